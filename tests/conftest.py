@@ -1,0 +1,40 @@
+"""Settings that every test runs under, and the fixtures that more than one file needs."""
+
+from __future__ import annotations
+
+import os
+
+import hypothesis
+import matplotlib
+import pytest
+import torch
+
+os.environ["MPLBACKEND"] = "Agg"  # also for the processes that tests start
+matplotlib.use("Agg")
+torch.set_num_threads(1)  # the tensors are small: threads cost more than they give, and two cores are shared
+hypothesis.settings.register_profile("torchsoro", max_examples=25, deadline=None, derandomize=True, database=None)
+hypothesis.settings.load_profile("torchsoro")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Judge the coverage of the whole suite only, not that of a chosen file or test."""
+    chosen = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
+    coverage = config.pluginmanager.get_plugin("_cov")
+    if coverage is not None and (chosen or config.option.keyword or config.option.markexpr):
+        coverage.options.cov_fail_under = 0
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give the marker ``gpu`` to every test that asks for the fixture ``cuda``."""
+    for item in items:
+        if "cuda" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.gpu)
+
+
+@pytest.fixture
+def cuda() -> torch.device:
+    """The CUDA device; skips the test where there is none."""
+    if not torch.cuda.is_available():
+        pytest.skip("needs a CUDA device")
+    return torch.device("cuda")

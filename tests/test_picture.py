@@ -1,0 +1,179 @@
+"""Pictures: the deformation is exact where it must be, the files are whole, and what should be seen is on the page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchsoro.domain import Chamber, Domain
+from torchsoro.fabricate import surface
+from torchsoro.page import last_cycle, motion_of
+from torchsoro.picture import deform, movie, shape_image, summary
+from torchsoro.scene import Camera
+
+CHAMBER = Chamber(name="air", center=(0.118, 0.068, 0.018), size=(0.018, 0.018, 0.018), wall=0.003)
+DOMAIN = Domain(size=(0.036,) * 3, particles=(12,) * 3, origin=(0.1, 0.05, 0.0), chambers=(CHAMBER,))
+WALLS = ((0, 0.1, 1), (0, 0.136, -1))
+
+
+def table() -> torch.Tensor:
+    """A body on four legs."""
+    gamma = torch.zeros(12, 12, 12)
+    gamma[:, :, 4:] = 1.0
+    for i in (slice(0, 3), slice(9, 12)):
+        for j in (slice(0, 3), slice(9, 12)):
+            gamma[i, j] = 1.0
+    gamma = gamma.flatten()
+    gamma[DOMAIN.gas] = 0.0
+    return gamma
+
+
+def walk(count: int = 5, travel: float = 0.01, axis: int = 0) -> torch.Tensor:
+    """Frames that move along an axis."""
+    frames = DOMAIN.positions.repeat(count, 1, 1)
+    frames[:, :, axis] += torch.linspace(0, travel, count, dtype=torch.float64)[:, None]
+    return frames
+
+
+def arguments(count: int = 5) -> dict:
+    time = torch.linspace(0.25, 0.75, count)
+    pressure = 40e3 * (1 - torch.cos(2 * torch.pi * 5 * time))
+    return {"domain": DOMAIN, "gamma": table(), "frames": walk(count), "time": time, "pressure": pressure}
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_deform_is_exact_for_affine_motion(weighted: bool) -> None:
+    gamma = table()
+    vertices, _ = surface(DOMAIN, gamma)
+    matrix, shift = np.array([[0.9, -0.4, 0.1], [0.3, 1.2, 0.2], [0.0, -0.1, 0.8]]), np.array([0.01, 0.02, 0.03])
+    frame = DOMAIN.positions.numpy() @ matrix.T + shift
+    moved = deform(DOMAIN, vertices, frame, gamma=gamma if weighted else None)
+    # With densities a little regularisation takes up to 1 % of a spacing.
+    np.testing.assert_allclose(moved, vertices @ matrix.T + shift, atol=0.01 * DOMAIN.spacing if weighted else 1e-9)
+
+
+def test_deform_follows_the_material_and_not_the_void() -> None:
+    gamma = table()
+    vertices, _ = surface(DOMAIN, gamma)
+    frame = DOMAIN.positions.numpy().copy()
+    void = ((gamma < 0.01) & DOMAIN.design).numpy()
+    frame[void] += np.random.default_rng(0).normal(0, 2e-3, (int(void.sum()), 3))
+    astray = np.abs(deform(DOMAIN, vertices, frame) - vertices).max()
+    assert np.abs(deform(DOMAIN, vertices, frame, gamma=gamma) - vertices).max() < min(1e-4, 0.1 * astray)
+
+
+def test_camera_keeps_z_vertical_and_lengths() -> None:
+    for azimuth, elevation in ((-60, 20), (30, 45), (-90, 0)):
+        view = Camera(azimuth, elevation).axes
+        np.testing.assert_allclose(view @ view.T, np.eye(3), atol=1e-12)
+        assert view[0, 2] == 0 and view[1, 2] > 0 and np.linalg.det(view) == pytest.approx(1)
+    np.testing.assert_allclose(Camera(-90, 0).axes, [[1, 0, 0], [0, 0, 1], [0, -1, 0]], atol=1e-12)
+
+
+def share_of(image: np.ndarray, color: str) -> float:
+    """Share of the pixels that are bluish (body) or reddish (pressure)."""
+    red, green, blue = (image[..., i].astype(int) for i in range(3))
+    chosen = {"blue": blue - red > 20, "red": red - green > 25, "ink": image.max(axis=2) < 250}[color]
+    return float(chosen.mean())
+
+
+def test_shape_image_shows_body_ground_and_pressure() -> None:
+    still = shape_image(domain=DOMAIN, gamma=table(), title="iteration 3")
+    assert still.shape == (480, 640, 3) and still.dtype == np.uint8
+    assert 0.1 < share_of(still, "blue") < 0.7
+    bare = shape_image(domain=DOMAIN, gamma=table(), planes=())
+    assert share_of(bare, "ink") != share_of(still, "ink")
+    full = shape_image(domain=DOMAIN, gamma=table(), frame=walk()[2], pressure=1.0, planes=WALLS, width=320, height=256)
+    assert full.shape == (256, 320, 3) and share_of(full, "red") > share_of(still, "red")
+    empty = Domain(size=(0.036,) * 3, particles=(12,) * 3)
+    assert shape_image(domain=empty, gamma=torch.zeros(empty.count)).std() > 0  # an empty stage, not a crash
+
+
+def test_travel_is_that_of_the_design_material() -> None:
+    motion = motion_of(DOMAIN, table(), walk(5, 0.01), np.arange(5.0), None, (), (1, 0, 0), 0.5)
+    np.testing.assert_allclose(motion.travel, [0, 2.5, 5, 7.5, 10], atol=1e-9)
+    back = motion_of(DOMAIN, table(), walk(5, 0.01), np.arange(5.0), None, (), (-1, 0, 0), 0.5)
+    np.testing.assert_allclose(back.travel, -motion.travel, atol=1e-12)
+
+
+def test_last_cycle_from_pressure_period_or_nothing() -> None:
+    time = np.linspace(0.0, 1.0, 201)
+    pressure = 80e3 * ((time * 5) % 1 < 0.5)
+    frames = walk(1).expand(201, -1, -1)
+    motion = motion_of(DOMAIN, table(), frames, time, pressure, (), (1, 0, 0), 0.5)
+    assert last_cycle(motion, None) == pytest.approx((0.8, 1.0), abs=0.006)
+    calm = motion_of(DOMAIN, table(), frames, time, None, (), (1, 0, 0), 0.5)
+    assert last_cycle(calm, None) == (0.0, 1.0)
+    assert last_cycle(calm, 0.25) == pytest.approx((0.75, 1.0))
+
+
+def test_movies_are_whole(tmp_path: Path) -> None:
+    film = movie(tmp_path / "gait.mp4", **arguments(), title="walker", width=480, height=320, fps=20)
+    reader = imageio_ffmpeg.read_frames(str(film))
+    meta = next(reader)
+    pictures = [np.frombuffer(picture, np.uint8) for picture in reader]
+    assert meta["size"] == (480, 320) and meta["fps"] == 20 and len(pictures) == 5
+    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50  # it moves
+    given = arguments(3) | {"pressure": None, "frames": walk(3, axis=2), "planes": WALLS, "direction": (0, 0, 1)}
+    with Image.open(movie(tmp_path / "gait.gif", **given, width=320, height=240)) as picture:
+        assert getattr(picture, "n_frames", 1) == 3 and picture.size == (320, 240)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["gait.gif", "gait.mp4"]
+
+
+def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    old = tmp_path / "gait.gif"
+    old.write_bytes(b"old")
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("torchsoro.picture._write_gif", fail)
+    with pytest.raises(OSError, match="disk full"):
+        movie(old, **arguments(2))
+    assert old.read_bytes() == b"old" and list(tmp_path.iterdir()) == [old]
+
+
+@pytest.mark.parametrize("climb", [False, True])
+def test_summary(tmp_path: Path, climb: bool) -> None:
+    history = {"objective/L": [1e-3, float("nan"), 3e-3], "constraint/C": [0.05, 0.03, 0.012]}
+    given = arguments(12)
+    if climb:
+        given |= {"frames": walk(12, axis=2), "planes": WALLS, "direction": (0, 0, 1), "pressure": None}
+    path = summary(tmp_path / "summary.png", **given, history=history, limit=0.0125, period=0.2, title="run")
+    with Image.open(path) as picture:
+        image = np.asarray(picture)
+    assert image.shape == (1120, 1760, 3) and share_of(image, "blue") > 0.02
+    assert [p.name for p in tmp_path.iterdir()] == ["summary.png"]
+
+
+def test_refusals(tmp_path: Path) -> None:
+    nan = walk()
+    nan[1, 2, 0] = float("nan")
+    for change, words in [
+        ({"frames": walk()[:, :-1]}, "frames: got shape"),
+        ({"frames": nan}, "frames: got positions that are not finite"),
+        ({"time": torch.zeros(4)}, r"time: got shape \(4,\)"),
+        ({"time": torch.zeros(5)}, "time: got no increase after frame 0"),
+        ({"pressure": torch.full((5,), float("inf"))}, "pressure"),
+        ({"planes": ((3, 0.0, 1),)}, "planes: got"),
+        ({"direction": (1.0, 1.0, 0.0)}, "direction: got"),
+        ({"fps": 0}, "fps: got 0"),
+        ({"width": 479}, "width, height: got 479"),
+        ({"gamma": torch.ones(3)}, "gamma: got shape"),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            movie(tmp_path / "x.mp4", **(arguments() | change))
+    with pytest.raises(ValueError, match=r"path: got .* want a suffix among .mp4, .gif"):
+        movie(tmp_path / "x.avi", **arguments())
+    with pytest.raises(ValueError, match="want a folder that exists"):
+        movie(tmp_path / "no" / "x.gif", **arguments())
+    with pytest.raises(ValueError, match=r"history: got the keys \['L'\], want numbers under 'C'"):
+        summary(tmp_path / "x.png", **arguments(), history={"L": [1.0]})
+    with pytest.raises(ValueError, match="period: got 0"):
+        summary(tmp_path / "x.png", **arguments(), history={"L": [1.0], "C": [0.0]}, period=0)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,208 @@
+"""Chamber pressure over time: measured, or modelled as a switched valve with a first-order lag.
+
+Pressures are gauge pressures, Pa, and times are in s.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import os
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Waveform:
+    """Pressure samples, linear in between and constant before the first and after the last.
+
+    Args:
+        time: Sample times, s, strictly increasing, floating point [S] with S >= 2.
+        pressure: Gauge pressure at these times, Pa, floating point [..., S]; leading axes are, for example, chambers.
+            May require a gradient.
+
+    Raises:
+        ValueError: Wrong shape or type, a number that is not finite, or times that do not increase.
+    """
+
+    time: Tensor
+    pressure: Tensor
+
+    def __post_init__(self) -> None:
+        """Check shapes, types and values."""
+        for name, value in (("time", self.time), ("pressure", self.pressure)):
+            if not isinstance(value, Tensor) or not value.is_floating_point():
+                kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
+                raise ValueError(f"{name}: got {kind}, want a floating-point tensor")
+        if self.time.ndim != 1 or len(self.time) < 2:
+            raise ValueError(f"time: got shape {tuple(self.time.shape)}, want [S] with at least 2 samples")
+        if self.pressure.ndim == 0 or self.pressure.shape[-1] != len(self.time):
+            raise ValueError(
+                f"pressure: got shape {tuple(self.pressure.shape)}, want [..., {len(self.time)}] as in time"
+            )
+        if self.pressure.device != self.time.device:
+            raise ValueError(f"pressure: got device {self.pressure.device}, want {self.time.device} as in time")
+        for name, value in (("time", self.time), ("pressure", self.pressure)):
+            if not bool(torch.isfinite(value.detach()).all()):
+                raise ValueError(f"{name}: got a value that is not finite, want finite numbers")
+        steps = self.time.detach().diff()
+        if not bool((steps > 0.0).all()):
+            sample = int((steps <= 0.0).nonzero()[0]) + 1
+            before, after = self.time[sample - 1].item(), self.time[sample].item()
+            raise ValueError(
+                f"time: got {after:.9g} s in sample {sample} after {before:.9g} s, want strictly increasing times"
+            )
+
+    def at(self, t: Tensor) -> Tensor:
+        """Interpolate linearly; differentiable with respect to the pressure samples (and to ``t``).
+
+        Args:
+            t: Times, s, floating point [T], on the device of the samples.
+
+        Returns:
+            Pressure, Pa, [..., T], in the type of the samples.
+
+        Raises:
+            ValueError: Wrong shape or type.
+        """
+        if not isinstance(t, Tensor) or not t.is_floating_point() or t.ndim != 1:
+            seen = f"{t.dtype} {tuple(t.shape)}" if isinstance(t, Tensor) else repr(t)
+            raise ValueError(f"t: got {seen}, want a floating-point tensor [T]")
+        after = torch.searchsorted(self.time.detach(), t.detach().to(self.time.dtype), right=True)
+        after = after.clamp(1, len(self.time) - 1)
+        begin, end = self.time[after - 1], self.time[after]
+        weight = ((t - begin) / (end - begin)).clamp(0.0, 1.0).to(self.pressure.dtype)
+        # lerp is exact at both ends, which p0 + w (p1 - p0) is not.
+        return torch.lerp(self.pressure[..., after - 1], self.pressure[..., after], weight)
+
+
+def square_wave(
+    *,
+    amplitude: float,
+    frequency: float,
+    duty: float = 0.5,
+    rise: float,
+    fall: float,
+    start: float = 0.0,
+    end: float,
+    samples_per_period: int = 400,
+) -> Waveform:
+    """Pressure behind a valve that switches between 0 and ``amplitude``, as a first-order lag.
+
+    While the valve is open ``p' = (amplitude - p) / rise``, while it vents ``p' = -p / fall``. The samples are the
+    exact exponentials, evenly spaced within each half cycle, with one sample at every switching instant.
+
+    Args:
+        amplitude: Supply pressure, Pa gauge; negative for vacuum.
+        frequency: Cycles per second, Hz.
+        duty: Part of each cycle with the valve open, in (0, 1).
+        rise: Time constant of filling, s.
+        fall: Time constant of venting, s.
+        start: First opening of the valve, s, >= 0. The pressure is 0 until then.
+        end: Last sample, s, after ``start``.
+        samples_per_period: Samples in one full cycle, at least 4.
+
+    Returns:
+        Waveform from t = 0 to ``end``, float64 [S].
+
+    Raises:
+        ValueError: An argument is out of its range.
+    """
+    for name, value in (("frequency", frequency), ("rise", rise), ("fall", fall)):
+        if not (math.isfinite(value) and value > 0.0):
+            raise ValueError(f"{name}: got {value!r}, want a finite number > 0")
+    if not math.isfinite(amplitude):
+        raise ValueError(f"amplitude: got {amplitude!r}, want a finite pressure in Pa")
+    if not 0.0 < duty < 1.0:
+        raise ValueError(f"duty: got {duty!r}, want more than 0 and less than 1")
+    if not (math.isfinite(start) and start >= 0.0):
+        raise ValueError(f"start: got {start!r}, want a finite time >= 0 s")
+    if not (math.isfinite(end) and end > start):
+        raise ValueError(f"end: got {end!r}, want a finite time after start ({start!r} s)")
+    if isinstance(samples_per_period, bool) or not isinstance(samples_per_period, int) or samples_per_period < 4:
+        raise ValueError(f"samples_per_period: got {samples_per_period!r}, want a whole number >= 4")
+
+    period = 1.0 / frequency
+    times: list[Tensor] = [torch.zeros(1 if start > 0.0 else 0, dtype=torch.float64)]
+    pressures: list[Tensor] = [torch.zeros_like(times[0])]
+    pressure = 0.0  # at the beginning of the half cycle
+    begin, half_cycle = start, 0
+    while begin < end:
+        valve_open = half_cycle % 2 == 0
+        target, constant, share = (amplitude, rise, duty) if valve_open else (0.0, fall, 1.0 - duty)
+        cycles = half_cycle // 2 + (duty if valve_open else 1.0)
+        finish = start + cycles * period  # from the start, so that rounding does not add up
+        if finish > end - 1e-9 * period:
+            finish = end
+        samples = max(2, round(samples_per_period * share))
+        samples = max(1, math.ceil(samples * (finish - begin) / (share * period) - 1e-6))
+        elapsed = torch.linspace(0.0, finish - begin, samples + 1, dtype=torch.float64)
+        lagged = target + (pressure - target) * torch.exp(-elapsed / constant)
+        times.append(begin + elapsed[:-1])
+        pressures.append(lagged[:-1])
+        pressure, begin, half_cycle = float(lagged[-1]), finish, half_cycle + 1
+    times.append(torch.tensor([end], dtype=torch.float64))
+    pressures.append(torch.tensor([pressure], dtype=torch.float64))
+    return Waveform(time=torch.cat(times), pressure=torch.cat(pressures))
+
+
+def read_pressure_csv(
+    path: str | os.PathLike[str], *, time_column: str = "time_s", pressure_column: str = "pressure_pa"
+) -> Waveform:
+    """Read a measured pressure from a comma-separated file with a header line.
+
+    Args:
+        path: File to read. Empty lines are skipped; other columns are ignored.
+        time_column: Header of the times, s, which must increase strictly.
+        pressure_column: Header of the gauge pressures, Pa.
+
+    Returns:
+        Waveform of all rows, float64 [S].
+
+    Raises:
+        ValueError: The file or a column is missing, a cell is not a finite number, times do not increase, or there are
+            fewer than two rows. The message names the file and the line (the header is line 1 of the file).
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise ValueError(f"path: got {str(path)!r}, want an existing CSV file")
+    times: list[float] = []
+    pressures: list[float] = []
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, skipinitialspace=True)
+        header = [name.strip() for name in next(reader, [])]
+        missing = [name for name in (time_column, pressure_column) if name not in header]
+        if missing:
+            raise ValueError(f"{path}: got columns {header}, want also {missing}")
+        columns = (header.index(time_column), header.index(pressure_column))
+        for row in reader:
+            if not any(cell.strip() for cell in row):
+                continue
+            where = f"{path}, line {reader.line_num}"
+            time, pressure = (_number(row, column, header[column], where) for column in columns)
+            if times and time <= times[-1]:
+                raise ValueError(
+                    f"{where}: got {time_column} = {time} after {times[-1]}, want strictly increasing times"
+                )
+            times.append(time)
+            pressures.append(pressure)
+    if len(times) < 2:
+        raise ValueError(f"{path}: got {len(times)} row(s) of numbers, want at least 2")
+    return Waveform(
+        time=torch.tensor(times, dtype=torch.float64), pressure=torch.tensor(pressures, dtype=torch.float64)
+    )
+
+
+def _number(row: list[str], column: int, name: str, where: str) -> float:
+    """One cell as a finite number."""
+    cell = row[column] if column < len(row) else ""
+    try:
+        value = float(cell)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise ValueError(f"{where}: got {name} = {cell!r}, want a finite number")
+    return value

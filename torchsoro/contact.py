@@ -1,0 +1,68 @@
+"""Planes that the body cannot pass: ground and walls, with stick or Coulomb friction, and adhesion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plane:
+    """An axis-aligned plane; the body stays on its free side.
+
+    Contact acts on grid nodes on and behind the plane. The grid is laid so that a layer of nodes lies on the first
+    plane of each axis, wherever that is; a further plane of the same axis should be a whole number of cells away.
+
+    Attributes:
+        axis: 0, 1 or 2: the plane's normal is x, y or z.
+        offset: Where it cuts the axis [m], a number or a tensor [...]; its gradient is that of shifting the grid.
+        side: +1 if the body lies on the positive side, else -1.
+        friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
+        adhesion: Traction that must be overcome to lift off [Pa], number or tensor [...].
+
+    Raises:
+        ValueError: for an axis, side, friction or adhesion out of range.
+    """
+
+    axis: int
+    offset: float | Tensor = 0.0
+    side: int = 1
+    friction: str | float | Tensor = "stick"
+    adhesion: float | Tensor = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if self.axis not in (0, 1, 2):
+            raise ValueError(f"axis = {self.axis!r}: wanted 0 (x), 1 (y) or 2 (z)")
+        if self.side not in (1, -1):
+            raise ValueError(f"side = {self.side!r}: wanted +1 or -1")
+        if isinstance(self.friction, str) and self.friction != "stick":
+            raise ValueError(f"friction = {self.friction!r}: wanted 'stick' or a coefficient of at least 0")
+        for name in ("friction", "adhesion", "offset"):
+            value = getattr(self, name)
+            if not isinstance(value, str):
+                least = -torch.inf if name == "offset" else 0.0
+                number = torch.as_tensor(value).detach()
+                if not bool((torch.isfinite(number) & (number >= least)).all()):
+                    raise ValueError(f"{name} = {value}: wanted finite{'' if name == 'offset' else ' and at least 0'}")
+
+    @property
+    def sticks(self) -> bool:
+        """Whether the plane holds what is pressed on it."""
+        return isinstance(self.friction, str)
+
+    def numbers(self) -> tuple[float | Tensor, float | Tensor, float | Tensor]:
+        """Offset, Coulomb coefficient (0 where it sticks) and adhesion, as kernels take them."""
+        return self.offset, 0.0 if isinstance(self.friction, str) else self.friction, self.adhesion
+
+
+def ground(height: float | Tensor = 0.0, *, friction: str | float | Tensor = "stick") -> Plane:
+    """A floor with its normal upward (z).
+
+    Args:
+        height: Its height [m].
+        friction: See :class:`Plane`.
+    """
+    return Plane(axis=2, offset=height, friction=friction)

@@ -1,0 +1,512 @@
+"""One substep backward: the adjoint of ``forward.substep``, from the kept states and node velocities.
+
+The adjoint state lies in one buffer that each pass overwrites in place. A pass finishes the scatter of substep t + 1
+and begins the gather of substep t, so that a caller may add its own gradients by the state after t + 1 substeps
+between two passes. Sums over particles or nodes (pressure, gravity, ...) go to rows, one for each lane, added up later.
+"""
+
+import taichi as ti
+
+from torchsoro.kernels.forward import (
+    BLEND,
+    CELL,
+    CPU_UNIT,
+    DT,
+    INVERSE_CELL,
+    Integers,
+    Reals,
+    external_force,
+    history_sum,
+    lowest_node,
+    stress,
+)
+from torchsoro.kernels.layout import (
+    ADJOINT_NEW,
+    AFFINE,
+    ANCHOR,
+    BEFORE,
+    BULK,
+    COEFFICIENTS,
+    DEFORMATION,
+    DRAG,
+    HISTORY,
+    MASS,
+    NODE,
+    NODE_NEW,
+    NODE_VELOCITY,
+    PLANE,
+    POSITION,
+    PRONY,
+    PRONY_DECAY,
+    PRONY_GAIN,
+    PRONY_MODULUS,
+    SHEAR,
+    SPRING,
+    VELOCITY,
+    VISCOSITY,
+    VOLUME,
+    VOLUME_VISCOSITY,
+)
+from torchsoro.kernels.nodes import add, move, node_adjoint, node_position
+from torchsoro.kernels.stress import (
+    gas_pressure,
+    pull_back,
+    pull_back_adjoint,
+    solid_stress_adjoint,
+    viscous_stress_adjoint,
+)
+from torchsoro.kernels.tensor import (
+    cofactor,
+    contract,
+    load_matrix,
+    load_symmetric,
+    load_symmetric_adjoint,
+    load_vector,
+    plus_identity,
+    store_matrix,
+    store_symmetric_adjoint,
+    store_vector,
+)
+from torchsoro.kernels.transfer import grid_to_particle_adjoint, particle_to_grid_adjoint
+
+
+@ti.func
+def deform_adjoint(
+    atomic: ti.template(),
+    state: ti.template(),
+    at,
+    out,
+    bar: ti.template(),
+    here,
+    particles,
+    prony: ti.template(),
+    prony_at,
+    prony_bar: ti.template(),
+    prony_row,
+    want_prony,
+    elements,
+    kind,
+    step_gradient,
+):
+    """Adjoint of ``forward.deform``: replaces F and H in the adjoint state, returns the gradient by dt L."""
+    F = load_matrix(state, at + DEFORMATION * particles, particles)
+    F_bar = load_matrix(bar, here + DEFORMATION * particles, particles)
+    step_bar = F * 0
+    if kind < 0:
+        old_bar = F * 0
+        if elements > 0:
+            F_new = load_matrix(state, out + DEFORMATION * particles, particles)
+            S_bar = F * 0
+            for e in range(elements):
+                H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
+                S_bar += prony[prony_at + PRONY * e + PRONY_GAIN] * H_bar
+            if want_prony == 1:
+                change = pull_back(F_new) - pull_back(F)
+                for e in range(elements):
+                    H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
+                    H = load_symmetric(state, at + (HISTORY + 6 * e) * particles, particles)
+                    add(atomic, prony_bar, prony_row + PRONY * e + PRONY_DECAY, contract(H_bar, H))
+                    add(atomic, prony_bar, prony_row + PRONY * e + PRONY_GAIN, contract(H_bar, change))
+            for e in range(elements):
+                a = prony[prony_at + PRONY * e + PRONY_DECAY]
+                for c in range(6):
+                    place = here + (HISTORY + 6 * e + c) * particles
+                    bar[place] = a * bar[place]
+            F_bar += pull_back_adjoint(F_new, S_bar)
+            old_bar = pull_back_adjoint(F, -S_bar)
+        step_bar = F_bar @ F.transpose()
+        F_bar = F_bar + step_gradient.transpose() @ F_bar + old_bar
+    else:
+        J_bar = F_bar[0, 0]
+        step_bar = plus_identity(step_bar, J_bar * F[0, 0])
+        F_bar[0, 0] = J_bar * (1 + step_gradient.trace())
+        for c in range(6 * elements):
+            bar[here + (HISTORY + c) * particles] = 0
+    store_matrix(bar, here + DEFORMATION * particles, particles, F_bar)
+    return step_bar
+
+
+@ti.func
+def stress_adjoint(
+    atomic: ti.template(),
+    state: ti.template(),
+    at,
+    bar: ti.template(),
+    here,
+    coefficients: ti.template(),
+    coefficients_bar: ti.template(),
+    mat,
+    particles,
+    prony: ti.template(),
+    prony_at,
+    prony_bar: ti.template(),
+    prony_row,
+    want_prony,
+    elements,
+    kind,
+    pressure: ti.template(),
+    pressure_at,
+    pressure_bar: ti.template(),
+    pressure_row,
+    tau_bar,
+):
+    """Adjoint of ``forward.stress``: adds to F and H in the adjoint state, returns the gradient by C."""
+    F = load_matrix(state, at + DEFORMATION * particles, particles)
+    C = load_matrix(state, at + AFFINE * particles, particles)
+    bulk = coefficients[mat + BULK * particles]
+    F_bar = load_matrix(bar, here + DEFORMATION * particles, particles)
+    C_bar = F * 0
+    J = F[0, 0]
+    J_bar = J * 0
+    if kind < 0:
+        J = F.determinant()
+        Q = F * 0
+        if elements > 0:
+            Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
+        shear = coefficients[mat + SHEAR * particles]
+        by_F, Q_bar, bulk_bar, shear_bar = solid_stress_adjoint(F, Q, bulk, shear, tau_bar)
+        F_bar += by_F
+        add(False, coefficients_bar, mat + BULK * particles, bulk_bar)
+        add(False, coefficients_bar, mat + SHEAR * particles, shear_bar)
+        for e in range(elements):
+            place = (HISTORY + 6 * e) * particles
+            H_bar = load_symmetric_adjoint(bar, here + place, particles)
+            H_bar += prony[prony_at + PRONY * e + PRONY_MODULUS] * Q_bar
+            store_symmetric_adjoint(bar, here + place, particles, H_bar)
+            if want_prony == 1:
+                H = load_symmetric(state, at + place, particles)
+                add(atomic, prony_bar, prony_row + PRONY * e + PRONY_MODULUS, contract(Q_bar, H))
+    else:
+        trace_bar = tau_bar.trace()
+        J_bar = trace_bar * (J * bulk - gas_pressure(J, bulk, pressure[pressure_at + kind]))
+        add(False, coefficients_bar, mat + BULK * particles, -(J * (1 - J) * trace_bar))
+        add(atomic, pressure_bar, pressure_row + kind, -J * trace_bar)
+    eta = coefficients[mat + VISCOSITY * particles]
+    zeta = coefficients[mat + VOLUME_VISCOSITY * particles]
+    by_J, by_C, eta_bar, zeta_bar = viscous_stress_adjoint(J, C, eta, zeta, tau_bar)
+    C_bar = by_C
+    J_bar += by_J
+    add(False, coefficients_bar, mat + VISCOSITY * particles, eta_bar)
+    add(False, coefficients_bar, mat + VOLUME_VISCOSITY * particles, zeta_bar)
+    if kind < 0:
+        F_bar += J_bar * cofactor(F)
+    else:
+        F_bar[0, 0] += J_bar
+    store_matrix(bar, here + DEFORMATION * particles, particles, F_bar)
+    return C_bar
+
+
+@ti.kernel
+def substep_adjoint(
+    atomic: ti.template(),
+    serial_nodes: ti.template(),
+    clock: Integers,
+    numbers: Reals,
+    state: Reals,
+    coefficients: Reals,
+    kind: Integers,
+    prony: Reals,
+    pressure: Reals,
+    gravity: Reals,
+    force: Reals,
+    share: Reals,
+    planes: Reals,
+    plane_kind: Integers,
+    origin: Reals,
+    box_low: Integers,
+    grid: Reals,
+    node: Reals,
+    grid_before: Reals,
+    before: Reals,
+    new: Reals,
+    flags: Integers,
+    bar: Reals,
+    node_bar: Reals,
+    before_bar: Reals,
+    coefficients_bar: Reals,
+    prony_bar: Reals,
+    pressure_bar: Reals,
+    gravity_bar: Reals,
+    force_bar: Reals,
+    planes_bar: Reals,
+    origin_bar: Reals,
+    batch: ti.i32,
+    particles: ti.i32,
+    lanes: ti.i32,
+    components: ti.i32,
+    elements: ti.i32,
+    chambers: ti.i32,
+    groups: ti.i32,
+    springs: ti.i32,
+    plane_count: ti.i32,
+    nx: ti.i32,
+    ny: ti.i32,
+    nz: ti.i32,
+    first: ti.i32,
+    steps: ti.i32,
+    node_lanes: ti.i32,
+    rows: ti.i32,
+    want_prony: ti.i32,
+):
+    """Go back by one substep; clock[0] counts from ``steps`` - 1 down to -1 (scatter of the first substep only)."""
+    unit = ti.static(1 if atomic else CPU_UNIT)
+    if ti.static(serial_nodes):
+        ti.loop_config(serialize=True)
+    for w in range(batch * node_lanes * unit):
+        if w % unit == 0:
+            t = clock[0]
+            nodes = nx * ny * nz
+            b = w // unit // node_lanes
+            lane = w // unit % node_lanes
+            row = lane % rows
+            cell = numbers[CELL]
+            dt = numbers[DT]
+            parts = lanes
+            if ti.static(atomic):
+                parts = 1
+            for i in range(lane * nodes // node_lanes, (lane + 1) * nodes // node_lanes):
+                x = node_position(box_low, origin, b, i, ti.Vector([nx, ny, nz]), cell)
+                if t + 1 < steps:
+                    time = first + t + 1
+                    node_adjoint(
+                        atomic,
+                        grid,
+                        node,
+                        (((t + 1) * batch + b) * nodes + i) * NODE,
+                        node_bar,
+                        (b * nodes + i) * NODE,
+                        before,
+                        (((t + 1) * batch + b) * nodes + i) * BEFORE,
+                        before_bar,
+                        (b * nodes + i) * BEFORE,
+                        numbers[BLEND] > 0,
+                        gravity,
+                        (time * batch + b) * 3,
+                        gravity_bar,
+                        ((time * rows + row) * batch + b) * 3,
+                        planes,
+                        plane_kind,
+                        b * plane_count * PLANE,
+                        planes_bar,
+                        (row * batch + b) * plane_count * PLANE,
+                        plane_count,
+                        x,
+                        cell,
+                        dt,
+                        b,
+                        i,
+                        batch,
+                        nodes,
+                        parts,
+                    )
+                if t >= 0:
+                    move(
+                        node,
+                        ((t * batch + b) * nodes + i) * NODE,
+                        before,
+                        ((t * batch + b) * nodes + i) * BEFORE,
+                        new,
+                        (b * nodes + i) * NODE_NEW,
+                        gravity,
+                        ((first + t) * batch + b) * 3,
+                        planes,
+                        plane_kind,
+                        b * plane_count * PLANE,
+                        plane_count,
+                        x,
+                        cell,
+                        dt,
+                        numbers[BLEND],
+                    )
+    for w in range(batch * lanes * unit):
+        if w % unit == 0:
+            t = clock[0]
+            nodes = nx * ny * nz
+            b = w // unit // lanes
+            lane = w // unit % lanes
+            row = lane % rows
+            dt = numbers[DT]
+            cell = numbers[CELL]
+            inverse_cell = numbers[INVERSE_CELL]
+            blend = numbers[BLEND]
+            size = ti.Vector([nx, ny, nz])
+            plane = ny * nz
+            part = lane
+            if ti.static(atomic):
+                part = 0
+            low = load_vector(origin, 3 * b, 1)
+            prony_at = b * elements * PRONY
+            prony_row = (row * batch + b) * elements * PRONY
+            mat0 = b * COEFFICIENTS * particles
+            for p in range(lane * particles // lanes, (lane + 1) * particles // lanes):
+                phase = kind[p]
+                mat = mat0 + p
+                here = b * components * particles + p
+                slot = ((first + t + 1) * batch + b) * components * particles + p
+                f_bar = low * 0
+                if t + 1 < steps:
+                    time = first + t + 1
+                    pressure_at = (time * batch + b) * chambers
+                    force_at = (time * batch + b) * groups * 3
+                    x = load_vector(state, slot + POSITION * particles, particles)
+                    v = load_vector(state, slot + VELOCITY * particles, particles)
+                    C = load_matrix(state, slot + AFFINE * particles, particles)
+                    mass = coefficients[mat + MASS * particles]
+                    volume = coefficients[mat + VOLUME * particles]
+                    tau = stress(
+                        state,
+                        slot,
+                        coefficients,
+                        mat,
+                        particles,
+                        prony,
+                        prony_at,
+                        elements,
+                        phase,
+                        pressure,
+                        pressure_at,
+                    )
+                    push = external_force(
+                        coefficients, mat, particles, p, springs, force, force_at, share, groups, x, v
+                    )
+                    per_volume = dt * 4 * inverse_cell
+                    A = (mass * cell) * C - (per_volume * volume) * tau
+                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
+                    f = (x - low) * inverse_cell - base
+                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
+                    node0 += base[2] - box_low[3 * b + 2]
+                    mass_bar, q_bar, A_bar, by_f = particle_to_grid_adjoint(
+                        node_bar,
+                        b * nodes * NODE,
+                        NODE,
+                        NODE_VELOCITY,
+                        node0,
+                        nz,
+                        plane,
+                        f,
+                        mass,
+                        mass * v + dt * push,
+                        A,
+                    )
+                    add(False, coefficients_bar, mat + VOLUME * particles, -(per_volume * contract(tau, A_bar)))
+                    push_bar = dt * q_bar
+                    tau_bar = (-per_volume * volume) * A_bar
+                    if blend > 0:
+                        _, q_more, A_more, f_more = particle_to_grid_adjoint(
+                            before_bar,
+                            b * nodes * BEFORE,
+                            BEFORE,
+                            0,
+                            node0,
+                            nz,
+                            plane,
+                            f,
+                            mass,
+                            mass * v,
+                            (mass * cell) * C,
+                        )
+                        q_bar += q_more
+                        A_bar += A_more
+                        by_f += f_more
+                    f_bar += by_f
+                    mass_bar += v.dot(q_bar) + cell * contract(C, A_bar)
+                    add(False, coefficients_bar, mat + MASS * particles, mass_bar)
+                    x_bar = load_vector(bar, here + POSITION * particles, particles)
+                    v_bar = load_vector(bar, here + VELOCITY * particles, particles) + mass * q_bar
+                    C_bar = load_matrix(bar, here + AFFINE * particles, particles) + (mass * cell) * A_bar
+                    if springs == 1:
+                        spring = coefficients[mat + SPRING * particles]
+                        drag = coefficients[mat + DRAG * particles]
+                        anchor = load_vector(coefficients, mat + ANCHOR * particles, particles)
+                        x_bar -= spring * push_bar
+                        v_bar -= drag * push_bar
+                        add(False, coefficients_bar, mat + SPRING * particles, push_bar.dot(anchor - x))
+                        add(False, coefficients_bar, mat + DRAG * particles, -(push_bar.dot(v)))
+                        for c in ti.static(range(3)):
+                            add(False, coefficients_bar, mat + (ANCHOR + c) * particles, spring * push_bar[c])
+                    for g in range(groups):
+                        for c in ti.static(range(3)):
+                            add(
+                                atomic,
+                                force_bar,
+                                ((time * rows + row) * batch + b) * groups * 3 + 3 * g + c,
+                                share[g * particles + p] * push_bar[c],
+                            )
+                    C_bar += stress_adjoint(
+                        atomic,
+                        state,
+                        slot,
+                        bar,
+                        here,
+                        coefficients,
+                        coefficients_bar,
+                        mat,
+                        particles,
+                        prony,
+                        prony_at,
+                        prony_bar,
+                        prony_row,
+                        want_prony,
+                        elements,
+                        phase,
+                        pressure,
+                        pressure_at,
+                        pressure_bar,
+                        ((time * rows + row) * batch + b) * chambers,
+                        tau_bar,
+                    )
+                    store_vector(bar, here + POSITION * particles, particles, x_bar + inverse_cell * by_f)
+                    store_vector(bar, here + VELOCITY * particles, particles, v_bar)
+                    store_matrix(bar, here + AFFINE * particles, particles, C_bar)
+                if t >= 0:
+                    at = ((first + t) * batch + b) * components * particles + p
+                    x = load_vector(state, at + POSITION * particles, particles)
+                    L = load_matrix(state, slot + AFFINE * particles, particles)
+                    x_bar = load_vector(bar, here + POSITION * particles, particles)
+                    v_bar = load_vector(bar, here + VELOCITY * particles, particles)
+                    L_bar = load_matrix(bar, here + AFFINE * particles, particles)
+                    L_bar += dt * deform_adjoint(
+                        atomic,
+                        state,
+                        at,
+                        slot,
+                        bar,
+                        here,
+                        particles,
+                        prony,
+                        prony_at,
+                        prony_bar,
+                        prony_row,
+                        want_prony,
+                        elements,
+                        phase,
+                        dt * L,
+                    )
+                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
+                    f = (x - low) * inverse_cell - base
+                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
+                    node0 += base[2] - box_low[3 * b + 2]
+                    by_f = grid_to_particle_adjoint(
+                        atomic,
+                        new,
+                        b * nodes * NODE_NEW,
+                        grid,
+                        (part * batch + b) * nodes * ADJOINT_NEW,
+                        node0,
+                        nz,
+                        plane,
+                        f,
+                        blend,
+                        dt * x_bar,
+                        (4 * inverse_cell) * L_bar,
+                        v_bar,
+                    )
+                    f_bar += by_f
+                    store_vector(bar, here + POSITION * particles, particles, x_bar + inverse_cell * by_f)
+                    store_vector(bar, here + VELOCITY * particles, particles, blend * v_bar)
+                    store_matrix(bar, here + AFFINE * particles, particles, 0 * L)
+                for c in ti.static(range(3)):
+                    add(atomic, origin_bar, (row * batch + b) * 3 + c, -inverse_cell * f_bar[c])
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        clock[0] = clock[0] - 1

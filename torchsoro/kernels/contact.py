@@ -1,0 +1,115 @@
+"""Contact of grid nodes with axis-aligned planes, stick or Coulomb friction with adhesion, and its adjoint."""
+
+import taichi as ti
+
+from torchsoro.kernels.layout import (
+    PLANE,
+    PLANE_ADHESION,
+    PLANE_AXIS,
+    PLANE_FRICTION,
+    PLANE_OFFSET,
+    PLANE_SIGN,
+    PLANE_STICK,
+)
+
+
+@ti.func
+def plane_distance(planes: ti.template(), plane_kind: ti.template(), at, k, x, cell):
+    """Signed distance of a node in front of plane k, in cells."""
+    axis, sign = plane_kind[3 * k + PLANE_AXIS], plane_kind[3 * k + PLANE_SIGN]
+    along = x[0]
+    if axis == 1:
+        along = x[1]
+    elif axis == 2:
+        along = x[2]
+    return (along - planes[at + PLANE * k + PLANE_OFFSET]) * sign / cell
+
+
+@ti.func
+def normal_of(plane_kind: ti.template(), k, like):
+    """Unit normal of plane k, pointing to the free side."""
+    axis, sign = plane_kind[3 * k + PLANE_AXIS], plane_kind[3 * k + PLANE_SIGN]
+    n = like * 0
+    for i in ti.static(range(3)):
+        if axis == i:
+            n[i] = sign
+    return n
+
+
+@ti.func
+def touch(u, n, stick, friction, hold):
+    """Velocity of a node after one plane; ``hold`` is the largest pull-off speed that adhesion cancels in this step.
+
+    A node that approaches (or is held back by adhesion) sticks: u = 0; or slides: its normal part vanishes and its
+    tangential part shrinks by at most ``friction`` times the normal part. A node torn off keeps the rest of its speed.
+    """
+    r = u
+    normal = u.dot(n)
+    if normal > hold:
+        r = u - hold * n
+    elif normal < 0 or hold > 0:
+        if stick == 1:
+            r = u * 0
+        else:
+            tangential = u - normal * n
+            speed = tangential.norm()
+            loss = friction * ti.abs(normal)
+            r = u * 0
+            if speed > loss:
+                r = tangential * (1 - loss / speed)
+    return r
+
+
+@ti.func
+def touch_adjoint(u, n, stick, friction, hold, r_bar):
+    """Adjoint of :func:`touch`: gradients by u, friction and hold."""
+    u_bar = r_bar
+    friction_bar = u[0] * 0
+    hold_bar = u[0] * 0
+    normal = u.dot(n)
+    if normal > hold:
+        hold_bar = -r_bar.dot(n)
+    elif normal < 0 or hold > 0:
+        u_bar = r_bar * 0
+        if stick == 0:
+            tangential = u - normal * n
+            speed = tangential.norm()
+            loss = friction * ti.abs(normal)
+            if speed > loss:
+                direction = tangential / speed
+                loss_bar = -direction.dot(r_bar)
+                flat = r_bar - r_bar.dot(n) * n
+                u_bar = flat - loss / speed * (flat - direction.dot(flat) * direction)
+                side = ti.select(normal < 0, friction * 0 - 1, friction * 0 + 1)
+                u_bar += loss_bar * friction * side * n
+                friction_bar = loss_bar * ti.abs(normal)
+    return u_bar, friction_bar, hold_bar
+
+
+@ti.func
+def touches(distance):
+    """Whether a node lies on a plane or behind it."""
+    return distance < 1e-4
+
+
+@ti.func
+def adhesive_speed(planes: ti.template(), at, k, distance, mass, impulse):
+    """Pull-off speed that adhesion cancels in a step: traction times node area times dt over mass, at the plane only."""
+    hold = mass * 0
+    if distance > -0.5:
+        hold = planes[at + PLANE * k + PLANE_ADHESION] * impulse / mass
+    return hold
+
+
+@ti.func
+def contact(planes: ti.template(), plane_kind: ti.template(), at, count, x, mass, u, cell, dt):
+    """Velocity of a node after the first ``count`` planes, one after the other."""
+    r = u
+    impulse = cell * cell * dt
+    for k in range(count):
+        distance = plane_distance(planes, plane_kind, at, k, x, cell)
+        n = normal_of(plane_kind, k, u)
+        hold = adhesive_speed(planes, at, k, distance, mass, impulse)
+        if touches(distance):
+            r = touch(r, n, plane_kind[3 * k + PLANE_STICK], planes[at + PLANE * k + PLANE_FRICTION], hold)
+    return r

@@ -1,0 +1,352 @@
+"""One substep forward: nodes, then every particle gathers, updates its state, and scatters for the next substep.
+
+Fusing the gather of one substep with the scatter of the next leaves one pass over the particles per substep. On a CPU
+the particles are cut into lanes, each with a grid of its own that the node pass adds up in a fixed order, so that a
+run has the same bits whatever the number of threads; on a GPU every particle is a lane and the grid is shared.
+"""
+
+import taichi as ti
+
+from torchsoro.kernels.layout import (
+    AFFINE,
+    ANCHOR,
+    BEFORE,
+    BULK,
+    COEFFICIENTS,
+    DEFORMATION,
+    DRAG,
+    HISTORY,
+    MASS,
+    NODE,
+    NODE_NEW,
+    PLANE,
+    POSITION,
+    PRONY,
+    PRONY_DECAY,
+    PRONY_GAIN,
+    PRONY_MODULUS,
+    SHEAR,
+    SPRING,
+    VELOCITY,
+    VISCOSITY,
+    VOLUME,
+    VOLUME_VISCOSITY,
+)
+from torchsoro.kernels.nodes import collect, move, node_position
+from torchsoro.kernels.spline import base_node
+from torchsoro.kernels.stress import gas_pressure, pull_back, solid_stress, viscous_stress
+from torchsoro.kernels.tensor import (
+    load_matrix,
+    load_symmetric,
+    load_vector,
+    plus_identity,
+    store_matrix,
+    store_symmetric,
+    store_vector,
+)
+from torchsoro.kernels.transfer import grid_to_particle, particle_to_grid
+
+Reals = ti.types.ndarray(ndim=1)
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+# Numbers handed over in the working precision.
+DT, CELL, INVERSE_CELL, BLEND = 0, 1, 2, 3
+
+# Taichi hands a CPU thread no fewer than 512 iterations of a loop: a lane is that many, of which one works.
+CPU_UNIT = 512
+
+# What a substep flags; the simulator then repeats the chunk step by step to say where.
+FLAG_LEFT_BOX, FLAG_COLLAPSED = 0, 1
+
+
+@ti.func
+def lowest_node(x, inverse_cell, box_low: ti.template(), b, size, flags: ti.template()):
+    """Lowest node of a particle in the active box; a particle outside is flagged and kept inside memory."""
+    base = base_node(x, inverse_cell)
+    for c in ti.static(range(3)):
+        local = base[c] - box_low[3 * b + c]
+        if local < 0 or local > size[c] - 3:
+            flags[FLAG_LEFT_BOX] = 1
+            base[c] = ti.max(0, ti.min(local, size[c] - 3)) + box_low[3 * b + c]
+    return base
+
+
+@ti.func
+def history_sum(state: ti.template(), at, stride, prony: ti.template(), prony_at, elements):
+    """Q = sum_i g_i H_i over the Maxwell elements."""
+    Q = load_symmetric(state, at, stride) * prony[prony_at + PRONY_MODULUS]
+    for e in range(1, elements):
+        H = load_symmetric(state, at + 6 * e * stride, stride)
+        Q += H * prony[prony_at + PRONY * e + PRONY_MODULUS]
+    return Q
+
+
+@ti.func
+def stress(
+    state: ti.template(),
+    at,
+    coefficients: ti.template(),
+    mat,
+    particles,
+    prony: ti.template(),
+    prony_at,
+    elements,
+    kind,
+    pressure: ti.template(),
+    pressure_at,
+):
+    """Kirchhoff stress of a particle from its state: solid with Maxwell elements, or gas; both with viscosity."""
+    F = load_matrix(state, at + DEFORMATION * particles, particles)
+    C = load_matrix(state, at + AFFINE * particles, particles)
+    bulk = coefficients[mat + BULK * particles]
+    J = F[0, 0]
+    tau = F * 0
+    if kind < 0:
+        J = F.determinant()
+        Q = F * 0
+        if elements > 0:
+            Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
+        tau = solid_stress(F, Q, bulk, coefficients[mat + SHEAR * particles])
+    else:
+        tau = plus_identity(tau, -J * gas_pressure(J, bulk, pressure[pressure_at + kind]))
+    eta = coefficients[mat + VISCOSITY * particles]
+    zeta = coefficients[mat + VOLUME_VISCOSITY * particles]
+    if eta != 0 or zeta != 0:
+        tau += viscous_stress(J, C, eta, zeta)
+    return tau
+
+
+@ti.func
+def external_force(
+    coefficients: ti.template(),
+    mat,
+    particles,
+    p,
+    springs,
+    force: ti.template(),
+    force_at,
+    share: ti.template(),
+    groups,
+    x,
+    v,
+):
+    """Shares of the group forces, spring to an anchor, linear drag [N]."""
+    f = x * 0
+    for g in range(groups):
+        f += share[g * particles + p] * load_vector(force, force_at + 3 * g, 1)
+    if springs == 1:
+        spring = coefficients[mat + SPRING * particles]
+        drag = coefficients[mat + DRAG * particles]
+        f += spring * (load_vector(coefficients, mat + ANCHOR * particles, particles) - x) - drag * v
+    return f
+
+
+@ti.func
+def deform(
+    state: ti.template(),
+    at,
+    out,
+    particles,
+    prony: ti.template(),
+    prony_at,
+    elements,
+    kind,
+    step_gradient,
+    flags: ti.template(),
+):
+    """F <- (I + dt L) F (a gas keeps only J), then the exact-exponential history H <- a H + b (S' - S)."""
+    F = load_matrix(state, at + DEFORMATION * particles, particles)
+    if kind < 0:
+        F_new = F + step_gradient @ F
+        store_matrix(state, out + DEFORMATION * particles, particles, F_new)
+        if F_new.determinant() <= 0:
+            flags[FLAG_COLLAPSED] = 1
+        if elements > 0:
+            change = pull_back(F_new) - pull_back(F)
+            for e in range(elements):
+                place = (HISTORY + 6 * e) * particles
+                a = prony[prony_at + PRONY * e + PRONY_DECAY]
+                b = prony[prony_at + PRONY * e + PRONY_GAIN]
+                H = load_symmetric(state, at + place, particles)
+                store_symmetric(state, out + place, particles, a * H + b * change)
+    else:
+        J = F[0, 0] * (1 + step_gradient.trace())
+        F[0, 0] = J
+        store_matrix(state, out + DEFORMATION * particles, particles, F)
+        for c in range(6 * elements):
+            state[out + (HISTORY + c) * particles] = 0
+        if J <= 0:
+            flags[FLAG_COLLAPSED] = 1
+
+
+@ti.kernel
+def substep(
+    atomic: ti.template(),
+    serial_nodes: ti.template(),
+    clock: Integers,
+    numbers: Reals,
+    state: Reals,
+    coefficients: Reals,
+    kind: Integers,
+    prony: Reals,
+    pressure: Reals,
+    gravity: Reals,
+    force: Reals,
+    share: Reals,
+    planes: Reals,
+    plane_kind: Integers,
+    origin: Reals,
+    box_low: Integers,
+    grid: Reals,
+    node: Reals,
+    grid_before: Reals,
+    before: Reals,
+    new: Reals,
+    flags: Integers,
+    batch: ti.i32,
+    particles: ti.i32,
+    lanes: ti.i32,
+    components: ti.i32,
+    elements: ti.i32,
+    chambers: ti.i32,
+    groups: ti.i32,
+    springs: ti.i32,
+    plane_count: ti.i32,
+    nx: ti.i32,
+    ny: ti.i32,
+    nz: ti.i32,
+    first: ti.i32,
+    steps: ti.i32,
+    ring: ti.i32,
+    node_ring: ti.i32,
+):
+    """Advance by one substep; clock[0] counts from -1 (scatter only) to ``steps`` - 1 within a chunk."""
+    unit = ti.static(1 if atomic else CPU_UNIT)
+    if ti.static(serial_nodes):
+        ti.loop_config(serialize=True)
+    for w in range(batch * nx * ny * nz):
+        s = clock[0]
+        if s >= 0:
+            nodes = nx * ny * nz
+            b = w // nodes
+            i = w % nodes
+            cell = numbers[CELL]
+            parts = lanes
+            if ti.static(atomic):
+                parts = 1
+            node_at = (((s % node_ring) * batch + b) * nodes + i) * NODE
+            before_at = (((s % node_ring) * batch + b) * nodes + i) * BEFORE
+            both = numbers[BLEND] > 0
+            collect(grid, node, node_at, grid_before, before, before_at, both, b, i, batch, nodes, parts)
+            move(
+                node,
+                node_at,
+                before,
+                before_at,
+                new,
+                (b * nodes + i) * NODE_NEW,
+                gravity,
+                ((first + s) * batch + b) * 3,
+                planes,
+                plane_kind,
+                b * plane_count * PLANE,
+                plane_count,
+                node_position(box_low, origin, b, i, ti.Vector([nx, ny, nz]), cell),
+                cell,
+                numbers[DT],
+                numbers[BLEND],
+            )
+    for w in range(batch * lanes * unit):
+        if w % unit == 0:
+            s = clock[0]
+            nodes = nx * ny * nz
+            b = w // unit // lanes
+            lane = w // unit % lanes
+            dt = numbers[DT]
+            cell = numbers[CELL]
+            inverse_cell = numbers[INVERSE_CELL]
+            blend = numbers[BLEND]
+            size = ti.Vector([nx, ny, nz])
+            plane = ny * nz
+            part = lane
+            if ti.static(atomic):
+                part = 0
+            low = load_vector(origin, 3 * b, 1)
+            prony_at = b * elements * PRONY
+            mat = b * COEFFICIENTS * particles
+            step = first + s + 1
+            for p in range(lane * particles // lanes, (lane + 1) * particles // lanes):
+                phase = kind[p]
+                out = (((first + s + 1) % ring) * batch + b) * components * particles + p
+                if s >= 0:
+                    at = (((first + s) % ring) * batch + b) * components * particles + p
+                    x = load_vector(state, at + POSITION * particles, particles)
+                    v = load_vector(state, at + VELOCITY * particles, particles)
+                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
+                    f = (x - low) * inverse_cell - base
+                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
+                    node0 += base[2] - box_low[3 * b + 2]
+                    u, moment, r = grid_to_particle(new, b * nodes * NODE_NEW, node0, nz, plane, f, blend > 0)
+                    L = moment * (4 * inverse_cell)
+                    store_vector(state, out + POSITION * particles, particles, x + dt * u)
+                    store_vector(state, out + VELOCITY * particles, particles, blend * v + r)
+                    store_matrix(state, out + AFFINE * particles, particles, L)
+                    deform(state, at, out, particles, prony, prony_at, elements, phase, dt * L, flags)
+                if s + 1 < steps:
+                    x = load_vector(state, out + POSITION * particles, particles)
+                    v = load_vector(state, out + VELOCITY * particles, particles)
+                    C = load_matrix(state, out + AFFINE * particles, particles)
+                    mass = coefficients[mat + MASS * particles + p]
+                    volume = coefficients[mat + VOLUME * particles + p]
+                    tau = stress(
+                        state,
+                        out,
+                        coefficients,
+                        mat + p,
+                        particles,
+                        prony,
+                        prony_at,
+                        elements,
+                        phase,
+                        pressure,
+                        (step * batch + b) * chambers,
+                    )
+                    push = external_force(
+                        coefficients,
+                        mat + p,
+                        particles,
+                        p,
+                        springs,
+                        force,
+                        (step * batch + b) * groups * 3,
+                        share,
+                        groups,
+                        x,
+                        v,
+                    )
+                    A_before = (mass * cell) * C
+                    A = A_before - (dt * volume * 4 * inverse_cell) * tau
+                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
+                    f = (x - low) * inverse_cell - base
+                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
+                    node0 += base[2] - box_low[3 * b + 2]
+                    particle_to_grid(
+                        atomic,
+                        grid,
+                        (part * batch + b) * nodes * NODE,
+                        grid_before,
+                        (part * batch + b) * nodes * BEFORE,
+                        blend > 0,
+                        node0,
+                        nz,
+                        plane,
+                        f,
+                        mass,
+                        mass * v + dt * push,
+                        A,
+                        mass * v,
+                        A_before,
+                    )
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        clock[0] = clock[0] + 1

@@ -1,0 +1,164 @@
+"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube, a tip load, a tether."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchsoro.actuation import Waveform
+from torchsoro.material import Body
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Force:
+    """A dead force on a group, shared equally among its particles.
+
+    Attributes:
+        particles: int64 indices [n].
+        value: [..., 3] N, constant; or [..., S, 3] with ``time``.
+        time: [S] s, increasing; interpolated linearly.
+    """
+
+    particles: Tensor
+    value: Tensor
+    time: Tensor | None = None
+
+    def at(self, t: Tensor) -> Tensor:
+        """Force at times t [T]: [..., T, 3] N."""
+        if self.time is None:
+            return self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
+        return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t).transpose(-1, -2)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PointMass:
+    """A mass carried by a group, with inertia and weight, shared equally.
+
+    Attributes:
+        particles: int64 indices [n].
+        mass: [...] kg.
+    """
+
+    particles: Tensor
+    mass: Tensor | float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Spring:
+    """A spring from each particle of a group to its place plus ``shift``; together of the given stiffness.
+
+    Attributes:
+        particles: int64 indices [n].
+        stiffness: [...] N/m of the whole group.
+        shift: [..., 3] m from the reference place to the rest point.
+    """
+
+    particles: Tensor
+    stiffness: Tensor | float
+    shift: Tensor | None = None
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drag:
+    """Linear drag on a group, shared equally.
+
+    Attributes:
+        particles: int64 indices [n].
+        coefficient: [...] N s/m of the whole group.
+    """
+
+    particles: Tensor
+    coefficient: Tensor | float
+
+
+Load = Force | PointMass | Spring | Drag
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Attached:
+    """Loads as the particles feel them.
+
+    Attributes:
+        body: The body, with the point masses added.
+        spring: [..., N] N/m, or None without springs and drag.
+        anchor: [..., N, 3] m, or None.
+        drag: [..., N] N s/m, or None.
+        forces: The forces, one group each.
+        share: [groups, N].
+    """
+
+    body: Body
+    spring: Tensor | None
+    anchor: Tensor | None
+    drag: Tensor | None
+    forces: tuple[Force, ...]
+    share: Tensor
+
+
+def attach(body: Body, loads: Sequence[Load]) -> Attached:
+    """Distribute loads over the particles of a body.
+
+    Args:
+        body: The body.
+        loads: Any number of loads; groups may overlap, but no two springs may share a particle.
+
+    Raises:
+        ValueError: for an empty group, an index out of range, a negative mass, stiffness or coefficient, springs that
+            share a particle, or forces of the wrong shape.
+    """
+    x = body.position.detach()
+    count = x.shape[-2]
+    mass, spring, drag = body.mass, x.new_zeros(count), x.new_zeros(count)
+    anchor = body.position.detach()
+    forces = tuple(load for load in loads if isinstance(load, Force))
+    share = x.new_zeros(len(forces), count)
+    held = torch.zeros(count, dtype=torch.bool, device=x.device)
+    for load in loads:
+        group = _indicator(load.particles, count, x)
+        if isinstance(load, Force):
+            share[forces.index(load)] = group
+            if load.value.shape[-1] != 3:
+                raise ValueError(f"force: shape {tuple(load.value.shape)}, wanted [..., 3]")
+        elif isinstance(load, PointMass):
+            mass = mass + _amount("mass", load.mass, x).unsqueeze(-1) * group
+        elif isinstance(load, Drag):
+            drag = drag + _amount("drag coefficient", load.coefficient, x).unsqueeze(-1) * group
+        else:
+            if bool((held & (group > 0)).any()):
+                raise ValueError("springs: two groups share a particle, wanted groups apart from each other")
+            held |= group > 0
+            spring = spring + _amount("stiffness", load.stiffness, x).unsqueeze(-1) * group
+            if load.shift is not None:
+                place = (group > 0).to(x).unsqueeze(-1)
+                anchor = anchor + place * load.shift.to(x).unsqueeze(-2)
+    loose = not any(isinstance(load, Spring | Drag) for load in loads)
+    return Attached(
+        body=replace(body, mass=mass),
+        spring=None if loose else spring,
+        anchor=None if loose else anchor,
+        drag=None if loose else drag,
+        forces=forces,
+        share=share,
+    )
+
+
+def _indicator(particles: Tensor, count: int, like: Tensor) -> Tensor:
+    """Each particle's equal share of a group [N]."""
+    indices = torch.unique(particles.to(like.device))
+    if len(indices) == 0:
+        raise ValueError("particles: an empty group, wanted at least one particle")
+    if int(indices[0]) < 0 or int(indices[-1]) >= count:
+        raise ValueError(f"particles: index {int(indices[0])} to {int(indices[-1])}, wanted 0 to {count - 1}")
+    group = like.new_zeros(count)
+    group[indices] = 1 / len(indices)
+    return group
+
+
+def _amount(name: str, value: Tensor | float, like: Tensor) -> Tensor:
+    number = torch.as_tensor(value).to(like)
+    if not bool((torch.isfinite(number.detach()) & (number.detach() >= 0)).all()):
+        raise ValueError(f"{name} = {value}: wanted finite and at least 0")
+    return number

@@ -1,0 +1,292 @@
+"""From density to particle coefficients: solid, Prony series, gas, the filled body, and the step that they allow."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsoro.domain import Domain, Region
+
+# Table S1 of the paper: moduli relative to the instantaneous one, relaxation times in s.
+_TABLE_S1_EQUILIBRIUM = 9.06e-4
+_TABLE_S1 = ((6.36e-4, 2.73e-1), (2.09e-3, 7.56e-3), (1.27e-2, 2.09e-4), (1.25e-1, 5.77e-6), (8.59e-1, 1.59e-7))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Solid:
+    """Nearly incompressible neo-Hookean solid (Eqs. 3-7); the defaults are the paper's printed resin.
+
+    Attributes:
+        youngs_modulus: Equilibrium Young's modulus [Pa].
+        poisson_ratio: Poisson ratio, 0 to below 0.5.
+        density: [kg/m3].
+
+    Raises:
+        ValueError: for a number that is not finite and positive, or a Poisson ratio outside [0, 0.5).
+    """
+
+    youngs_modulus: float = 0.44e6
+    poisson_ratio: float = 0.4
+    density: float = 1070.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        _positive("youngs_modulus", self.youngs_modulus)
+        _positive("density", self.density)
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: wanted at least 0 and less than 0.5")
+
+    @property
+    def shear(self) -> float:
+        """Equilibrium shear modulus mu [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def bulk(self) -> float:
+        """Bulk modulus K [Pa]."""
+        return self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Gas:
+    """Air in a chamber (Eqs. 9-10); the defaults are the paper's.
+
+    Attributes:
+        stiffness: k [Pa]; 0 for a regulated supply, 0.14 MPa for sealed air.
+        viscosity: Shear viscosity mu_v [Pa s].
+        volume_viscosity: zeta [Pa s].
+        density: [kg/m3]; artificially high, as the stable step falls with its square root.
+
+    Raises:
+        ValueError: for a number that is not finite or negative (density: not positive).
+    """
+
+    stiffness: float = 0.14e6
+    viscosity: float = 1.83e-5
+    volume_viscosity: float = 0.0
+    density: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        _positive("density", self.density)
+        for name in ("stiffness", "viscosity", "volume_viscosity"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name} = {value}: wanted finite and at least 0")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prony:
+    """Maxwell elements beside the equilibrium spring: moduli *relative to the equilibrium modulus*.
+
+    Attributes:
+        moduli: g_i / g_inf [..., M], may require grad.
+        times: Relaxation times tau_i [..., M] in s, may require grad.
+
+    Raises:
+        ValueError: for shapes that differ, more than five elements, negative moduli or times that are not positive.
+    """
+
+    moduli: Tensor
+    times: Tensor
+
+    def __post_init__(self) -> None:
+        """Check shapes and signs."""
+        if self.moduli.shape != self.times.shape or self.moduli.ndim < 1 or self.moduli.shape[-1] > 5:
+            raise ValueError(
+                f"moduli, times: shapes {tuple(self.moduli.shape)} and {tuple(self.times.shape)}, "
+                "wanted the same shape [..., M] with M from 0 to 5"
+            )
+        if not bool((torch.isfinite(self.moduli) & (self.moduli >= 0)).all()):
+            raise ValueError(f"moduli = {self.moduli.tolist()}: wanted finite and at least 0")
+        if not bool((torch.isfinite(self.times) & (self.times > 0)).all()):
+            raise ValueError(f"times = {self.times.tolist()}: wanted finite and positive")
+
+    @classmethod
+    def paper(cls, elements: int = 3) -> Prony:
+        """The first elements of the paper's Table S1, whose moduli are relative to the instantaneous modulus.
+
+        Read literally against an equilibrium modulus of 0.44 MPa, the robot would collapse under its weight; so each
+        is divided by the table's equilibrium entry.
+
+        Raises:
+            ValueError: if ``elements`` is not 0 to 5.
+        """
+        if elements not in range(6):
+            raise ValueError(f"elements = {elements}: wanted 0 to 5, Table S1 has five")
+        table = torch.tensor(_TABLE_S1[:elements], dtype=torch.float64).reshape(elements, 2)
+        return cls(moduli=table[:, 0] / _TABLE_S1_EQUILIBRIUM, times=table[:, 1].clone())
+
+    @property
+    def elements(self) -> int:
+        """Number of Maxwell elements."""
+        return self.moduli.shape[-1]
+
+    def discrete(self, dt: float) -> Tensor:
+        """Numbers of the exact-exponential update [..., M, 3]: a = exp(-dt/tau), b = (1 - a) tau / dt, g.
+
+        H <- a H + b (S_new - S_old) integrates Eq. 8 exactly for a strain that changes linearly in a step.
+        """
+        ratio = dt / self.times
+        return torch.stack([torch.exp(-ratio), -torch.expm1(-ratio) / ratio, self.moduli], dim=-1)
+
+    def storage_loss(self, omega: Tensor) -> tuple[Tensor, Tensor]:
+        """Storage and loss modulus over the equilibrium modulus at angular frequencies [rad/s] (Eqs. 17a, 17b)."""
+        wt = omega.unsqueeze(-1) * self.times
+        part = self.moduli * wt / (1 + wt * wt)
+        return 1 + (part * wt).sum(-1), part.sum(-1)
+
+    def stiffening(self, dt: float) -> float:
+        """Shear stiffness that one step of dt feels, over the equilibrium one: 1 + sum g_i b_i."""
+        step = self.discrete(dt).detach()
+        return float((1 + (step[..., 1] * step[..., 2]).sum(-1)).max())
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Body:
+    """Particles and their coefficients; every tensor but ``chamber`` may require grad and have a leading batch.
+
+    Attributes:
+        position: [..., N, 3] m.
+        mass: [..., N] kg.
+        volume: [..., N] m3, in the reference state.
+        bulk: K of a solid, k of a gas [..., N] Pa.
+        shear: mu of a solid [..., N] Pa.
+        chamber: int32 [N], -1 for solid, else the gas chamber's number.
+        velocity: [..., N, 3] m/s; at rest if None.
+        viscosity: [..., N] Pa s; 0 if None. Solids may have one too.
+        volume_viscosity: [..., N] Pa s; 0 if None.
+    """
+
+    position: Tensor
+    mass: Tensor
+    volume: Tensor
+    bulk: Tensor
+    shear: Tensor
+    chamber: Tensor
+    velocity: Tensor | None = None
+    viscosity: Tensor | None = None
+    volume_viscosity: Tensor | None = None
+
+
+def simp(gamma: Tensor, *, epsilon: float = 1e-5, power: float = 3.0) -> Tensor:
+    """Interpolation between void and solid, (1 - epsilon) gamma^power + epsilon (Eq. 11).
+
+    Args:
+        gamma: Density field in [0, 1], any shape.
+        epsilon: What the void keeps, relative to the solid.
+        power: 3 in the paper, so that intermediate densities carry little.
+
+    Raises:
+        ValueError: if epsilon is not in (0, 1) or power not positive.
+    """
+    if not 0 < epsilon < 1:
+        raise ValueError(f"epsilon = {epsilon}: wanted more than 0 and less than 1")
+    _positive("power", power)
+    return (1 - epsilon) * gamma**power + epsilon
+
+
+def fill(
+    domain: Domain,
+    gamma: Tensor,
+    *,
+    solid: Solid,
+    gas: Gas | None = None,
+    epsilon: float = 1e-5,
+    power: float = 3.0,
+) -> Body:
+    """Fill a domain with material: mass and moduli interpolated by density (Eq. 11), gas in the chambers.
+
+    Args:
+        domain: Lattice and regions.
+        gamma: Density of every particle [..., N]; differentiable. Gas particles ignore theirs.
+        solid: The printed material.
+        gas: The chambers' gas; the paper's if None.
+        epsilon: See :func:`simp`.
+        power: See :func:`simp`.
+
+    Returns:
+        A body on gamma's device and in its precision.
+
+    Raises:
+        ValueError: if gamma's last axis is not the particles.
+    """
+    if gamma.shape[-1] != domain.count:
+        raise ValueError(f"gamma: shape {tuple(gamma.shape)}, wanted [..., {domain.count}], one value for each particle")
+    gas = gas or Gas()
+    like = {"dtype": gamma.dtype, "device": gamma.device}
+    air = (domain.region == Region.GAS).to(gamma.device)
+    scale = simp(gamma, epsilon=epsilon, power=power)
+    zero = torch.zeros((), **like)
+    return Body(
+        position=domain.positions.to(**like),
+        mass=domain.volume * torch.where(air, torch.tensor(gas.density, **like), solid.density * scale),
+        volume=torch.full((domain.count,), domain.volume, **like),
+        bulk=torch.where(air, torch.tensor(gas.stiffness, **like), solid.bulk * scale),
+        shear=torch.where(air, zero, solid.shear * scale),
+        chamber=domain.chamber.to(device=gamma.device, dtype=torch.int32),
+        viscosity=torch.where(air, torch.tensor(gas.viscosity, **like), zero),
+        volume_viscosity=torch.where(air, torch.tensor(gas.volume_viscosity, **like), zero),
+    )
+
+
+# The largest dt c / dx at which waves stay bounded: five elements of Table S1 run at 0.81 and fail at 0.95.
+STABLE_COURANT = 0.85
+
+
+@dataclass(frozen=True, kw_only=True)
+class Courant:
+    """Algorithmic Courant number of a step and the term that sets it."""
+
+    number: float
+    term: str
+
+
+def courant(body: Body, prony: Prony | None, *, dt: float, cell: float) -> Courant:
+    """Courant number dt c / dx of the fastest wave, with the stiffness that one step feels.
+
+    A Maxwell element counts with g_i b_i, not g_i: the exact-exponential update relaxes within the step.
+
+    Args:
+        body: Particles.
+        prony: Maxwell elements of the solids.
+        dt: Step [s].
+        cell: Grid cell [m].
+    """
+    air = body.chamber >= 0
+    factor = prony.stiffening(dt) if prony is not None and prony.elements else 1.0
+    density = (body.mass / body.volume).detach()
+    stiff = body.bulk.detach() + torch.where(air, 0.0, 4 / 3 * factor * body.shear.detach())
+    speeds = torch.sqrt(stiff / density)
+    rates = {"elastic waves in the solid": ~air, "pressure waves in the gas": air}
+    numbers = {
+        term: float(speeds[..., mask].max()) * dt / cell for term, mask in rates.items() if bool(mask.any())
+    }
+    if factor > 1 and "elastic waves in the solid" in numbers and prony is not None:
+        step = prony.discrete(dt).detach()
+        shares = (step[..., 1] * step[..., 2]).reshape(-1, prony.elements).amax(0)
+        term = f"elastic waves in the solid, stiffened {factor:.3g} times by Maxwell element {int(shares.argmax()) + 1}"
+        numbers[term] = numbers.pop("elastic waves in the solid")
+    eta = body.viscosity
+    if eta is not None and bool((eta > 0).any()):
+        numbers["viscosity"] = float((eta.detach() / density).max()) * 4 * dt / cell**2 * STABLE_COURANT
+    term = max(numbers, key=lambda name: numbers[name])
+    return Courant(number=numbers[term], term=term)
+
+
+def stable_step(body: Body, prony: Prony | None, *, cell: float) -> float:
+    """Largest stable step [s] of a body on a grid, by bisection (the stiffness depends on the step)."""
+    low, high = 0.0, 1.0
+    while high - low > 1e-4 * high:
+        middle = (low + high) / 2
+        ok = courant(body, prony, dt=middle, cell=cell).number <= STABLE_COURANT
+        low, high = (middle, high) if ok else (low, middle)
+    return low
+
+
+def _positive(name: str, value: float) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} = {value}: wanted finite and positive")

@@ -1,0 +1,1 @@
+"""The bridge between torch and Taichi, and the only place that knows both."""

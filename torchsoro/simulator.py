@@ -1,0 +1,403 @@
+"""The simulator: a body, what acts on it, and how long, to a named trajectory; differentiable in all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor, nn
+
+from torchsoro.actuation import Waveform
+from torchsoro.contact import Plane
+from torchsoro.kernels import layout
+from torchsoro.loads import Attached, Load, attach
+from torchsoro.material import STABLE_COURANT, Body, Prony, courant
+from torchsoro.ops.march import Inputs, Scene
+from torchsoro.ops.rollout import initial_state, rollout
+
+TRANSFERS = {"apic": 0.0, "flip": 1.0}
+_MEMORY = {"cpu": 2 * 2**30, "cuda": 16 * 2**30}
+_LARGEST = 2**31 - 1  # Taichi indexes a buffer with 32 bits
+_NODE_SHARE = 1.15  # what is kept of the nodes, for each byte of particle state
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """What was recorded; the leading batch is there only if something simulated had one.
+
+    Attributes:
+        time: [S] s.
+        position: Probes [..., S, P, 3] m.
+        velocity: Probes [..., S, P, 3] m/s.
+        center_of_gravity: [..., S, 3] m, weighted as asked for.
+        center_velocity: [..., S, 3] m/s.
+        chamber_volume: Gas volume of each chamber [..., S, chambers] m3.
+        chamber_pressure: Mean gas pressure (Eq. 10) of each chamber [..., S, chambers] Pa.
+        probes: int64 [P] particle indices.
+        final: Last state [B, S, N]; with it a later run can go on.
+    """
+
+    time: Tensor
+    position: Tensor
+    velocity: Tensor
+    center_of_gravity: Tensor
+    center_velocity: Tensor
+    chamber_volume: Tensor
+    chamber_pressure: Tensor
+    probes: Tensor
+    final: Tensor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How a rollout is kept for its gradient.
+
+    Attributes:
+        segment: Substeps between two kept states.
+        keep: Keep every state of a segment in the forward pass, so that backward need not compute it again.
+        memory: What this takes [bytes].
+    """
+
+    segment: int
+    keep: bool
+    memory: int
+
+
+def plan_checkpoints(*, steps: int, state_bytes: int, element_bytes: int, budget: int) -> Plan:
+    """Choose a plan within a memory budget: everything kept if it fits, else segments of about sqrt(steps) substeps.
+
+    Args:
+        steps: Substeps of the rollout.
+        state_bytes: Bytes of one state.
+        element_bytes: Bytes of a number, 4 or 8.
+        budget: Bytes.
+
+    Raises:
+        ValueError: if no plan fits; says the smallest budget that does.
+    """
+    each = int(state_bytes * _NODE_SHARE)
+    most = max(1, _LARGEST * element_bytes // state_bytes - 1)
+    if each * (steps + 1) <= budget and steps <= most:
+        return Plan(segment=steps, keep=True, memory=each * (steps + 1))
+    segment = min(most, steps, max(1, math.isqrt(steps)))
+    memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    if memory > budget:
+        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {memory / 2**20:.0f} MiB")
+    return Plan(segment=segment, keep=False, memory=memory)
+
+
+class Simulator(nn.Module):
+    """Differentiable visco-hyperelastic MLS-MPM on a uniform grid.
+
+    A call simulates a body and returns a :class:`Trajectory`. Gradients flow to every tensor of the body, the Prony
+    series, pressure, gravity, planes and loads that requires one.
+
+    Args:
+        cell: Grid cell dx [m].
+        dt: Substep [s].
+        low: Lower corner of the analysis box [m].
+        high: Upper corner of the analysis box [m].
+        transfer: "apic" (the paper's; damps a little at every substep) or "flip" (affine FLIP; hardly damps).
+        memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 16 GiB on CUDA if None.
+        segment: Substeps between two kept states, instead of the plan from the budget; for tests.
+
+    Raises:
+        ValueError: for numbers that are not finite and positive, an empty box, or an unknown transfer.
+    """
+
+    def __init__(
+        self,
+        *,
+        cell: float,
+        dt: float,
+        low: Sequence[float],
+        high: Sequence[float],
+        transfer: str = "apic",
+        memory_budget: int | None = None,
+        segment: int | None = None,
+    ) -> None:
+        super().__init__()
+        for name, value in (("cell", cell), ("dt", dt), ("memory_budget", memory_budget), ("segment", segment)):
+            if value is not None and not (math.isfinite(value) and value > 0):
+                raise ValueError(f"{name} = {value}: wanted finite and positive")
+        if len(low) != 3 or len(high) != 3 or not all(b - a > 6 * cell for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"low, high = {tuple(low)}, {tuple(high)}: wanted three numbers each, over 6 cells apart")
+        if transfer not in TRANSFERS:
+            raise ValueError(f"transfer = {transfer!r}: wanted one of {', '.join(map(repr, TRANSFERS))}")
+        self.cell, self.dt, self.transfer = float(cell), float(dt), transfer
+        self.low, self.high = _triple(low), _triple(high)
+        self.memory_budget, self.segment = memory_budget, segment
+
+    def extra_repr(self) -> str:
+        """For ``print``."""
+        return f"cell={self.cell:g} m, dt={self.dt:g} s, transfer={self.transfer!r}"
+
+    def forward(
+        self,
+        body: Body,
+        *,
+        duration: float,
+        prony: Prony | None = None,
+        pressure: Waveform | None = None,
+        gravity: Tensor | Sequence[float] | tuple[Tensor, Tensor] = (0.0, 0.0, -9.81),
+        planes: Sequence[Plane] = (),
+        loads: Sequence[Load] = (),
+        sample_every: float | None = None,
+        probes: Tensor | None = None,
+        weight: Tensor | None = None,
+        start: Tensor | None = None,
+    ) -> Trajectory:
+        """Simulate.
+
+        Args:
+            body: Particles; leading axes are a batch of independent simulations, and so are those of what follows.
+            duration: [s], a whole number of substeps.
+            prony: Maxwell elements of the solids.
+            pressure: Gauge pressure p_act of the chambers [..., chambers, S], or [S] for a single chamber.
+            gravity: [..., 3] m/s2; or a pair of times [S] and values [..., S, 3], interpolated linearly.
+            planes: Ground and walls.
+            loads: What is attached.
+            sample_every: Time between two samples [s], a whole number of substeps; about a hundred samples if None.
+            probes: Particles to record, int64 [P]; none if None.
+            weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None.
+            start: State to go on from (``Trajectory.final``) instead of the undeformed body.
+
+        Returns:
+            The trajectory, sampled at 0, ``sample_every``, ... and at the end.
+
+        Raises:
+            ValueError: for bad input, before any work; also if dt is above the limit of the fastest wave.
+            SimulationDiverged: if a particle leaves the box, collapses or is no longer finite.
+        """
+        x = body.position
+        like = {"dtype": x.dtype, "device": x.device}
+        steps = _whole("duration", duration, self.dt)
+        every = max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, self.dt)
+        _check_body(body)
+        self._check_step(body, prony)
+        attached = attach(body, loads)
+        body = attached.body
+
+        times = torch.arange(steps + 1, dtype=torch.float64, device=x.device) * self.dt
+        supply = _supply(body, pressure, times, **like)
+        pull = _gravity(gravity, times[:-1], **like)
+        forces = [force.at(times[:-1]).to(**like) for force in attached.forces]
+        maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(self.dt).to(**like)
+        numbers = [[torch.as_tensor(n, **like) for n in plane.numbers()] for plane in planes]
+        mass = body.mass if weight is None else weight.to(**like)
+
+        ranks = [(x, 2), (maxwell, 2), (supply, 2), (pull, 2), (mass, 1), *((f, 2) for f in forces)]
+        ranks += [(n, 0) for plane in numbers for n in plane]
+        ranks += [(t, t_rank) for t, t_rank in _body_tensors(attached)]
+        lead = torch.broadcast_shapes(*(t.shape[: t.ndim - rank] for t, rank in ranks))
+        batch = math.prod(lead)
+
+        def wide(t: Tensor, rank: int) -> Tensor:
+            tail = t.shape[t.ndim - rank :]
+            return t.expand((*lead, *tail)).reshape((batch, *tail))
+
+        planes_tensor = torch.zeros(batch, 0, 3, **like)
+        if planes:
+            planes_tensor = torch.stack([torch.stack([wide(n, 0) for n in p], -1) for p in numbers], 1)
+        force_tensor = torch.zeros(steps, batch, 0, 3, **like)
+        if forces:
+            force_tensor = torch.stack([wide(f, 2).transpose(0, 1) for f in forces], 2)
+        whole = Inputs(
+            coefficients=_coefficients(attached, wide),
+            prony=wide(maxwell, 2),
+            pressure=wide(supply, 2).permute(2, 0, 1),
+            gravity=wide(pull, 2).transpose(0, 1),
+            force=force_tensor,
+            planes=planes_tensor,
+            origin=self._origin(planes, planes_tensor, batch, **like),
+        )
+        scene = Scene(
+            dt=self.dt,
+            cell=self.cell,
+            blend=TRANSFERS[self.transfer],
+            low=self.low,
+            high=self.high,
+            kind=body.chamber.to(device=x.device, dtype=torch.int32),
+            share=attached.share,
+            plane_kind=torch.tensor(
+                [[p.axis, p.side, int(p.sticks)] for p in planes], dtype=torch.int32, device=x.device
+            ).reshape(-1, 3),
+            springs=attached.spring is not None,
+            probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
+        )
+        _check_probes(scene.probes, x.shape[-2])
+        velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
+        state = initial_state(wide(x, 2), wide(velocity, 2), maxwell.shape[-2]) if start is None else start
+        samples = sorted({*range(0, steps + 1, every), steps})
+        seen, final = self._march(scene, whole, state, wide(mass, 1), samples)
+        shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in seen]
+        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=scene.probes, final=final)
+
+    def _march(
+        self, scene: Scene, whole: Inputs, state: Tensor, weight: Tensor, samples: list[int]
+    ) -> tuple[list[Tensor], Tensor]:
+        """Run the segments of the plan one after the other."""
+        steps = whole.gravity.shape[0]
+        differentiable = torch.is_grad_enabled() and any(
+            t.requires_grad for t in (state, weight, *(getattr(whole, f.name) for f in fields(whole)))
+        )
+        segment, keep = steps, False
+        if differentiable:
+            budget = self.memory_budget or _MEMORY[state.device.type]
+            plan = plan_checkpoints(
+                steps=steps,
+                state_bytes=state.numel() * state.element_size(),
+                element_bytes=state.element_size(),
+                budget=budget,
+            )
+            segment, keep = (plan.segment, plan.keep) if self.segment is None else (self.segment, False)
+        parts: list[tuple[Tensor, ...]] = []
+        for first in range(0, steps, segment):
+            last = min(first + segment, steps)
+            inside = tuple(k - first for k in samples if first < k <= last or k == first == 0)
+            cut = replace(
+                whole,
+                pressure=whole.pressure[first : last + 1],
+                gravity=whole.gravity[first:last],
+                force=whole.force[first:last],
+            )
+            state, *seen = rollout(scene, cut, state, weight, first=first, samples=inside, keep=keep)
+            parts.append(tuple(seen))
+        return [torch.cat(each) for each in zip(*parts, strict=True)], state
+
+    def _check_step(self, body: Body, prony: Prony | None) -> None:
+        found = courant(body, prony, dt=self.dt, cell=self.cell)
+        if found.number > STABLE_COURANT:
+            limit = self.dt * STABLE_COURANT / found.number
+            raise ValueError(
+                f"dt = {self.dt:g} s: above the limit of about {limit:.3g} s, set by {found.term} "
+                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {STABLE_COURANT})"
+            )
+
+    def _origin(self, planes: Sequence[Plane], numbers: Tensor, batch: int, **like) -> Tensor:
+        """A grid node of each simulation: on the first plane of each axis, else the box's lower corner."""
+        columns = []
+        for axis in range(3):
+            first = next((i for i, plane in enumerate(planes) if plane.axis == axis), None)
+            low = torch.full((batch,), self.low[axis], **like)
+            columns.append(low if first is None else numbers[:, first, layout.PLANE_OFFSET])
+        return torch.stack(columns, -1)
+
+
+def _named(seen: list[Tensor]) -> dict[str, Tensor]:
+    names = (
+        "position",
+        "velocity",
+        "center_of_gravity",
+        "center_velocity",
+        "chamber_volume",
+        "chamber_pressure",
+    )
+    return dict(zip(names, seen, strict=True))
+
+
+def _body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
+    body = attached.body
+    flat = (body.mass, body.volume, body.bulk, body.shear, body.viscosity, body.volume_viscosity)
+    pairs = [(t, 1) for t in (*flat, attached.spring, attached.drag) if t is not None]
+    return pairs + [(t, 2) for t in (body.velocity, attached.anchor) if t is not None]
+
+
+def _coefficients(attached: Attached, wide) -> Tensor:
+    body = attached.body
+    zero = torch.zeros_like(body.volume)
+    anchor = torch.zeros_like(body.position) if attached.anchor is None else attached.anchor
+    rows: list[Tensor] = [torch.empty(0)] * layout.COEFFICIENTS
+    for place, values in (
+        (layout.MASS, body.mass),
+        (layout.VOLUME, body.volume),
+        (layout.BULK, body.bulk),
+        (layout.SHEAR, body.shear),
+        (layout.VISCOSITY, body.viscosity),
+        (layout.VOLUME_VISCOSITY, body.volume_viscosity),
+        (layout.SPRING, attached.spring),
+        (layout.DRAG, attached.drag),
+    ):
+        rows[place] = wide(zero if values is None else values, 1)
+    for c in range(3):
+        rows[layout.ANCHOR + c] = wide(anchor[..., c], 1)
+    return torch.stack(rows, 1)
+
+
+def _supply(body: Body, pressure: Waveform | None, times: Tensor, **like) -> Tensor:
+    """Supply pressure [..., chambers, T + 1]."""
+    chambers = int(body.chamber.max()) + 1
+    if pressure is None:
+        return torch.zeros(chambers, len(times), **like)
+    values = pressure.at(times.to(pressure.time)).to(**like)
+    if values.ndim == 1:
+        values = values.unsqueeze(0)
+    if values.shape[-2] != chambers:
+        raise ValueError(f"pressure: {values.shape[-2]} chambers, wanted the body's {chambers}")
+    return values
+
+
+def _gravity(gravity, times: Tensor, **like) -> Tensor:
+    """Gravity at each substep [..., T, 3]."""
+    if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
+        wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
+        values = wave.at(times.to(gravity[0])).transpose(-1, -2).to(**like)
+    else:
+        constant = torch.as_tensor(gravity).to(**like)
+        if constant.shape[-1:] != (3,):
+            raise ValueError(f"gravity: shape {tuple(constant.shape)}, wanted [..., 3]")
+        values = constant.unsqueeze(-2).expand(*constant.shape[:-1], len(times), 3)
+    if not bool(torch.isfinite(values.detach()).all()):
+        raise ValueError(f"gravity = {gravity}: wanted finite numbers")
+    return values
+
+
+def _check_body(body: Body) -> None:
+    x = body.position
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"body.position: dtype {x.dtype}, wanted float32 or float64")
+    if x.device.type not in _MEMORY or (x.is_cuda and x.dtype != torch.float32):
+        raise ValueError(f"body.position: {x.dtype} on {x.device}, wanted float32 on cuda, or either precision on cpu")
+    count = x.shape[-2]
+    if body.chamber.shape != (count,):
+        raise ValueError(f"body.chamber: shape {tuple(body.chamber.shape)}, wanted [{count}]")
+    for name in ("position", "velocity", "mass", "volume", "bulk", "shear", "viscosity", "volume_viscosity"):
+        value = getattr(body, name)
+        if value is None:
+            continue
+        if value.dtype != x.dtype or value.device != x.device:
+            raise ValueError(f"body.{name}: {value.dtype} on {value.device}, wanted {x.dtype} on {x.device}")
+        vector = name in ("position", "velocity")
+        tail = (count, 3) if vector else (count,)
+        if tuple(value.shape[-len(tail) :]) != tail:
+            raise ValueError(f"body.{name}: shape {tuple(value.shape)}, wanted [..., {', '.join(map(str, tail))}]")
+        finite = torch.isfinite(value.detach())
+        least = value.detach() > 0 if name in ("mass", "volume") else value.detach() >= 0
+        if not bool((finite if vector else finite & least).all()):
+            wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
+            bad = value.detach()[~(finite if vector else finite & least)][0]
+            raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
+
+
+def _check_probes(probes: Tensor, count: int) -> None:
+    if probes.dtype != torch.int64 or probes.ndim != 1:
+        raise ValueError(f"probes: {probes.dtype} of shape {tuple(probes.shape)}, wanted int64 [P]")
+    if len(probes) and (int(probes.min()) < 0 or int(probes.max()) >= count):
+        raise ValueError(f"probes: {int(probes.min())} to {int(probes.max())}, wanted 0 to {count - 1}")
+
+
+def _whole(name: str, value: float, dt: float) -> int:
+    """How many substeps a time is."""
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} = {value}: wanted finite and positive")
+    steps = round(value / dt)
+    if steps < 1 or abs(steps * dt - value) > 1e-6 * value:
+        raise ValueError(f"{name} = {value:g} s: wanted a whole number of substeps of {dt:g} s")
+    return steps
+
+
+def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z

@@ -1,0 +1,204 @@
+"""What a run leaves on disk: files replaced as a whole, a table of metrics, and settings that JSON gives back."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import enum
+import io
+import math
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import torch
+
+
+@contextlib.contextmanager
+def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
+    """Open a file for writing that appears under its name only when it is complete and on disk.
+
+    Args:
+        path: The file to create or to replace; its folder must exist.
+
+    Yields:
+        A binary file. If the block raises or the process dies, what stood at ``path`` before stays untouched.
+    """
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")  # the same folder: a rename is atomic only within one file system
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        temporary.unlink(missing_ok=True)
+        raise
+    if os.name == "posix":
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+class MetricsFile:
+    """The rows of ``metrics.csv``, in memory and on disk.
+
+    Args:
+        path: The file; written anew.
+        columns: Names of the columns, ``iteration`` first.
+        rows: The rows to begin with.
+    """
+
+    def __init__(self, path: Path, columns: list[str], rows: list[dict[str, float]]) -> None:
+        self._path = path
+        self._columns = columns or ["iteration"]
+        self._rows = rows
+        self._rewrite()
+
+    @property
+    def last(self) -> dict[str, float]:
+        """The row of the last iteration."""
+        return self._rows[-1]
+
+    def by_column(self) -> dict[str, list[float]]:
+        """The values of each column; NaN where a row has none."""
+        return {column: [row.get(column, math.nan) for row in self._rows] for column in self._columns}
+
+    def add(self, iteration: int, scalars: dict[str, float]) -> None:
+        """Add to the row of an iteration; it is on disk on return.
+
+        Args:
+            iteration: The last iteration or a later one.
+            scalars: Numbers by column; a new name makes a new column.
+
+        Raises:
+            ValueError: If the iteration goes back.
+        """
+        last = self._rows[-1]["iteration"] if self._rows else -1
+        if iteration < last:
+            raise ValueError(f"iteration: got {iteration}, wanted at least the {last} logged last")
+        new = [tag for tag in scalars if tag not in self._columns]
+        self._columns += new
+        if iteration == last:
+            self._rows[-1].update(scalars)
+        else:
+            self._rows.append({"iteration": iteration, **scalars})
+        if new or iteration == last:
+            self._rewrite()
+            return
+        with open(self._path, "a", encoding="utf-8", newline="") as file:
+            file.write(self._text(self._rows[-1:]))
+            file.flush()
+            os.fsync(file.fileno())
+
+    def _text(self, rows: list[dict[str, float]]) -> str:
+        # repr reads back as the same float, so the file of a resumed run equals that of an uninterrupted one.
+        cells = [[repr(row[column]) if column in row else "" for column in self._columns] for row in rows]
+        return _csv_text(cells)
+
+    def _rewrite(self) -> None:
+        with atomic_write(self._path) as file:
+            file.write((_csv_text([self._columns]) + self._text(self._rows)).encode())
+
+
+def _csv_text(rows: list[list[str]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def read_metrics(path: Path, start: int) -> tuple[list[str], list[dict[str, float]]]:
+    """Read a table of metrics whose last line may be cut off.
+
+    Args:
+        path: The file; one that is missing counts as empty.
+        start: Rows of this iteration and later ones are dropped.
+
+    Returns:
+        The names of the columns, and the rows.
+
+    Raises:
+        ValueError: If a line cannot be read; names it.
+    """
+    if not path.exists():
+        return [], []
+    text = path.read_text(encoding="utf-8")
+    header, *lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
+    rows: list[dict[str, float]] = []
+    for number, line in enumerate(lines, start=2):
+        try:
+            iteration = int(line[0])
+            values = {tag: float(cell) for tag, cell in zip(header[1:], line[1:], strict=True) if cell}
+        except (ValueError, IndexError) as error:
+            raise ValueError(f"path: {path} is damaged in line {number} ({error}); choose another folder") from error
+        if iteration < start:
+            rows.append({"iteration": iteration, **values})
+    return header, rows
+
+
+def plain_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn settings into nested dicts of what JSON gives back unchanged.
+
+    Args:
+        settings: Mappings or dataclasses of numbers, strings, paths, enums, small tensors, lists.
+
+    Returns:
+        The same values with strings, finite numbers, booleans, None, lists and dicts only.
+
+    Raises:
+        ValueError: If something else is among them; names it.
+    """
+    plain = _plain(settings, "")
+    if not isinstance(plain, dict):
+        raise ValueError(f"settings: got {type(settings).__name__}, wanted a mapping or a dataclass")
+    return plain
+
+
+def _plain(value: Any, name: str) -> Any:
+    if isinstance(value, enum.Enum):
+        return _plain(value.value, name)
+    if isinstance(value, np.ndarray | np.generic | torch.Tensor):
+        return _plain(value.tolist(), name)
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float) and math.isfinite(value):
+        return value
+    if isinstance(value, Path | torch.device | torch.dtype):
+        return str(value)
+    if isinstance(value, list | tuple):
+        return [_plain(item, f"{name}[{index}]") for index, item in enumerate(value)]
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        value = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if isinstance(value, Mapping) and all(isinstance(key, str) for key in value):
+        return {key: _plain(item, f"{name}.{key}" if name else key) for key, item in value.items()}
+    raise ValueError(
+        f"settings: {name or 'the whole'} is {value!r}, wanted finite numbers, strings, lists and mappings"
+    )
+
+
+def check_storable(value: Any, name: str) -> None:
+    """Refuse what ``torch.load(weights_only=True)`` would refuse when it is too late.
+
+    Args:
+        value: What is to be saved: tensors, numbers, strings, None, and lists, tuples and mappings of them.
+        name: How to call it in the message.
+
+    Raises:
+        ValueError: If something else is among it.
+    """
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            check_storable(key, f"a key of {name}")
+            check_storable(item, f"{name}[{key!r}]")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            check_storable(item, f"{name}[{index}]")
+    elif not isinstance(value, torch.Tensor) and type(value) not in (bool, int, float, str, type(None)):
+        kind = type(value).__name__
+        raise ValueError(f"{name}: got {kind}, wanted tensors, numbers, strings, lists, dicts or a state_dict")
