@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -20,7 +21,9 @@ ORDER = """
 errors storage
 runtime
 domain
-field material rheology actuation contact loads
+field actuation contact rheology
+material
+loads
 kernels
 ops
 simulator
@@ -73,6 +76,7 @@ def line_of(module: str) -> str:
     return folder if folder in FOLDERS else module
 
 
+@functools.cache
 def imported(module: str) -> tuple[set[str], set[str]]:
     """The modules of torchsoro ('' is the root itself) and the other top-level packages that a module imports."""
     inside: set[str] = set()
@@ -154,6 +158,7 @@ def test_every_public_name_is_defined_in_one_module():
         assert len(homes) + own == 1 or name == "__version__", f"torchsoro.{name} is defined in {homes}"
 
 
+@functools.cache
 def defined(module: str) -> set[str]:
     """Names that the top level of a module defines, imports left out."""
     found: set[str] = set()

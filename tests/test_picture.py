@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -114,10 +115,10 @@ def test_last_cycle_from_pressure_period_or_nothing() -> None:
 
 def test_movies_are_whole(tmp_path: Path) -> None:
     film = movie(tmp_path / "gait.mp4", **arguments(), title="walker", width=480, height=320, fps=20)
-    reader = imageio_ffmpeg.read_frames(str(film))
-    meta = next(reader)
-    pictures = [np.frombuffer(picture, np.uint8) for picture in reader]
-    assert meta["size"] == (480, 320) and meta["fps"] == 20 and len(pictures) == 5
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(film), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    decoded = subprocess.run(command, capture_output=True, check=True)
+    pictures = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 320, 480, 3)
+    assert len(pictures) == 5 and b"20 fps" in decoded.stderr and b"h264" in decoded.stderr
     assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 50  # it moves
     given = arguments(3) | {"pressure": None, "frames": walk(3, axis=2), "planes": WALLS, "direction": (0, 0, 1)}
     with Image.open(movie(tmp_path / "gait.gif", **given, width=320, height=240)) as picture:
@@ -132,6 +133,9 @@ def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.M
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "false")
+    with pytest.raises(RuntimeError, match="ffmpeg could not write"):
+        movie(tmp_path / "new.mp4", **arguments(2))
     monkeypatch.setattr("torchsoro.picture._write_gif", fail)
     with pytest.raises(OSError, match="disk full"):
         movie(old, **arguments(2))

@@ -82,44 +82,41 @@ import torch
 from torchsoro.training import RunFolder
 
 def work(path):
-    settings = {"seed": 1}
-    run = RunFolder(path, settings, resume=os.path.exists(path + "/settings.json"))
-    state = run.load()
-    for iteration in range(run.start, 10**9):
+    run = RunFolder(path, {"seed": 1})
+    for iteration in range(10**9):
         run.log(iteration, {"objective/L": iteration})
-        run.save(iteration, field=torch.full((100_000,), float(iteration)), phase="x")
+        run.save(iteration, field=torch.full((100_000,), float(iteration)))
 
 random.seed(5)
-path, last, loaded = sys.argv[1], -1, 0
-for trial in range(12):
+for trial in range(10):
+    path = f"{sys.argv[1]}/{trial}"
     child = os.fork()
     if child == 0:
         work(path)
     time.sleep(random.uniform(0.05, 0.2))
     os.kill(child, signal.SIGKILL)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL  # killed by us: it did not fail by itself
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL  # it did not fail by itself before
     if os.path.exists(path + "/checkpoint.pt"):
         state = torch.load(path + "/checkpoint.pt", weights_only=True)
-        assert state["iteration"] >= last, (state["iteration"], last)
         assert (state["items"]["field"] == state["iteration"]).all()
-        last, loaded = state["iteration"], loaded + 1
-assert loaded and last > 0
-print(last)
+        print(trial, state["iteration"])
 """
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path):
-    path = tmp_path / "run"
-    done = subprocess.run([sys.executable, "-c", KILLED, str(path)], capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    last = int(done.stdout)
-    with RunFolder(path, {"seed": 1}, resume=True) as run:
-        assert run.start == last + 1
-        assert run.metrics["iteration"] == list(range(last + 1))
-        assert bool((run.load()["field"] == last).all())
-    assert not list(path.glob("*.tmp"))
-    assert [event.step for event in events(path).Scalars("objective/L")] == list(range(last + 1))
+    found = [[int(word) for word in line.split()] for line in done.stdout.splitlines()]
+    assert len(found) > 3, "most trials should reach a checkpoint"
+    for trial, last in found[-3:]:
+        path = tmp_path / str(trial)
+        with RunFolder(path, {"seed": 1}, resume=True) as run:
+            assert run.start == last + 1
+            assert run.metrics["iteration"] == list(range(last + 1))
+            assert bool((run.load()["field"] == last).all())
+        assert not list(path.glob("*.tmp"))
+        assert [event.step for event in events(path).Scalars("objective/L")] == list(range(last + 1))
 
 
 def test_sigterm_ends_the_run_like_ctrl_c(tmp_path, capsys):

@@ -9,8 +9,10 @@ down. Everything passed in is in SI units; everything drawn is in mm from the lo
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
+import subprocess
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -204,15 +206,19 @@ def _pictures(
 
 
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: int) -> None:
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", quality=8, macro_block_size=16, ffmpeg_log_level="error"
-    )
-    writer.send(None)
-    try:
-        for picture in pictures:
-            writer.send(picture)
-    finally:
-        writer.close()
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-"]
+    command += ["-an", "-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]
+    with tempfile.TemporaryFile() as messages:
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=messages) as ffmpeg:
+            assert ffmpeg.stdin is not None
+            with contextlib.suppress(BrokenPipeError):  # ffmpeg has stopped, and says why below
+                for picture in pictures:
+                    ffmpeg.stdin.write(picture.data)
+                ffmpeg.stdin.close()
+        if ffmpeg.returncode:
+            messages.seek(0)
+            raise RuntimeError(f"ffmpeg could not write the movie: {messages.read().decode(errors='replace').strip()}")
 
 
 def _write_gif(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: int) -> None:

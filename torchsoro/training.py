@@ -25,6 +25,7 @@ import math
 import signal
 import sys
 import threading
+import time
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -38,6 +39,7 @@ from tqdm import tqdm
 from torchsoro.storage import MetricsFile, atomic_write, check_storable, plain_settings, read_metrics
 
 _ABSENT = "absent"
+_EVENTS = "events.out.tfevents.*"
 
 
 class RunFolder:
@@ -89,6 +91,7 @@ class RunFolder:
         self._saved = self.start - 1
         self._bar: tqdm | None = None
         self._old_handler: Any = None
+        self._wait_for_next_second()
         # Events of iterations that the checkpoint does not contain would otherwise be shown twice.
         self._writer = SummaryWriter(str(self.path), purge_step=self.start if resume else None, flush_secs=10)
 
@@ -273,11 +276,19 @@ class RunFolder:
             kept = f"{self._saved + 1} iterations are saved in {self.path}"
             print(f"interrupted: {kept}; resume to continue", file=sys.stderr)
 
+    def _wait_for_next_second(self) -> None:
+        # TensorBoard reads event files by name, which holds the second of their making and then the process: one that
+        # purges the events of another must come after it.
+        seconds = [int(path.name.split(".")[3]) for path in self.path.glob(_EVENTS)]
+        now = time.time()
+        if seconds and int(now) == max(seconds):
+            time.sleep(max(seconds) + 1 - now)
+
     def _refuse_wrong_folder(self, resume: bool) -> None:
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"path: {self.path} is a file, wanted a folder for the run")
         settings = self.path / "settings.json"
-        held = settings.exists() or self._checkpoint.exists() or any(self.path.glob("events.out.tfevents.*"))
+        held = settings.exists() or self._checkpoint.exists() or any(self.path.glob(_EVENTS))
         if held and not resume:
             raise ValueError(f"path: {self.path} already holds a run; resume it, or choose another folder")
         if resume and not settings.exists():
