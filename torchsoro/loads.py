@@ -1,4 +1,4 @@
-"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube, a tip load, a tether."""
+"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube or a tip load."""
 
 from __future__ import annotations
 

@@ -215,7 +215,9 @@ def fill(
         ValueError: if gamma's last axis is not the particles.
     """
     if gamma.shape[-1] != domain.count:
-        raise ValueError(f"gamma: shape {tuple(gamma.shape)}, wanted [..., {domain.count}], one value for each particle")
+        raise ValueError(
+            f"gamma: shape {tuple(gamma.shape)}, wanted [..., {domain.count}], one value for each particle"
+        )
     gas = gas or Gas()
     like = {"dtype": gamma.dtype, "device": gamma.device}
     air = (domain.region == Region.GAS).to(gamma.device)
@@ -262,9 +264,7 @@ def courant(body: Body, prony: Prony | None, *, dt: float, cell: float) -> Coura
     stiff = body.bulk.detach() + torch.where(air, 0.0, 4 / 3 * factor * body.shear.detach())
     speeds = torch.sqrt(stiff / density)
     rates = {"elastic waves in the solid": ~air, "pressure waves in the gas": air}
-    numbers = {
-        term: float(speeds[..., mask].max()) * dt / cell for term, mask in rates.items() if bool(mask.any())
-    }
+    numbers = {term: float(speeds[..., mask].max()) * dt / cell for term, mask in rates.items() if bool(mask.any())}
     if factor > 1 and "elastic waves in the solid" in numbers and prony is not None:
         step = prony.discrete(dt).detach()
         shares = (step[..., 1] * step[..., 2]).reshape(-1, prony.elements).amax(0)

@@ -8,7 +8,7 @@ import torch
 
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
-import taichi as ti  # noqa: E402  (the variable above silences its banner and must be set before)
+import taichi as ti
 
 _started: str | None = None
 

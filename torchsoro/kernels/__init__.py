@@ -1,1 +1,1 @@
-"""Taichi kernels: shape functions, stress laws, transfers and node laws, each with its adjoint; torch never enters here."""
+"""Taichi kernels: shape functions, stress laws, transfers, node laws and the adjoint of each; torch never enters."""

@@ -7,6 +7,7 @@ between two passes. Sums over particles or nodes (pressure, gravity, ...) go to 
 
 import taichi as ti
 
+from torchsoro.kernels.constitutive import deform_adjoint, stress, stress_adjoint
 from torchsoro.kernels.forward import (
     BLEND,
     CELL,
@@ -16,20 +17,15 @@ from torchsoro.kernels.forward import (
     Integers,
     Reals,
     external_force,
-    history_sum,
     lowest_node,
-    stress,
 )
 from torchsoro.kernels.layout import (
     ADJOINT_NEW,
     AFFINE,
     ANCHOR,
     BEFORE,
-    BULK,
     COEFFICIENTS,
-    DEFORMATION,
     DRAG,
-    HISTORY,
     MASS,
     NODE,
     NODE_NEW,
@@ -37,163 +33,20 @@ from torchsoro.kernels.layout import (
     PLANE,
     POSITION,
     PRONY,
-    PRONY_DECAY,
-    PRONY_GAIN,
-    PRONY_MODULUS,
-    SHEAR,
     SPRING,
     VELOCITY,
-    VISCOSITY,
     VOLUME,
-    VOLUME_VISCOSITY,
 )
-from torchsoro.kernels.nodes import add, move, node_adjoint, node_position
-from torchsoro.kernels.stress import (
-    gas_pressure,
-    pull_back,
-    pull_back_adjoint,
-    solid_stress_adjoint,
-    viscous_stress_adjoint,
-)
+from torchsoro.kernels.nodes import move, node_adjoint, node_position
 from torchsoro.kernels.tensor import (
-    cofactor,
+    add,
     contract,
     load_matrix,
-    load_symmetric,
-    load_symmetric_adjoint,
     load_vector,
-    plus_identity,
     store_matrix,
-    store_symmetric_adjoint,
     store_vector,
 )
 from torchsoro.kernels.transfer import grid_to_particle_adjoint, particle_to_grid_adjoint
-
-
-@ti.func
-def deform_adjoint(
-    atomic: ti.template(),
-    state: ti.template(),
-    at,
-    out,
-    bar: ti.template(),
-    here,
-    particles,
-    prony: ti.template(),
-    prony_at,
-    prony_bar: ti.template(),
-    prony_row,
-    want_prony,
-    elements,
-    kind,
-    step_gradient,
-):
-    """Adjoint of ``forward.deform``: replaces F and H in the adjoint state, returns the gradient by dt L."""
-    F = load_matrix(state, at + DEFORMATION * particles, particles)
-    F_bar = load_matrix(bar, here + DEFORMATION * particles, particles)
-    step_bar = F * 0
-    if kind < 0:
-        old_bar = F * 0
-        if elements > 0:
-            F_new = load_matrix(state, out + DEFORMATION * particles, particles)
-            S_bar = F * 0
-            for e in range(elements):
-                H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
-                S_bar += prony[prony_at + PRONY * e + PRONY_GAIN] * H_bar
-            if want_prony == 1:
-                change = pull_back(F_new) - pull_back(F)
-                for e in range(elements):
-                    H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
-                    H = load_symmetric(state, at + (HISTORY + 6 * e) * particles, particles)
-                    add(atomic, prony_bar, prony_row + PRONY * e + PRONY_DECAY, contract(H_bar, H))
-                    add(atomic, prony_bar, prony_row + PRONY * e + PRONY_GAIN, contract(H_bar, change))
-            for e in range(elements):
-                a = prony[prony_at + PRONY * e + PRONY_DECAY]
-                for c in range(6):
-                    place = here + (HISTORY + 6 * e + c) * particles
-                    bar[place] = a * bar[place]
-            F_bar += pull_back_adjoint(F_new, S_bar)
-            old_bar = pull_back_adjoint(F, -S_bar)
-        step_bar = F_bar @ F.transpose()
-        F_bar = F_bar + step_gradient.transpose() @ F_bar + old_bar
-    else:
-        J_bar = F_bar[0, 0]
-        step_bar = plus_identity(step_bar, J_bar * F[0, 0])
-        F_bar[0, 0] = J_bar * (1 + step_gradient.trace())
-        for c in range(6 * elements):
-            bar[here + (HISTORY + c) * particles] = 0
-    store_matrix(bar, here + DEFORMATION * particles, particles, F_bar)
-    return step_bar
-
-
-@ti.func
-def stress_adjoint(
-    atomic: ti.template(),
-    state: ti.template(),
-    at,
-    bar: ti.template(),
-    here,
-    coefficients: ti.template(),
-    coefficients_bar: ti.template(),
-    mat,
-    particles,
-    prony: ti.template(),
-    prony_at,
-    prony_bar: ti.template(),
-    prony_row,
-    want_prony,
-    elements,
-    kind,
-    pressure: ti.template(),
-    pressure_at,
-    pressure_bar: ti.template(),
-    pressure_row,
-    tau_bar,
-):
-    """Adjoint of ``forward.stress``: adds to F and H in the adjoint state, returns the gradient by C."""
-    F = load_matrix(state, at + DEFORMATION * particles, particles)
-    C = load_matrix(state, at + AFFINE * particles, particles)
-    bulk = coefficients[mat + BULK * particles]
-    F_bar = load_matrix(bar, here + DEFORMATION * particles, particles)
-    C_bar = F * 0
-    J = F[0, 0]
-    J_bar = J * 0
-    if kind < 0:
-        J = F.determinant()
-        Q = F * 0
-        if elements > 0:
-            Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
-        shear = coefficients[mat + SHEAR * particles]
-        by_F, Q_bar, bulk_bar, shear_bar = solid_stress_adjoint(F, Q, bulk, shear, tau_bar)
-        F_bar += by_F
-        add(False, coefficients_bar, mat + BULK * particles, bulk_bar)
-        add(False, coefficients_bar, mat + SHEAR * particles, shear_bar)
-        for e in range(elements):
-            place = (HISTORY + 6 * e) * particles
-            H_bar = load_symmetric_adjoint(bar, here + place, particles)
-            H_bar += prony[prony_at + PRONY * e + PRONY_MODULUS] * Q_bar
-            store_symmetric_adjoint(bar, here + place, particles, H_bar)
-            if want_prony == 1:
-                H = load_symmetric(state, at + place, particles)
-                add(atomic, prony_bar, prony_row + PRONY * e + PRONY_MODULUS, contract(Q_bar, H))
-    else:
-        trace_bar = tau_bar.trace()
-        J_bar = trace_bar * (J * bulk - gas_pressure(J, bulk, pressure[pressure_at + kind]))
-        add(False, coefficients_bar, mat + BULK * particles, -(J * (1 - J) * trace_bar))
-        add(atomic, pressure_bar, pressure_row + kind, -J * trace_bar)
-    eta = coefficients[mat + VISCOSITY * particles]
-    zeta = coefficients[mat + VOLUME_VISCOSITY * particles]
-    by_J, by_C, eta_bar, zeta_bar = viscous_stress_adjoint(J, C, eta, zeta, tau_bar)
-    C_bar = by_C
-    J_bar += by_J
-    add(False, coefficients_bar, mat + VISCOSITY * particles, eta_bar)
-    add(False, coefficients_bar, mat + VOLUME_VISCOSITY * particles, zeta_bar)
-    if kind < 0:
-        F_bar += J_bar * cofactor(F)
-    else:
-        F_bar[0, 0] += J_bar
-    store_matrix(bar, here + DEFORMATION * particles, particles, F_bar)
-    return C_bar
 
 
 @ti.kernel

@@ -7,41 +7,30 @@ run has the same bits whatever the number of threads; on a GPU every particle is
 
 import taichi as ti
 
+from torchsoro.kernels.constitutive import deform, stress
 from torchsoro.kernels.layout import (
     AFFINE,
     ANCHOR,
     BEFORE,
-    BULK,
     COEFFICIENTS,
-    DEFORMATION,
     DRAG,
-    HISTORY,
+    FLAG_LEFT_BOX,
     MASS,
     NODE,
     NODE_NEW,
     PLANE,
     POSITION,
     PRONY,
-    PRONY_DECAY,
-    PRONY_GAIN,
-    PRONY_MODULUS,
-    SHEAR,
     SPRING,
     VELOCITY,
-    VISCOSITY,
     VOLUME,
-    VOLUME_VISCOSITY,
 )
 from torchsoro.kernels.nodes import collect, move, node_position
 from torchsoro.kernels.spline import base_node
-from torchsoro.kernels.stress import gas_pressure, pull_back, solid_stress, viscous_stress
 from torchsoro.kernels.tensor import (
     load_matrix,
-    load_symmetric,
     load_vector,
-    plus_identity,
     store_matrix,
-    store_symmetric,
     store_vector,
 )
 from torchsoro.kernels.transfer import grid_to_particle, particle_to_grid
@@ -55,9 +44,6 @@ DT, CELL, INVERSE_CELL, BLEND = 0, 1, 2, 3
 # Taichi hands a CPU thread no fewer than 512 iterations of a loop: a lane is that many, of which one works.
 CPU_UNIT = 512
 
-# What a substep flags; the simulator then repeats the chunk step by step to say where.
-FLAG_LEFT_BOX, FLAG_COLLAPSED = 0, 1
-
 
 @ti.func
 def lowest_node(x, inverse_cell, box_low: ti.template(), b, size, flags: ti.template()):
@@ -69,51 +55,6 @@ def lowest_node(x, inverse_cell, box_low: ti.template(), b, size, flags: ti.temp
             flags[FLAG_LEFT_BOX] = 1
             base[c] = ti.max(0, ti.min(local, size[c] - 3)) + box_low[3 * b + c]
     return base
-
-
-@ti.func
-def history_sum(state: ti.template(), at, stride, prony: ti.template(), prony_at, elements):
-    """Q = sum_i g_i H_i over the Maxwell elements."""
-    Q = load_symmetric(state, at, stride) * prony[prony_at + PRONY_MODULUS]
-    for e in range(1, elements):
-        H = load_symmetric(state, at + 6 * e * stride, stride)
-        Q += H * prony[prony_at + PRONY * e + PRONY_MODULUS]
-    return Q
-
-
-@ti.func
-def stress(
-    state: ti.template(),
-    at,
-    coefficients: ti.template(),
-    mat,
-    particles,
-    prony: ti.template(),
-    prony_at,
-    elements,
-    kind,
-    pressure: ti.template(),
-    pressure_at,
-):
-    """Kirchhoff stress of a particle from its state: solid with Maxwell elements, or gas; both with viscosity."""
-    F = load_matrix(state, at + DEFORMATION * particles, particles)
-    C = load_matrix(state, at + AFFINE * particles, particles)
-    bulk = coefficients[mat + BULK * particles]
-    J = F[0, 0]
-    tau = F * 0
-    if kind < 0:
-        J = F.determinant()
-        Q = F * 0
-        if elements > 0:
-            Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
-        tau = solid_stress(F, Q, bulk, coefficients[mat + SHEAR * particles])
-    else:
-        tau = plus_identity(tau, -J * gas_pressure(J, bulk, pressure[pressure_at + kind]))
-    eta = coefficients[mat + VISCOSITY * particles]
-    zeta = coefficients[mat + VOLUME_VISCOSITY * particles]
-    if eta != 0 or zeta != 0:
-        tau += viscous_stress(J, C, eta, zeta)
-    return tau
 
 
 @ti.func
@@ -139,44 +80,6 @@ def external_force(
         drag = coefficients[mat + DRAG * particles]
         f += spring * (load_vector(coefficients, mat + ANCHOR * particles, particles) - x) - drag * v
     return f
-
-
-@ti.func
-def deform(
-    state: ti.template(),
-    at,
-    out,
-    particles,
-    prony: ti.template(),
-    prony_at,
-    elements,
-    kind,
-    step_gradient,
-    flags: ti.template(),
-):
-    """F <- (I + dt L) F (a gas keeps only J), then the exact-exponential history H <- a H + b (S' - S)."""
-    F = load_matrix(state, at + DEFORMATION * particles, particles)
-    if kind < 0:
-        F_new = F + step_gradient @ F
-        store_matrix(state, out + DEFORMATION * particles, particles, F_new)
-        if F_new.determinant() <= 0:
-            flags[FLAG_COLLAPSED] = 1
-        if elements > 0:
-            change = pull_back(F_new) - pull_back(F)
-            for e in range(elements):
-                place = (HISTORY + 6 * e) * particles
-                a = prony[prony_at + PRONY * e + PRONY_DECAY]
-                b = prony[prony_at + PRONY * e + PRONY_GAIN]
-                H = load_symmetric(state, at + place, particles)
-                store_symmetric(state, out + place, particles, a * H + b * change)
-    else:
-        J = F[0, 0] * (1 + step_gradient.trace())
-        F[0, 0] = J
-        store_matrix(state, out + DEFORMATION * particles, particles, F)
-        for c in range(6 * elements):
-            state[out + (HISTORY + c) * particles] = 0
-        if J <= 0:
-            flags[FLAG_COLLAPSED] = 1
 
 
 @ti.kernel

@@ -38,3 +38,6 @@ NODE_NEW = 6
 # Adjoint of a node: of (moved + transferred) velocity, and of the FLIP part of the transferred one.
 ADJOINT_MOVED, ADJOINT_FLIP = 0, 3
 ADJOINT_NEW = 6
+
+# What a substep flags; the march then repeats the chunk step by step to say where.
+FLAG_LEFT_BOX, FLAG_COLLAPSED = 0, 1

@@ -18,16 +18,7 @@ from torchsoro.kernels.layout import (
     PLANE_FRICTION,
     PLANE_STICK,
 )
-from torchsoro.kernels.tensor import load_vector, store_vector
-
-
-@ti.func
-def add(atomic: ti.template(), a: ti.template(), at, value):
-    """Add to a buffer: atomically where threads share it, plainly where a lane owns it."""
-    if ti.static(atomic):
-        ti.atomic_add(a[at], value)
-    else:
-        a[at] = a[at] + value
+from torchsoro.kernels.tensor import add, load_vector, store_vector
 
 
 @ti.func
@@ -197,4 +188,3 @@ def node_adjoint(
     store_vector(bar, bar_at + NODE_VELOCITY, 1, momentum_bar)
     if both:
         store_vector(before_bar, before_bar_at, 1, flip_bar)
-

@@ -4,6 +4,15 @@ import taichi as ti
 
 
 @ti.func
+def add(atomic: ti.template(), a: ti.template(), at, value):
+    """Add to a buffer: atomically where threads share it, plainly where a lane owns it."""
+    if ti.static(atomic):
+        ti.atomic_add(a[at], value)
+    else:
+        a[at] = a[at] + value
+
+
+@ti.func
 def load_vector(a: ti.template(), at, stride):
     """Three components, ``stride`` apart."""
     return ti.Vector([a[at], a[at + stride], a[at + 2 * stride]])

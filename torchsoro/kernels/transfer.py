@@ -14,9 +14,8 @@ from torchsoro.kernels.layout import (
     NODE_TRANSFER,
     NODE_VELOCITY,
 )
-from torchsoro.kernels.nodes import add
 from torchsoro.kernels.spline import slopes, weights
-from torchsoro.kernels.tensor import load_vector
+from torchsoro.kernels.tensor import add, load_vector
 
 
 @ti.func

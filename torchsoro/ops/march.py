@@ -192,9 +192,7 @@ class March:
         for chunk in reversed(self.chunks):
             self._retreat(chunk, states, bar, sums, add, prony)
         by_time = ("pressure", "gravity", "force")
-        return {
-            name: s if name == "coefficients" else s.sum(1 if name in by_time else 0) for name, s in sums.items()
-        }
+        return {name: s if name == "coefficients" else s.sum(1 if name in by_time else 0) for name, s in sums.items()}
 
     def _chunk(self, first: int, state: Tensor, longest: int, keep: bool) -> Chunk:
         """The active box around the particles, and the substeps that it is expected to last."""
@@ -267,7 +265,9 @@ class March:
         self.zeroed.clear()
         return False
 
-    def _retreat(self, chunk: Chunk, states: Tensor, bar: Tensor, sums: dict[str, Tensor], add: Look, prony: bool) -> None:
+    def _retreat(
+        self, chunk: Chunk, states: Tensor, bar: Tensor, sums: dict[str, Tensor], add: Look, prony: bool
+    ) -> None:
         parts = 1 if self.gpu else self.lanes
         scratch = self._zeros("adjoint", parts * self.batch * chunk.nodes * layout.ADJOINT_NEW)
         node_bar = bar.new_empty(self.batch * chunk.nodes * layout.NODE)
