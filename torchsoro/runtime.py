@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 import torch
 
@@ -34,7 +35,7 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
         raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
     if _started == kind and threads is None:
         return
-    options = {} if threads is None else {"cpu_max_num_threads": threads}
+    options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
     # Memory comes from torch; Taichi needs next to none on the GPU.
     if kind == "cuda":
         options["device_memory_GB"] = 0.3

@@ -94,7 +94,7 @@ def touches(distance):
 
 @ti.func
 def adhesive_speed(planes: ti.template(), at, k, distance, mass, impulse):
-    """Pull-off speed that adhesion cancels in a step, traction times node area times dt over mass; at the plane only."""
+    """Pull-off speed that adhesion cancels in a step, at the plane only: traction times area times dt over mass."""
     hold = mass * 0
     if distance > -0.5:
         hold = planes[at + PLANE * k + PLANE_ADHESION] * impulse / mass

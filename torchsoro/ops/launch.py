@@ -8,6 +8,7 @@ what changes (the number of the substep) from a buffer that they count up themse
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import taichi as ti
 from taichi.lang import impl
@@ -39,7 +40,7 @@ def capture(kernel, *arguments) -> Callable[[int], None]:
         else:
             context.set_arg_int((slot,), value)
         slot += 1
-    program = impl.get_runtime().prog
+    program: Any = impl.get_runtime().prog
     data = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
 
     def launch(times: int, alive: tuple = arguments) -> None:

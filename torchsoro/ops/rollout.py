@@ -105,7 +105,7 @@ class _Rollout(torch.autograd.Function):
             wanted = [None if g is None else g[ctx.samples.index(k)] for g in seen_bar]
             leaves = [t.detach().requires_grad_() for t in (states[k], weight, named.coefficients, named.pressure[k])]
             with torch.enable_grad():
-                seen = observe(*leaves, ctx.scene)
+                seen = observe(leaves[0], leaves[1], leaves[2], leaves[3], ctx.scene)
             pairs = [(s, g) for s, g in zip(seen, wanted, strict=True) if g is not None and s.requires_grad]
             if pairs:
                 outputs, gradients = zip(*pairs, strict=True)
