@@ -117,7 +117,8 @@ def substep_adjoint(
             parts = lanes
             if ti.static(atomic):
                 parts = 1
-            for i in range(lane * nodes // node_lanes, (lane + 1) * nodes // node_lanes):
+            each = (nodes + node_lanes - 1) // node_lanes
+            for i in range(lane * each, ti.min(nodes, (lane + 1) * each)):
                 x = node_position(box_low, origin, b, i, ti.Vector([nx, ny, nz]), cell)
                 if t + 1 < steps:
                     time = first + t + 1
@@ -191,7 +192,8 @@ def substep_adjoint(
             prony_at = b * elements * PRONY
             prony_row = (row * batch + b) * elements * PRONY
             mat0 = b * COEFFICIENTS * particles
-            for p in range(lane * particles // lanes, (lane + 1) * particles // lanes):
+            each = (particles + lanes - 1) // lanes
+            for p in range(lane * each, ti.min(particles, (lane + 1) * each)):
                 phase = kind[p]
                 mat = mat0 + p
                 here = b * components * particles + p

@@ -177,8 +177,9 @@ def substep(
             low = load_vector(origin, 3 * b, 1)
             prony_at = b * elements * PRONY
             mat = b * COEFFICIENTS * particles
+            each = (particles + lanes - 1) // lanes
             step = first + s + 1
-            for p in range(lane * particles // lanes, (lane + 1) * particles // lanes):
+            for p in range(lane * each, ti.min(particles, (lane + 1) * each)):
                 phase = kind[p]
                 out = (((first + s + 1) % ring) * batch + b) * components * particles + p
                 if s >= 0:

@@ -29,22 +29,33 @@ def capture(kernel, *arguments) -> Callable[[int], None]:
     """
     primal = kernel._primal
     compiled = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
-    context = compiled.make_launch_context()
-    slot = 0
-    for argument, value in zip(primal.arguments, arguments, strict=True):
-        if isinstance(argument.annotation, ti.template) or argument.annotation is ti.template:
-            continue
-        if isinstance(value, Tensor):
-            size = value.element_size() * value.nelement()
-            context.set_arg_external_array_with_shape((slot,), value.data_ptr(), size, list(value.shape), 0)
-        else:
-            context.set_arg_int((slot,), value)
-        slot += 1
     program: Any = impl.get_runtime().prog
     data = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
+    values = [
+        value
+        for argument, value in zip(primal.arguments, arguments, strict=True)
+        if not (isinstance(argument.annotation, ti.template) or argument.annotation is ti.template)
+    ]
+    tensors = [
+        ((slot,), value.data_ptr(), value.element_size() * value.nelement(), list(value.shape), 0)
+        for slot, value in enumerate(values)
+        if isinstance(value, Tensor)
+    ]
+    integers = [((slot,), value) for slot, value in enumerate(values) if not isinstance(value, Tensor)]
+
+    def prepare() -> Any:
+        context = compiled.make_launch_context()
+        for each in tensors:
+            context.set_arg_external_array_with_shape(*each)
+        for each in integers:
+            context.set_arg_int(*each)
+        return context
+
+    # A launch on CUDA moves the arguments to the device and leaves the context unusable.
+    lasting = None if any(value.is_cuda for value in values if isinstance(value, Tensor)) else prepare()
 
     def launch(times: int, alive: tuple = arguments) -> None:
         for _ in range(times):
-            program.launch_kernel(data, context)
+            program.launch_kernel(data, lasting or prepare())
 
     return launch

@@ -1,0 +1,126 @@
+"""A cube with an air chamber becomes a walker, by gradient through the simulator.
+
+    python recipes/walker.py                                  # coarse, on a laptop
+    python recipes/walker.py --preset paper                   # the paper's size; chosen by itself on a GPU
+    python recipes/walker.py --slope 0.3 --out runs/uphill    # any number of the settings can be overridden
+    python recipes/walker.py --resume                         # go on after Ctrl-C or a kill
+    tensorboard --logdir runs                                 # watch it
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from pathlib import Path
+
+import torch
+
+from torchsoro.lagrangian import AugmentedLagrangian
+from torchsoro.results import deliver, show_shape
+from torchsoro.robot import Robot, walker
+from torchsoro.settings import Settings, from_command_line
+from torchsoro.training import RunFolder
+
+PAPER = Settings(preset="paper", out=Path("runs/walker"))
+DESK = dataclasses.replace(
+    PAPER,
+    preset="desk",
+    particles=(12, 12, 12),
+    wall=0.035 / 12,
+    elements=2,
+    epsilon=1e-3,
+    dt=1e-4,
+    settle=0.15,
+    duration=0.2,
+    sample_every=0.002,
+    iterations=30,
+    filter_radius=0.007,
+    learning_rate=0.05,
+    penalty=1.0,
+    window=2,
+    tolerance=0.03,
+)
+
+
+def optimize(robot: Robot, name: str) -> dict[str, float]:
+    """Run the design loop to the stopping rule and write what came out of it.
+
+    Args:
+        robot: What to design.
+        name: Names the movie and the summary.
+
+    Returns:
+        The final metrics (see ``results.deliver``) and the number of iterations.
+    """
+    s, field = robot.settings, robot.field
+
+    def new_adam() -> torch.optim.Adam:
+        return torch.optim.Adam(field.parameters(), lr=s.learning_rate)
+
+    adam = new_adam()
+    lagrangian = AugmentedLagrangian(
+        previous=0.25 - s.c_max, penalty=s.penalty, window=s.window, tolerance=s.tolerance, growth=s.growth
+    )
+    stopped = False
+    with RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, free=s.free) as run:
+        if state := run.load():
+            field.load_state_dict(state["field"])
+            adam.load_state_dict(state["adam"])
+            lagrangian.load_state_dict(state["lagrangian"])
+            stopped = state["stopped"]
+        for k in run.progress(run.start if stopped else s.iterations):
+            begin = time.perf_counter()
+            gamma = field()
+            outcome = robot(gamma, gravity_scale=s.gravity_scale(k))
+            violation = outcome.intermediate - s.c_max
+            # Adam wants gradients of order one: travel counts in grid cells.
+            loss = lagrangian(outcome.travel / robot.domain.cell, violation)
+            middle = time.perf_counter()
+            adam.zero_grad()
+            loss.backward()
+            norm = torch.nn.utils.get_total_norm([p.grad for p in field.parameters() if p.grad is not None])
+            end = time.perf_counter()
+            adam.step()
+            field.clamp_()
+            event = lagrangian.update(loss.item(), violation.item())
+            if event is not None and event.reset_optimizer:
+                adam = new_adam()
+            stopped = event is not None and event.stop and s.gravity_scale(k) == 1.0
+            center = outcome.center.detach()
+            run.log(
+                k,
+                {
+                    "objective/L": outcome.travel.detach(),
+                    "constraint/C": outcome.intermediate.detach(),
+                    "mass": outcome.mass.detach(),
+                    **{f"cog/{axis}": center[i] for i, axis in enumerate("xyz")},
+                    "multiplier/C": lagrangian.multiplier,
+                    "penalty/C": lagrangian.penalty,
+                    "grad_norm/phi": norm,
+                    "field/gamma_mean": gamma.detach().mean(),
+                    "time/forward": middle - begin,
+                    "time/backward": end - middle,
+                    "time/iteration": time.perf_counter() - begin,
+                },
+            )
+            if k % s.picture_every == 0:
+                show_shape(run, robot, gamma, k)
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped)
+            if stopped:
+                break
+        metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name)
+    return {**metrics, "iterations": len(run.metrics["iteration"])}
+
+
+def main(settings: Settings) -> dict[str, float]:
+    """Design a walker."""
+    return optimize(walker(settings), "walker")
+
+
+if __name__ == "__main__":
+    chosen = from_command_line({"desk": DESK, "paper": PAPER}, description=__doc__)
+    result = main(chosen)
+    print(
+        f"L = {1e3 * result['L']:.2f} mm in {chosen.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
+        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g; everything is in {chosen.out}"
+    )

@@ -1,0 +1,155 @@
+"""Small problems, and what is known of their solutions, for the tests of the operator and the simulator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, fill
+from torchsoro.kernels import layout
+from torchsoro.ops.march import Inputs, Scene
+from torchsoro.ops.rollout import initial_state, rollout
+
+H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
+DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s
+TENSORS = ("coefficients", "prony", "pressure", "gravity", "force", "planes", "origin", "state", "weight")
+
+
+def block(
+    particles: tuple[int, int, int] = (4, 4, 4),
+    *,
+    air: bool = False,
+    gamma: Tensor | None = None,
+    gas: Gas | None = None,
+    solid: Solid | None = None,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    velocity: Tensor | None = None,
+    dtype: torch.dtype = torch.float64,
+) -> tuple[Domain, Body]:
+    """A box body of the paper's resin, with a chamber (one layer of wall) that fills it all but one layer if asked."""
+    size = tuple(n * H for n in particles)
+    middle = tuple(o + s / 2 for o, s in zip(origin, size, strict=True))
+    inner = tuple(s - 2 * H for s in size)
+    chambers = (Chamber(name="air", center=middle, size=inner, wall=H),) if air else ()
+    domain = Domain(size=size, particles=particles, origin=origin, chambers=chambers)
+    gamma = torch.ones(domain.count, dtype=dtype) if gamma is None else gamma
+    body = fill(domain, gamma, solid=solid or Solid(), gas=gas)
+    return domain, body if velocity is None else replace(body, velocity=velocity.to(dtype).expand_as(body.position))
+
+
+def simulator(*, dt: float = DT, reach: float = 0.1, **settings) -> Simulator:
+    """A simulator for :func:`block`, whose box reaches so far (m) on every side."""
+    return Simulator(**{"cell": 2 * H, "dt": dt, "low": (-reach,) * 3, "high": (reach,) * 3, **settings})
+
+
+def falling(x: Tensor, v: Tensor, g: Tensor, *, dt: float, steps: Tensor) -> tuple[Tensor, Tensor]:
+    """Position and velocity after some steps of symplectic Euler with constant acceleration, in closed form."""
+    n = steps.to(x).unsqueeze(-1)
+    return x + n * dt * v + dt * dt * g * n * (n + 1) / 2, v + n * dt * g
+
+
+def momenta(body: Body, state: Tensor, cell: float) -> tuple[Tensor, Tensor]:
+    """Linear and angular momentum of a state [1, S, N], with the part that APIC carries in C."""
+    s = state[0]
+    x, v = s[:3].T, s[3:6].T
+    C = s[layout.AFFINE : layout.DEFORMATION].reshape(3, 3, -1).permute(2, 0, 1)
+    m = body.mass.unsqueeze(-1)
+    spin = torch.stack([C[:, 2, 1] - C[:, 1, 2], C[:, 0, 2] - C[:, 2, 0], C[:, 1, 0] - C[:, 0, 1]], -1)
+    return (m * v).sum(0), (m * torch.linalg.cross(x, v) + m * spin * cell * cell / 4).sum(0)
+
+
+def rotations(count: int, *, seed: int = 0) -> Tensor:
+    """Random rotation matrices [count, 3, 3]."""
+    g = torch.Generator().manual_seed(seed)
+    q, r = torch.linalg.qr(torch.randn(count, 3, 3, generator=g, dtype=torch.float64))
+    q = q * r.diagonal(dim1=-2, dim2=-1).sign().unsqueeze(-2)
+    return q * torch.linalg.det(q).sign()[:, None, None]
+
+
+@dataclass(kw_only=True)
+class Problem:
+    """A segment for the operator with everything in it: two chambers, Maxwell elements, planes, forces, springs."""
+
+    scene: Scene
+    tensors: dict[str, Tensor]
+    samples: tuple[int, ...]
+
+    def run(self, tensors: dict[str, Tensor] | None = None, *, keep: bool = True) -> tuple[Tensor, ...]:
+        """The operator's outputs, with some of the tensors replaced."""
+        named = {**self.tensors, **(tensors or {})}
+        state, weight = named.pop("state"), named.pop("weight")
+        return rollout(self.scene, Inputs(**named), state, weight, samples=self.samples, keep=keep)
+
+    def leaves(self) -> dict[str, Tensor]:
+        """Copies of the tensors that require gradients."""
+        return {name: t.clone().requires_grad_() for name, t in self.tensors.items()}
+
+
+def problem(
+    *,
+    particles: tuple[int, int, int] = (4, 4, 4),
+    batch: int = 1,
+    elements: int = 2,
+    steps: int = 6,
+    blend: float = 0.0,
+    stick: bool = False,
+    samples: tuple[int, ...] = (0, 2, 5, 6),
+    spread: float = 1.0,
+    dtype: torch.dtype = torch.float64,
+    seed: int = 1,
+) -> Problem:
+    """A problem in units of the cell, all of whose numbers are of order one and random, so that every term counts."""
+    g = torch.Generator().manual_seed(seed)
+
+    def randn(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=g, dtype=torch.float64)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    axes = [5 + spread * 0.5 * (torch.arange(n, dtype=torch.float64) + 0.5) for n in particles]
+    x = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(1, -1, 3).repeat(batch, 1, 1)
+    count = x.shape[1]
+    x = x + 0.05 * randn(*x.shape)
+    v = 0.3 * randn(*x.shape)
+    kind = torch.full((count,), -1, dtype=torch.int32)
+    kind[count // 2 : count // 2 + 3], kind[count // 2 + 3 : count // 2 + 5] = 0, 1
+    coefficients = rand(batch, layout.COEFFICIENTS, count) + 0.5
+    coefficients[:, layout.VISCOSITY] *= 0.05
+    coefficients[:, layout.VOLUME_VISCOSITY] *= 0.05
+    coefficients[:, layout.ANCHOR : layout.ANCHOR + 3] = x.transpose(1, 2) + 0.1
+    gravity = 0.3 * randn(steps, batch, 3)
+    gravity[..., 2] -= 1
+    share = torch.zeros(2, count, dtype=torch.float64)
+    share[0, :5], share[1, 3:9] = 0.2, 0.3
+    # The ground sticks or slides; one wall is adhesive and slides, the other holds what is near it back.
+    planes = torch.tensor([[5.0, 0.3, 0.0], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
+    state = initial_state(x, v, elements)
+    state[:, layout.AFFINE :] += 0.1 * randn(*state[:, layout.AFFINE :].shape)
+    tensors = {
+        "coefficients": coefficients,
+        "prony": rand(batch, elements, layout.PRONY),
+        "pressure": rand(steps + 1, batch, 2),
+        "gravity": gravity,
+        "force": randn(steps, batch, 2, 3),
+        "planes": planes.repeat(batch, 1, 1),
+        "origin": torch.zeros(batch, 3, dtype=torch.float64),
+        "state": state,
+        "weight": rand(batch, count) + 0.1,
+    }
+    reach = 20.0 * spread
+    scene = Scene(
+        dt=0.02,
+        cell=1.0,
+        blend=blend,
+        low=(0.0, 0.0, 0.0),
+        high=(reach, reach, reach),
+        kind=kind,
+        share=share.to(dtype),
+        plane_kind=torch.tensor([[2, 1, int(stick)], [0, -1, 0], [1, 1, 0]], dtype=torch.int32),
+        springs=True,
+        probes=torch.tensor([0, 7, count - 1]),
+    )
+    return Problem(scene=scene, tensors={name: t.to(dtype) for name, t in tensors.items()}, samples=samples)

@@ -1,0 +1,305 @@
+"""The operator: its gradients by every tensor, its reproducibility, and what it refuses."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from problems import TENSORS, Problem, problem
+from torch import Tensor
+
+from torchsoro.ops.march import Inputs
+from torchsoro.ops.rollout import rollout
+
+HERE = Path(__file__).parent
+
+
+def combined(outputs: tuple[Tensor, ...], seed: int = 5) -> Tensor:
+    """One number to which every output contributes."""
+    g = torch.Generator().manual_seed(seed)
+    return sum(
+        ((o * torch.randn(o.shape, generator=g, dtype=torch.float64).to(o)).sum() for o in outputs), torch.zeros(())
+    )
+
+
+def gradients(p: Problem, *, keep: bool = True) -> dict[str, Tensor]:
+    leaves = p.leaves()
+    grads = torch.autograd.grad(combined(p.run(leaves, keep=keep)), list(leaves.values()))
+    return dict(zip(leaves, grads, strict=True))
+
+
+def close(a: dict[str, Tensor], b: dict[str, Tensor], tolerance: float) -> None:
+    for name in a:
+        scale = float(b[name].abs().max())
+        assert scale > 0, name
+        worst = float((a[name] - b[name]).abs().max()) / scale
+        assert worst <= tolerance, f"{name}: {worst}"
+
+
+# ------------------------------------------------------------------------------------------------------- gradients
+
+
+@pytest.mark.parametrize("stick", [False, True])
+@pytest.mark.parametrize("blend", [0.0, 1.0, 0.7])
+@pytest.mark.parametrize("name", TENSORS)
+def test_gradcheck_by_every_tensor(name, blend, stick):
+    # The whole of a body of 64 particles along a random direction.
+    p = problem(batch=2, blend=blend, stick=stick)
+    x = p.tensors[name].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: p.run({name: t}), (x,), fast_mode=True, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("blend", "stick"), [(0.0, False), (0.7, True)])
+def test_gradcheck_of_every_entry(blend, stick):
+    # The full Jacobian by all nine tensors, so that no error can hide in a sum.
+    p = problem(particles=(2, 2, 3), steps=3, blend=blend, stick=stick, samples=(0, 2, 3))
+    leaves = p.leaves()
+
+    def outputs(*tensors):
+        return p.run(dict(zip(leaves, tensors, strict=True)))
+
+    assert torch.autograd.gradcheck(outputs, tuple(leaves.values()), rtol=1e-4, atol=1e-6, check_undefined_grad=False)
+
+
+@pytest.mark.parametrize("elements", [0, 1, 5])
+def test_gradcheck_with_other_numbers_of_maxwell_elements(elements):
+    p = problem(elements=elements)
+    names = ["state", "coefficients"] + (["prony"] if elements else [])
+    tensors = tuple(p.tensors[n].clone().requires_grad_() for n in names)
+
+    def outputs(*t):
+        return p.run(dict(zip(names, t, strict=True)))
+
+    assert torch.autograd.gradcheck(outputs, tensors, fast_mode=True, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.7])
+def test_gradcheck_of_a_bare_body(blend):
+    # Without planes, forces, springs and chambers the kernels get placeholders for empty tensors.
+    p = problem(blend=blend)
+    p.scene = replace(
+        p.scene,
+        springs=False,
+        share=p.scene.share[:0],
+        plane_kind=p.scene.plane_kind[:0],
+        kind=torch.full_like(p.scene.kind, -1),
+    )
+    p.tensors["force"], p.tensors["planes"] = p.tensors["force"][:, :, :0], p.tensors["planes"][:, :0]
+    p.tensors["pressure"] = p.tensors["pressure"][..., :0]
+    tensors = tuple(p.tensors[n].clone().requires_grad_() for n in ("state", "coefficients", "gravity"))
+
+    def outputs(*t):
+        return [o for o in p.run(dict(zip(("state", "coefficients", "gravity"), t, strict=True))) if o.numel()]
+
+    assert torch.autograd.gradcheck(outputs, tensors, fast_mode=True, rtol=1e-5, atol=1e-6)
+
+
+def test_no_output_is_without_effect_and_undefined_gradients_are_zero():
+    p = problem()
+    leaves = p.leaves()
+    for k, output in enumerate(p.run(leaves)):
+        grads = torch.autograd.grad(output.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
+        by_state = grads[list(leaves).index("state")]
+        assert by_state is not None and bool(by_state.any()), k
+        assert all(bool(torch.isfinite(g).all()) for g in grads if g is not None)
+
+
+def test_backward_accumulates_once_each_time():
+    p = problem(batch=2, blend=0.7)
+    once = gradients(p)
+    leaves = p.leaves()
+    for _ in range(2):
+        combined(p.run(leaves)).backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None
+        assert torch.equal(leaf.grad, 2 * once[name]), name
+    # A graph that is kept can be gone back along again, although the kept states were freed.
+    leaves = p.leaves()
+    loss = combined(p.run(leaves))
+    loss.backward(retain_graph=True)
+    loss.backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None
+        assert torch.equal(leaf.grad, 2 * once[name]), name
+
+
+def test_gradient_flows_through_what_made_a_tensor():
+    p = problem()
+    once = gradients(p)
+    seeds = {name: (t / 2).requires_grad_() for name, t in p.tensors.items()}
+    combined(p.run({name: 2 * t for name, t in seeds.items()})).backward()
+    for name, seed in seeds.items():
+        assert seed.grad is not None
+        torch.testing.assert_close(seed.grad, 2 * once[name], rtol=1e-12, atol=1e-12)
+
+
+def test_inputs_are_left_alone():
+    p = problem()
+    copies = {name: t.clone() for name, t in p.tensors.items()}
+    gradients(p)
+    assert all(torch.equal(copies[name], t) for name, t in p.tensors.items())
+
+
+def test_gradients_do_not_depend_on_which_are_wanted():
+    p = problem(blend=0.7)
+    every = gradients(p)
+    for name in TENSORS:
+        x = p.tensors[name].clone().requires_grad_()
+        (alone,) = torch.autograd.grad(combined(p.run({name: x})), [x])
+        torch.testing.assert_close(alone, every[name], rtol=1e-13, atol=1e-13)
+
+
+def test_second_derivatives_are_refused():
+    p = problem()
+    x = p.tensors["gravity"].clone().requires_grad_()
+    (g,) = torch.autograd.grad(combined(p.run({"gravity": x})), [x], create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        g.sum().backward()
+
+
+def test_noncontiguous_tensors_are_taken_as_they_look():
+    p = problem()
+    turned = {name: t.transpose(0, -1).contiguous().transpose(0, -1) for name, t in p.tensors.items()}
+    assert not turned["state"].is_contiguous()
+    for a, b in zip(p.run(), p.run(turned), strict=True):
+        assert torch.equal(a, b)
+
+
+# ------------------------------------------------------------------------------------------------------ equivalence
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.7])
+def test_gradient_is_the_same_for_every_plan(blend):
+    p = problem(batch=2, blend=blend, steps=12, samples=())
+    whole = gradients(p)
+    close(gradients(p, keep=False), whole, 1e-13)
+    for cut in (1, 5):
+        leaves = p.leaves()
+        state = leaves["state"]
+        for first in range(0, 12, cut):
+            last = min(first + cut, 12)
+            part = {name: leaves[name] for name in ("coefficients", "prony", "planes", "origin")}
+            part["pressure"] = leaves["pressure"][first : last + 1]
+            part |= {name: leaves[name][first:last] for name in ("gravity", "force")}
+            state, *_ = rollout(p.scene, Inputs(**part), state, leaves["weight"], first=first, keep=False)
+        named = {name: t for name, t in leaves.items() if name != "weight"}
+        grads = torch.autograd.grad(combined((state,)), list(named.values()))
+        close(dict(zip(named, grads, strict=True)), {n: g for n, g in whole.items() if n != "weight"}, 1e-12)
+
+
+def test_a_run_over_several_active_boxes_has_the_right_gradient():
+    # Fast particles leave the active box within a few substeps, so that a segment has several.
+    p = problem(steps=30, blend=0.7, samples=(3, 17, 30))
+    p.tensors["state"][:, 3:6] *= 8
+    x = p.tensors["state"].clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda t: p.run({"state": t}), (x,), fast_mode=True, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("blend", [0.0, 0.7])
+def test_a_batch_of_two_equals_two_runs(blend):
+    p = problem(batch=2, blend=blend)
+    together, by = p.run(), gradients(p)
+    for b in range(2):
+        axis = {"pressure": 1, "gravity": 1, "force": 1}
+        alone = replace(p, tensors={n: t.narrow(axis.get(n, 0), b, 1) for n, t in p.tensors.items()})
+        for k, (one, two) in enumerate(zip(alone.run(), together, strict=True)):
+            torch.testing.assert_close(one, two.narrow(0 if k == 0 else 1, b, 1), rtol=1e-12, atol=1e-12)
+        leaves = alone.leaves()
+        outputs = alone.run(leaves)
+        g = torch.Generator().manual_seed(5)
+        loss = torch.zeros(())
+        for k, o in enumerate(outputs):
+            factor = torch.randn(together[k].shape, generator=g, dtype=torch.float64)
+            loss = loss + (o * factor.narrow(0 if k == 0 else 1, b, 1)).sum()
+        for name, grad in zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True):
+            torch.testing.assert_close(grad, by[name].narrow(axis.get(name, 0), b, 1), rtol=1e-10, atol=1e-10)
+
+
+def test_float32_agrees_with_float64():
+    double, single = gradients(problem(blend=0.7)), gradients(problem(blend=0.7, dtype=torch.float32))
+    assert all(g.dtype == torch.float32 for g in single.values())
+    close({n: g.double() for n, g in single.items()}, double, 1e-4)
+
+
+def test_two_runs_have_the_same_bits():
+    p = problem(batch=2, blend=0.7, steps=20)
+    first, again = gradients(p), gradients(p)
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert all(torch.equal(a, b) for a, b in zip(p.run(), p.run(), strict=True))
+
+
+BITS = """
+import hashlib, sys
+import torch, torchsoro
+sys.path.insert(0, sys.argv[2])
+from problems import problem
+torch.set_num_threads(1)
+torchsoro.init(threads=int(sys.argv[1]))
+# Far enough apart that nodes too are shared among threads.
+p = problem(particles=(12, 12, 12), blend=0.7, steps=20, samples=(20,), spread=6.0, dtype=torch.float32)
+leaves = p.leaves()
+outputs = p.run(leaves)
+outputs[0].square().sum().backward()
+digest = hashlib.sha256()
+for t in [*outputs, *(leaf.grad for leaf in leaves.values() if leaf.grad is not None)]:
+    digest.update(t.detach().numpy().tobytes())
+print(digest.hexdigest())
+"""
+
+
+def test_the_bits_do_not_depend_on_the_number_of_threads():
+    digests = []
+    for threads in (1, 2, 3):
+        command = [sys.executable, "-W", "ignore", "-c", BITS, str(threads), str(HERE)]
+        digests.append(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
+    assert len(digests[0]) == 64
+    assert digests[0] == digests[1] == digests[2]
+
+
+# --------------------------------------------------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_a_wrong_shape_is_refused(name):
+    p = problem()
+    wrong = p.tensors[name][..., :-1] if name != "coefficients" else p.tensors[name][:, :-1]
+    with pytest.raises(ValueError, match=rf"^{name}: shape \(.*\), wanted \("):
+        p.run({name: wrong})
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_a_wrong_dtype_is_refused(name):
+    p = problem()
+    wanted = "torch.float64" if name != "state" else "torch.float32"
+    with pytest.raises(ValueError, match=r"dtype torch\.float\d\d, wanted " + wanted):
+        p.run({name: p.tensors[name].float()})
+
+
+def test_half_precision_is_refused():
+    p = problem()
+    with pytest.raises(ValueError, match=r"^state: dtype torch\.float16, wanted .*float32 or float64"):
+        p.run({name: t.half() for name, t in p.tensors.items()})
+
+
+@pytest.mark.parametrize("name", [n for n in TENSORS if n != "state"])
+def test_a_wrong_device_is_refused(name):
+    p = problem()
+    with pytest.raises(ValueError, match=rf"^{name}: on meta, wanted cpu"):
+        p.run({name: p.tensors[name].to("meta")})
+
+
+@pytest.mark.parametrize("samples", [(2, 1), (1, 1), (-1,), (7,)])
+def test_samples_out_of_order_or_range_are_refused(samples):
+    p = replace(problem(), samples=samples)
+    with pytest.raises(ValueError, match=r"^samples = .*: wanted increasing substeps from 0 to 6"):
+        p.run()
+
+
+def test_a_chamber_without_pressure_is_refused():
+    p = problem()
+    with pytest.raises(ValueError, match=r"^kind: chamber 1, wanted less than the 1 of pressure"):
+        p.run({"pressure": p.tensors["pressure"][..., :1]})
