@@ -19,7 +19,7 @@ from walker import PAPER as WALKER_PAPER
 from walker import optimize
 
 from torchsoro.robot import climber
-from torchsoro.settings import Settings, from_command_line
+from torchsoro.settings import Settings, from_command_line, plain_errors
 
 # The paper's text says 40.25 mm; 83,200 particles and its step times fit 45.5 mm.
 PAPER = dataclasses.replace(
@@ -37,7 +37,9 @@ DESK = dataclasses.replace(
     size=(0.035, 0.035, 0.035 / 12 * 16),
     particles=(12, 12, 16),
     settle=0.0,
-    iterations=40,
+    iterations=60,
+    learning_rate=0.05,
+    epsilon=1e-4,
     gravity_steps=5,
     gravity_every=4,
 )
@@ -50,7 +52,8 @@ def main(settings: Settings) -> dict[str, float]:
 
 if __name__ == "__main__":
     chosen = from_command_line({"desk": DESK, "paper": PAPER}, description=__doc__)
-    result = main(chosen)
+    with plain_errors():
+        result = main(chosen)
     print(
         f"L = {1e3 * result['L']:.2f} mm in {chosen.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
         f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g; everything is in {chosen.out}"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, fill
+from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fill
 from torchsoro.kernels import layout
 from torchsoro.ops.march import Inputs, Scene
 from torchsoro.ops.rollout import initial_state, rollout
@@ -28,11 +28,10 @@ def block(
     velocity: Tensor | None = None,
     dtype: torch.dtype = torch.float64,
 ) -> tuple[Domain, Body]:
-    """A box body of the paper's resin, with a chamber (one layer of wall) that fills it all but one layer if asked."""
+    """A box body of the paper's resin; if asked, all but its outermost layer is air."""
     size = tuple(n * H for n in particles)
     middle = tuple(o + s / 2 for o, s in zip(origin, size, strict=True))
-    inner = tuple(s - 2 * H for s in size)
-    chambers = (Chamber(name="air", center=middle, size=inner, wall=H),) if air else ()
+    chambers = (Chamber(name="air", center=middle, size=size, wall=H),) if air else ()
     domain = Domain(size=size, particles=particles, origin=origin, chambers=chambers)
     gamma = torch.ones(domain.count, dtype=dtype) if gamma is None else gamma
     body = fill(domain, gamma, solid=solid or Solid(), gas=gas)
@@ -42,6 +41,17 @@ def block(
 def simulator(*, dt: float = DT, reach: float = 0.1, **settings) -> Simulator:
     """A simulator for :func:`block`, whose box reaches so far (m) on every side."""
     return Simulator(**{"cell": 2 * H, "dt": dt, "low": (-reach,) * 3, "high": (reach,) * 3, **settings})
+
+
+def vector(*values: float) -> Tensor:
+    """A float64 vector."""
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def constant(*pascals: float) -> Waveform:
+    """Constant pressures, one for each chamber."""
+    values = torch.tensor(pascals, dtype=torch.float64)
+    return Waveform(time=vector(0.0, 1.0), pressure=values.unsqueeze(-1).expand(len(pascals), 2))
 
 
 def falling(x: Tensor, v: Tensor, g: Tensor, *, dt: float, steps: Tensor) -> tuple[Tensor, Tensor]:

@@ -107,21 +107,20 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
 
     Raises:
         ValueError: for an empty group, an index out of range, a negative mass, stiffness or coefficient, springs that
-            share a particle, or forces of the wrong shape.
+            share a particle, or forces or shifts of the wrong shape or not finite.
     """
     x = body.position.detach()
     count = x.shape[-2]
     mass, spring, drag = body.mass, x.new_zeros(count), x.new_zeros(count)
-    anchor = body.position.detach()
+    anchor = body.position
     forces = tuple(load for load in loads if isinstance(load, Force))
-    share = x.new_zeros(len(forces), count)
+    shares = [x.new_zeros(0, count)]
     held = torch.zeros(count, dtype=torch.bool, device=x.device)
     for load in loads:
         group = _indicator(load.particles, count, x)
         if isinstance(load, Force):
-            share[forces.index(load)] = group
-            if load.value.shape[-1] != 3:
-                raise ValueError(f"force: shape {tuple(load.value.shape)}, wanted [..., 3]")
+            shares.append(group.unsqueeze(0))
+            _check_vector("force", load.value)
         elif isinstance(load, PointMass):
             mass = mass + _amount("mass", load.mass, x).unsqueeze(-1) * group
         elif isinstance(load, Drag):
@@ -132,6 +131,7 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
             held |= group > 0
             spring = spring + _amount("stiffness", load.stiffness, x).unsqueeze(-1) * group
             if load.shift is not None:
+                _check_vector("spring shift", load.shift)
                 place = (group > 0).to(x).unsqueeze(-1)
                 anchor = anchor + place * load.shift.to(x).unsqueeze(-2)
     loose = not any(isinstance(load, Spring | Drag) for load in loads)
@@ -141,12 +141,14 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
         anchor=None if loose else anchor,
         drag=None if loose else drag,
         forces=forces,
-        share=share,
+        share=torch.cat(shares),
     )
 
 
 def _indicator(particles: Tensor, count: int, like: Tensor) -> Tensor:
     """Each particle's equal share of a group [N]."""
+    if particles.dtype != torch.int64:
+        raise ValueError(f"particles: {particles.dtype}, wanted int64 indices")
     indices = torch.unique(particles.to(like.device))
     if len(indices) == 0:
         raise ValueError("particles: an empty group, wanted at least one particle")
@@ -157,8 +159,15 @@ def _indicator(particles: Tensor, count: int, like: Tensor) -> Tensor:
     return group
 
 
+def _check_vector(name: str, value: Tensor) -> None:
+    if value.shape[-1:] != (3,):
+        raise ValueError(f"{name}: shape {tuple(value.shape)}, wanted [..., 3]")
+    if not bool(torch.isfinite(value.detach()).all()):
+        raise ValueError(f"{name} = {value.tolist()}: wanted finite numbers")
+
+
 def _amount(name: str, value: Tensor | float, like: Tensor) -> Tensor:
-    number = torch.as_tensor(value).to(like)
+    number = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if not bool((torch.isfinite(number.detach()) & (number.detach() >= 0)).all()):
         raise ValueError(f"{name} = {value}: wanted finite and at least 0")
     return number

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,22 +11,20 @@ import numpy as np
 import torch
 
 from torchsoro.fabricate import AirPort, Part, fabricate, surface
-from torchsoro.objective import stride
 from torchsoro.picture import movie, shape_image, summary
 from torchsoro.robot import Robot
+from torchsoro.simulator import Trajectory
 from torchsoro.storage import atomic_write
 from torchsoro.training import RunFolder
 
 
 def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
-    """Put the present shape into TensorBoard, as a picture and as a mesh; a shape without surface is left out."""
+    """Put the present shape into TensorBoard, as a picture and as a mesh."""
     density = gamma.detach().cpu().numpy()
-    try:
-        vertices, faces = surface(robot.domain, density)
-    except ValueError:
-        return
+    vertices, faces = surface(robot.domain, density)
     run.log_mesh("shape/mesh", vertices, faces, None, iteration)
-    picture = shape_image(domain=robot.domain, gamma=density, planes=drawn_planes(robot), title=f"iteration {iteration}")
+    title = f"iteration {iteration}"
+    picture = shape_image(domain=robot.domain, gamma=density, planes=drawn_planes(robot), title=title)
     run.log_image("shape/picture", picture, iteration)
 
 
@@ -51,7 +50,7 @@ def deliver(
         name: Of the robot: names the movie and the page.
 
     Returns:
-        Travel L [m], mean stride over whole cycles [m], C, mass [kg].
+        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg].
 
     Raises:
         ValueError: if the design has no connected body to print; the design and the movie are written before.
@@ -60,13 +59,6 @@ def deliver(
     outcome = robot(gamma, everything=True)
     density = gamma.detach().cpu().numpy()
     trajectory = outcome.trajectory
-    steps = stride(
-        trajectory.center_of_gravity,
-        trajectory.time,
-        start=s.settle,
-        period=1 / s.frequency,
-        direction=robot.direction,
-    )
     with atomic_write(path / "design.npz") as file:
         np.savez_compressed(
             file,
@@ -111,10 +103,21 @@ def deliver(
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
     return {
         "L": float(outcome.travel),
-        "stride": float(steps.mean()) if steps.numel() else float("nan"),
+        "stride": _mean_stride(robot, trajectory),
         "C": float(outcome.intermediate),
         "mass": float(outcome.mass),
     }
+
+
+def _mean_stride(robot: Robot, trajectory: Trajectory) -> float:
+    """Advance per whole cycle [m], interpolated where a cycle does not end on a sample; NaN without a whole cycle."""
+    s = robot.settings
+    cycles = math.floor(s.duration * s.frequency + 1e-9)
+    if cycles == 0:
+        return math.nan
+    way = trajectory.center_of_gravity.double().cpu() @ torch.tensor(robot.direction, dtype=torch.float64)
+    start, end = np.interp([s.settle, s.settle + cycles / s.frequency], trajectory.time.cpu().numpy(), way.numpy())
+    return float(end - start) / cycles
 
 
 def print_part(robot: Robot, density: np.ndarray) -> Part:

@@ -1,4 +1,4 @@
-"""A pneumatic robot on its ground or between its walls: design field, material, actuation and simulator in one module."""
+"""A pneumatic robot on its ground or between walls: design field, material, actuation and simulator in one module."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ class Outcome:
         travel: L, Eq. 13 [m].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
+        fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
         center: Centre of gravity of the undeformed design domain [3] m, Eq. 14.
         trajectory: The motion.
     """
@@ -34,6 +35,7 @@ class Outcome:
     travel: Tensor
     intermediate: Tensor
     mass: Tensor
+    fall: Tensor
     center: Tensor
     trajectory: Trajectory
 
@@ -80,6 +82,8 @@ class Robot(nn.Module):
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
+        # Density scales mass and stiffness alike: the step is good for every design, or for none.
+        self._simulator(s.dt)._check_step(self._fill(torch.ones(self.domain.count)), self.prony)
 
     def forward(self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False) -> Outcome:
         """Simulate a design and judge it.
@@ -96,20 +100,26 @@ class Robot(nn.Module):
             SimulationDiverged: if the simulation breaks down.
         """
         s = self.settings
-        body = fill(self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power)
+        body = self._fill(gamma)
         weight = torch.where(self.design, body.mass, torch.zeros_like(body.mass))
         trajectory = self._simulate(body, weight, gravity_scale, everything)
         end = s.settle + s.duration
         distance = travel(
             trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
         )
+        height = trajectory.center_of_gravity[:, 2]
         return Outcome(
             travel=distance,
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))),
+            fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
         )
+
+    def _fill(self, gamma: Tensor) -> Body:
+        s = self.settings
+        return fill(self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power)
 
     def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
@@ -154,6 +164,8 @@ def walker(settings: Settings) -> Robot:
 def climber(settings: Settings) -> Robot:
     """A robot between two walls, normal to x, that is to travel upward, symmetric about both vertical mid planes."""
     half = settings.wall_distance / 2
+    if settings.wall_distance < settings.size[0]:
+        raise ValueError(f"wall_distance = {settings.wall_distance} m: wanted at least the body's {settings.size[0]} m")
     planes = (
         Plane(axis=0, offset=-half, side=1, friction=settings.friction),
         Plane(axis=0, offset=half, side=-1, friction=settings.friction),

@@ -3,22 +3,27 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+import re
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import torch
 import tyro
 
+from torchsoro.errors import SimulationDiverged
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Settings:
     """Settings of a design run; SI units, z up. The defaults are the paper's walker."""
 
-    preset: str = "paper"
-    """Where the other numbers come from before they are overridden."""
+    preset: Literal["desk", "paper"] = "paper"
+    """Where the other numbers come from before they are overridden: coarse, or the paper's size."""
     out: Path = Path("runs/walker")
     """Folder of the run."""
     resume: bool = False
@@ -103,6 +108,10 @@ class Settings:
     """Radius of the density filter [m]."""
     beta: float = 8.0
     """Sharpness of the projection."""
+    upright: float = 0.0
+    """Weight of falling over against travel; 0 in the paper, whose longer runs punish a fall by themselves."""
+    sink: float = 0.02
+    """What the centre of gravity may sink before it counts as falling, in heights of the body."""
     learning_rate: float = 0.02
     """Of Adam."""
     c_max: float = 0.0125
@@ -126,7 +135,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse what no module checks by itself."""
-        for name in ("gravity", "slope", "settle", "room", "memory", "offset", "port"):
+        for name in ("upright", "sink", "gravity", "slope", "settle", "room", "memory", "offset", "port"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} = {value}: wanted finite and at least 0")
@@ -134,6 +143,10 @@ class Settings:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} = {value}: wanted finite and positive")
+        for name, whole in (("settle", "dt"), ("duration", "dt"), ("sample_every", "dt"), ("settle", "sample_every")):
+            value, part = getattr(self, name), getattr(self, whole)
+            if abs(round(value / part) * part - value) > 1e-6 * value:
+                raise ValueError(f"{name} = {value:g} s: wanted a whole number of {whole} = {part:g} s")
         for name in ("iterations", "window", "gravity_every", "picture_every", "frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 1")
@@ -182,9 +195,20 @@ def from_command_line(
     known, _ = first.parse_known_args(arguments)
     gpu = known.device == "cuda" or (known.device == "auto" and torch.cuda.is_available())
     name = known.preset or ("paper" if gpu else "desk")
-    if name not in presets:
-        raise SystemExit(f"--preset {name}: wanted one of {', '.join(presets)}")
+    # Of a preset that does not exist, tyro says so.
+    default = presets.get(name, presets["desk"])
+    # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
+    text = re.sub(r"\n *(?=(?:python|tensorboard) )", "\n$ ", description or "")
+    return tyro.cli(Settings, args=arguments, default=default, description=text)
+
+
+@contextlib.contextmanager
+def plain_errors() -> Iterator[None]:
+    """End the process with a line instead of a traceback: on bad input, a simulation that diverged, and Ctrl-C."""
     try:
-        return tyro.cli(Settings, args=arguments, default=presets[name], description=description)
-    except ValueError as error:
-        raise SystemExit(f"error: {error}") from None
+        yield
+    except (ValueError, SimulationDiverged) as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2 if isinstance(error, ValueError) else 1) from error
+    except KeyboardInterrupt:
+        raise SystemExit(130) from None

@@ -176,6 +176,8 @@ class Simulator(nn.Module):
         steps = _whole("duration", duration, self.dt)
         every = max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, self.dt)
         _check_body(body)
+        if start is None:
+            self._check_inside(x)
         self._check_step(body, prony)
         attached = attach(body, loads)
         body = attached.body
@@ -186,12 +188,17 @@ class Simulator(nn.Module):
         forces = [force.at(times[:-1]).to(**like) for force in attached.forces]
         maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(self.dt).to(**like)
         numbers = [[torch.as_tensor(n, **like) for n in plane.numbers()] for plane in planes]
-        mass = body.mass if weight is None else weight.to(**like)
+        mass = body.mass if weight is None else _check_weight(weight, x.shape[-2]).to(**like)
 
         ranks = [(x, 2), (maxwell, 2), (supply, 2), (pull, 2), (mass, 1), *((f, 2) for f in forces)]
         ranks += [(n, 0) for plane in numbers for n in plane]
         ranks += [(t, t_rank) for t, t_rank in _body_tensors(attached)]
-        lead = torch.broadcast_shapes(*(t.shape[: t.ndim - rank] for t, rank in ranks))
+        leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
+        try:
+            lead = torch.broadcast_shapes(*leads)
+        except RuntimeError:
+            seen = ", ".join(map(str, sorted({axes for axes in leads if axes})))
+            raise ValueError(f"leading axes {seen}: wanted batches that broadcast against each other") from None
         batch = math.prod(lead)
 
         def wide(t: Tensor, rank: int) -> Tensor:
@@ -266,6 +273,16 @@ class Simulator(nn.Module):
             state, *seen = rollout(scene, cut, state, weight, first=first, samples=inside, keep=keep)
             parts.append(tuple(seen))
         return [torch.cat(each) for each in zip(*parts, strict=True)], state
+
+    def _check_inside(self, x: Tensor) -> None:
+        low, high = (x.new_tensor(corner) for corner in (self.low, self.high))
+        places = x.detach().reshape(-1, 3)
+        outside = ((places <= low + self.cell) | (places >= high - self.cell)).any(-1)
+        if bool(outside.any()):
+            raise ValueError(
+                f"body.position: a particle at {tuple(places[outside][0].tolist())} m, wanted inside the analysis box "
+                f"from {self.low} to {self.high} m and a cell of {self.cell:g} m away from its faces"
+            )
 
     def _check_step(self, body: Body, prony: Prony | None) -> None:
         found = courant(body, prony, dt=self.dt, cell=self.cell)
@@ -343,9 +360,13 @@ def _gravity(gravity, times: Tensor, **like) -> Tensor:
     """Gravity at each substep [..., T, 3]."""
     if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
         wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
+        if gravity[1].shape[-1] != 3:
+            raise ValueError(
+                f"gravity: shape {tuple(gravity[1].shape)}, wanted [..., S, 3] over {len(gravity[0])} times"
+            )
         values = wave.at(times.to(gravity[0])).transpose(-1, -2).to(**like)
     else:
-        constant = torch.as_tensor(gravity).to(**like)
+        constant = torch.as_tensor(gravity, **like)
         if constant.shape[-1:] != (3,):
             raise ValueError(f"gravity: shape {tuple(constant.shape)}, wanted [..., 3]")
         values = constant.unsqueeze(-2).expand(*constant.shape[:-1], len(times), 3)
@@ -360,6 +381,8 @@ def _check_body(body: Body) -> None:
         raise ValueError(f"body.position: dtype {x.dtype}, wanted float32 or float64")
     if x.device.type not in _MEMORY or (x.is_cuda and x.dtype != torch.float32):
         raise ValueError(f"body.position: {x.dtype} on {x.device}, wanted float32 on cuda, or either precision on cpu")
+    if x.ndim < 2:
+        raise ValueError(f"body.position: shape {tuple(x.shape)}, wanted [..., N, 3]")
     count = x.shape[-2]
     if body.chamber.shape != (count,):
         raise ValueError(f"body.chamber: shape {tuple(body.chamber.shape)}, wanted [{count}]")
@@ -379,6 +402,14 @@ def _check_body(body: Body) -> None:
             wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
             bad = value.detach()[~(finite if vector else finite & least)][0]
             raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
+
+
+def _check_weight(weight: Tensor, count: int) -> Tensor:
+    if weight.shape[-1:] != (count,):
+        raise ValueError(f"weight: shape {tuple(weight.shape)}, wanted [..., {count}]")
+    if not bool(torch.isfinite(weight.detach()).all() & (weight.detach().sum(-1) > 0).all()):
+        raise ValueError("weight: not finite or all zero, wanted finite numbers with a positive sum")
+    return weight
 
 
 def _check_probes(probes: Tensor, count: int) -> None:

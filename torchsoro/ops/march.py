@@ -334,5 +334,8 @@ class March:
 
 
 def _flat(tensors: list[Tensor]) -> list[Tensor]:
-    """One-dimensional views; an empty tensor has no address to hand over, so that a single number stands for it."""
-    return [t.view(-1) if t.numel() else t.new_zeros(1) for t in tensors]
+    """One-dimensional views; an empty tensor has no address to hand over, so that a single number stands for it.
+
+    Detached, as Taichi compiles a kernel anew for every pattern of tensors that require gradients.
+    """
+    return [t.detach().view(-1) if t.numel() else t.new_zeros(1) for t in tensors]

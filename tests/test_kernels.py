@@ -1,0 +1,345 @@
+"""The functions that the kernels are made of: shape functions, stress laws and their adjoints."""
+
+import pytest
+import taichi as ti
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import rotations
+
+import torchsoro
+from torchsoro.kernels import contact, spline, stress, tensor
+
+# The annotations of kernels must be values: no ``from __future__ import annotations`` here.
+Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
+
+
+@ti.func
+def vector(a: ti.template(), i):
+    return ti.Vector([a[3 * i], a[3 * i + 1], a[3 * i + 2]])
+
+
+@ti.func
+def matrix(a: ti.template(), i):
+    return tensor.load_matrix(a, 9 * i, 1)
+
+
+@ti.func
+def put(a: ti.template(), i, m):
+    tensor.store_matrix(a, 9 * i, 1, m)
+
+
+@ti.kernel
+def run_spline(inverse_cell: ti.f64, x: Reals, base: Reals, w: Reals, dw: Reals, n: ti.i32):
+    for i in range(n):
+        place = vector(x, i)
+        node = spline.base_node(place, inverse_cell)
+        f = place * inverse_cell - node
+        for c in ti.static(range(3)):
+            base[3 * i + c] = node[c]
+        put(w, i, spline.weights(f))
+        put(dw, i, spline.slopes(f))
+
+
+@ti.kernel
+def run_tensor(a: Reals, b: Reals, cof: Reals, dev: Reals, dot: Reals, back: Reals, scratch: Reals, n: ti.i32):
+    for i in range(n):
+        A, B = matrix(a, i), matrix(b, i)
+        put(cof, i, tensor.cofactor(A))
+        put(dev, i, tensor.deviator(A))
+        dot[i] = tensor.contract(A, B)
+        tensor.store_symmetric(scratch, 6 * i, 1, A + A.transpose())
+        put(back, i, tensor.load_symmetric(scratch, 6 * i, 1))
+
+
+@ti.kernel
+def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, tau: Reals, S: Reals, n: ti.i32):
+    for i in range(n):
+        put(tau, i, stress.solid_stress(matrix(F, i), matrix(Q, i), bulk, shear))
+        put(S, i, stress.pull_back(matrix(F, i)))
+
+
+@ti.kernel
+def run_solid_adjoint(
+    F: Reals,
+    Q: Reals,
+    moduli: Reals,
+    bar: Reals,
+    F_bar: Reals,
+    Q_bar: Reals,
+    moduli_bar: Reals,
+    S_bar: Reals,
+    n: ti.i32,
+):
+    for i in range(n):
+        f, q, bulk, shear = stress.solid_stress_adjoint(
+            matrix(F, i), matrix(Q, i), moduli[2 * i], moduli[2 * i + 1], matrix(bar, i)
+        )
+        put(F_bar, i, f)
+        put(Q_bar, i, q)
+        moduli_bar[2 * i] = bulk
+        moduli_bar[2 * i + 1] = shear
+        put(S_bar, i, stress.pull_back_adjoint(matrix(F, i), matrix(bar, i)))
+
+
+@ti.kernel
+def run_viscous(
+    J: Reals, L: Reals, eta: Reals, bar: Reals, tau: Reals, J_bar: Reals, L_bar: Reals, eta_bar: Reals, n: ti.i32
+):
+    for i in range(n):
+        put(tau, i, stress.viscous_stress(J[i], matrix(L, i), eta[2 * i], eta[2 * i + 1]))
+        j, gradient, shear, volume = stress.viscous_stress_adjoint(
+            J[i], matrix(L, i), eta[2 * i], eta[2 * i + 1], matrix(bar, i)
+        )
+        J_bar[i] = j
+        put(L_bar, i, gradient)
+        eta_bar[2 * i] = shear
+        eta_bar[2 * i + 1] = volume
+
+
+@ti.kernel
+def run_gas(J: Reals, k: ti.f64, supply: ti.f64, p: Reals, n: ti.i32):
+    for i in range(n):
+        p[i] = stress.gas_pressure(J[i], k, supply)
+
+
+@ti.kernel
+def run_touch(
+    u: Reals, sticks: ti.i32, friction: ti.f64, hold: ti.f64, bar: Reals, r: Reals, u_bar: Reals, by: Reals, n: ti.i32
+):
+    for i in range(n):
+        up = ti.Vector([0.0, 0.0, 1.0], dt=ti.f64)
+        out = contact.touch(vector(u, i), up, sticks, friction, hold)
+        tensor.store_vector(r, 3 * i, 1, out)
+        by_u, by_friction, by_hold = contact.touch_adjoint(vector(u, i), up, sticks, friction, hold, vector(bar, i))
+        tensor.store_vector(u_bar, 3 * i, 1, by_u)
+        by[2 * i] = by_friction
+        by[2 * i + 1] = by_hold
+
+
+@pytest.fixture(scope="module", autouse=True)
+def started():
+    torchsoro.init("cpu")
+
+
+def out(*shape):
+    return torch.zeros(*shape, dtype=torch.float64)
+
+
+def flat(t):
+    return t.contiguous().view(-1)
+
+
+def deformations(n=32, *, seed=0, size=0.3):
+    g = torch.Generator().manual_seed(seed)
+    return torch.eye(3, dtype=torch.float64) + size * (torch.rand(n, 3, 3, generator=g, dtype=torch.float64) - 0.5)
+
+
+def symmetric(n=32, *, seed=1, size=0.3):
+    m = deformations(n, seed=seed, size=size) - torch.eye(3, dtype=torch.float64)
+    return m + m.mT
+
+
+def solid(F, Q=None, *, bulk=2.3, shear=0.7):
+    """Kirchhoff stress, and pull-back S."""
+    tau, S = out(*F.shape), out(*F.shape)
+    Q = torch.zeros_like(F) if Q is None else Q
+    run_solid(flat(F), flat(Q), bulk, shear, flat(tau), flat(S), len(F))
+    return tau, S
+
+
+def splines(x, cell):
+    n = len(x)
+    base, w, dw = out(n, 3), out(n, 3, 3), out(n, 3, 3)
+    run_spline(1 / cell, flat(x), flat(base), flat(w), flat(dw), n)
+    return base, w, dw
+
+
+positions = st.lists(st.tuples(*[st.floats(-3, 3)] * 3), min_size=1, max_size=20)
+
+
+@given(places=positions, cell=st.floats(0.01, 10))
+def test_weights_are_a_partition_of_unity_and_reproduce_linear_fields(places, cell):
+    x = torch.tensor(places, dtype=torch.float64)
+    base, w, dw = splines(x, cell)
+    nodes = base.unsqueeze(1) + torch.arange(3.0, dtype=torch.float64).view(1, 3, 1)
+    assert bool((w >= 0).all())
+    torch.testing.assert_close(w.sum(1), torch.ones_like(x), rtol=0, atol=1e-12)
+    torch.testing.assert_close(cell * (w * nodes).sum(1), x, rtol=1e-12, atol=1e-11)
+    torch.testing.assert_close(dw.sum(1), torch.zeros_like(x), rtol=0, atol=1e-11)
+    torch.testing.assert_close((dw * nodes).sum(1), torch.ones_like(x), rtol=0, atol=1e-9)
+    # The second moment is a quarter of a cell squared: the D of APIC.
+    distance = nodes - (x / cell).unsqueeze(1)
+    torch.testing.assert_close((w * distance**2).sum(1), torch.full_like(x, 0.25), rtol=0, atol=1e-9)
+
+
+def test_slopes_are_derivatives_of_the_weights():
+    g = torch.Generator().manual_seed(2)
+    x = torch.rand(50, 3, generator=g, dtype=torch.float64) * 6 - 3
+    e = 1e-6
+    base, _, dw = splines(x, 1.0)
+    (up, w_up, _), (down, w_down, _) = splines(x + e, 1.0), splines(x - e, 1.0)
+    assert torch.equal(up, base)
+    assert torch.equal(down, base)
+    torch.testing.assert_close((w_up - w_down) / (2 * e), dw, rtol=0, atol=1e-9)
+
+
+def test_weights_are_continuous_where_the_nodes_change():
+    x = torch.tensor([[0.5, 1.5, 2.5]], dtype=torch.float64)
+    (_, below, below_slope), (_, above, above_slope) = splines(x - 1e-12, 1.0), splines(x + 1e-12, 1.0)
+    for a, b in ((below, above), (below_slope, above_slope)):
+        torch.testing.assert_close(a[:, 1:], b[:, :2], rtol=0, atol=1e-10)
+        torch.testing.assert_close(a[:, 0], torch.zeros(1, 3, dtype=torch.float64), rtol=0, atol=1e-10)
+
+
+def test_tensor_functions_agree_with_torch():
+    a, b = deformations(seed=3, size=2.0), deformations(seed=4, size=2.0)
+    cof, dev, dot, back, scratch = out(32, 3, 3), out(32, 3, 3), out(32), out(32, 3, 3), out(32, 6)
+    run_tensor(*(flat(t) for t in (a, b, cof, dev, dot, back, scratch)), 32)
+    torch.testing.assert_close(cof, torch.linalg.det(a)[:, None, None] * torch.linalg.inv(a).mT, rtol=1e-9, atol=1e-12)
+    third = a.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] / 3
+    torch.testing.assert_close(dev, a - third * torch.eye(3, dtype=torch.float64), rtol=1e-14, atol=1e-14)
+    torch.testing.assert_close(dot, (a * b).sum((1, 2)), rtol=1e-13, atol=1e-13)
+    assert torch.equal(back, a + a.mT)
+
+
+def test_no_stress_without_strain():
+    tau, S = solid(rotations(8))
+    assert float(tau.abs().max()) < 1e-14
+    assert float(S.abs().max()) < 1e-14
+
+
+def test_stress_is_the_derivative_of_the_energy():
+    # Eqs. 6-7: W = mu/2 (tr Cb - 3) + K/2 [ (J - 1)^2 + (ln J)^2 ] / 2, and tau = dW/dF F^T.
+    bulk, shear = 2.3, 0.7
+    F = deformations(size=0.8).requires_grad_()
+    J = torch.linalg.det(F)
+    assert float(J.detach().min()) > 0.3
+    trace = (J ** (-2 / 3)) * (F * F).sum((1, 2))
+    energy = shear / 2 * (trace - 3) + bulk / 4 * ((J - 1) ** 2 + torch.log(J) ** 2)
+    (P,) = torch.autograd.grad(energy.sum(), F)
+    tau, _ = solid(F.detach(), bulk=bulk, shear=shear)
+    torch.testing.assert_close(tau, (P @ F.mT).detach(), rtol=1e-12, atol=1e-13)
+
+
+def test_pull_back_is_the_deviatoric_stress():
+    # mu dev(Bb) = J mu Fb S Fb^T: an element that has followed everything adds its modulus to the elastic one.
+    F = deformations(size=0.8)
+    J = torch.linalg.det(F)[:, None, None]
+    Fb = F * J ** (-1 / 3)
+    tau, S = solid(F, bulk=0.0)
+    torch.testing.assert_close(J * 0.7 * (Fb @ S @ Fb.mT), tau, rtol=1e-12, atol=1e-13)
+    twice, _ = solid(F, S, bulk=0.0)
+    torch.testing.assert_close(twice, 2 * tau, rtol=1e-12, atol=1e-13)
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 10_000), size=st.floats(0.01, 0.9))
+def test_frame_indifference(seed, size):
+    F, Q, R = deformations(seed=seed, size=size), symmetric(seed=seed + 1), rotations(32, seed=seed)
+    tau, S = solid(F, Q)
+    turned_tau, turned_S = solid(R @ F, Q)
+    assert float((turned_tau - R @ tau @ R.mT).abs().max()) <= 1e-10 * float(tau.abs().max())
+    assert float((turned_S - S).abs().max()) <= 1e-10 * float(S.abs().max())
+    torch.testing.assert_close(tau, tau.mT, rtol=0, atol=1e-14)
+
+
+def test_adjoints_of_the_solid():
+    F, Q, bar = deformations(), symmetric(), symmetric(seed=5, size=2.0)
+    moduli = torch.rand(32, 2, generator=torch.Generator().manual_seed(6), dtype=torch.float64) + 0.5
+    found = [out(32, 3, 3), out(32, 3, 3), out(32, 2), out(32, 3, 3)]
+    run_solid_adjoint(*(flat(t) for t in (F, Q, moduli, bar, *found)), 32)
+    F_bar, Q_bar, moduli_bar, S_bar = found
+    numbers = list(enumerate(moduli.tolist()))
+    e, d, dQ = 1e-6, deformations(seed=7, size=2.0), symmetric(seed=8, size=2.0)
+
+    def power(*, f=F, q=Q, k=0.0, m=0.0, which=0):
+        rows = [solid(f[i : i + 1], q[i : i + 1], bulk=a + k, shear=b + m) for i, (a, b) in numbers]
+        return (torch.cat([r[which] for r in rows]) * bar).sum((1, 2))
+
+    def slope(up, down):
+        return (up - down) / (2 * e)
+
+    for numeric, exact in (
+        (slope(power(f=F + e * d), power(f=F - e * d)), (F_bar * d).sum((1, 2))),
+        (slope(power(q=Q + e * dQ), power(q=Q - e * dQ)), (Q_bar * dQ).sum((1, 2))),
+        (slope(power(k=e), power(k=-e)), moduli_bar[:, 0]),
+        (slope(power(m=e), power(m=-e)), moduli_bar[:, 1]),
+        (slope(power(f=F + e * d, which=1), power(f=F - e * d, which=1)), (S_bar * d).sum((1, 2))),
+    ):
+        torch.testing.assert_close(exact, numeric, rtol=1e-7, atol=1e-8)
+
+
+def test_viscous_stress_and_its_adjoint():
+    g = torch.Generator().manual_seed(9)
+    J = torch.rand(32, generator=g, dtype=torch.float64) + 0.5
+    L, bar = deformations(seed=10, size=2.0), deformations(seed=11, size=2.0)
+    eta = torch.rand(32, 2, generator=g, dtype=torch.float64)
+    leaves = [t.clone().requires_grad_() for t in (J, L, eta)]
+    j, gradient, (shear, volume) = leaves[0], leaves[1], leaves[2].unbind(1)
+    spread = (volume - 2 / 3 * shear) * gradient.diagonal(dim1=1, dim2=2).sum(-1)
+    expected = shear[:, None, None] * (gradient + gradient.mT) + spread[:, None, None] * torch.eye(3).double()
+    expected = j[:, None, None] * expected
+    by = torch.autograd.grad((expected * bar).sum(), leaves)
+    tau, J_bar, L_bar, eta_bar = out(32, 3, 3), out(32), out(32, 3, 3), out(32, 2)
+    run_viscous(*(flat(t) for t in (J, L, eta, bar, tau, J_bar, L_bar, eta_bar)), 32)
+    torch.testing.assert_close(tau, expected.detach(), rtol=1e-12, atol=1e-13)
+    for found, wanted in zip((J_bar, L_bar, eta_bar), by, strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)
+    # A rigid rotation is not resisted, and pure shear viscosity has no pressure.
+    spin = L - L.mT
+    run_viscous(*(flat(t) for t in (J, spin, eta, bar, tau, J_bar, L_bar, eta_bar)), 32)
+    assert float(tau.abs().max()) < 1e-14
+
+
+def test_gas_pressure():
+    J, p = torch.tensor([1.0, 0.9, 1.2], dtype=torch.float64), out(3)
+    run_gas(J, 140e3, 80e3, p, 3)
+    torch.testing.assert_close(p, torch.tensor([80e3, 94e3, 52e3], dtype=torch.float64), rtol=1e-12, atol=0)
+
+
+def touch(u, *, stick=0, friction=0.0, hold=0.0, bar=None):
+    u = torch.as_tensor(u, dtype=torch.float64).reshape(-1, 3)
+    bar = torch.zeros_like(u) if bar is None else bar
+    r, u_bar, by = torch.zeros_like(u), torch.zeros_like(u), out(len(u), 2)
+    run_touch(flat(u), stick, friction, hold, flat(bar), flat(r), flat(u_bar), flat(by), len(u))
+    return r, u_bar, by
+
+
+@pytest.mark.parametrize(
+    ("u", "settings", "wanted"),
+    [
+        ((1.0, 2.0, 0.5), {"stick": 1}, (1.0, 2.0, 0.5)),  # leaving: free
+        ((1.0, 2.0, -0.5), {"stick": 1}, (0.0, 0.0, 0.0)),  # pressed on: stuck
+        ((3.0, 4.0, -1.0), {}, (3.0, 4.0, 0.0)),  # without friction only the normal part goes
+        ((3.0, 4.0, -5.0), {"friction": 0.5}, (1.5, 2.0, 0.0)),  # slides: 5 less 0.5 of 5
+        ((3.0, 4.0, -5.0), {"friction": 1.1}, (0.0, 0.0, 0.0)),  # friction suffices
+        ((3.0, 4.0, 1.0), {"friction": 0.5, "hold": 2.0}, (2.7, 3.6, 0.0)),  # held back by adhesion: slides
+        ((3.0, 4.0, 1.0), {"stick": 1, "hold": 2.0}, (0.0, 0.0, 0.0)),  # held back: stuck
+        ((3.0, 4.0, 3.0), {"friction": 0.5, "hold": 2.0}, (3.0, 4.0, 1.0)),  # torn off, slower
+    ],
+)
+def test_touch(u, settings, wanted):
+    r, _, _ = touch(u, **settings)
+    torch.testing.assert_close(r[0], torch.tensor(wanted, dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("stick", [0, 1])
+@pytest.mark.parametrize(("friction", "hold"), [(0.0, 0.0), (0.6, 0.0), (0.6, 0.8)])
+def test_adjoint_of_touch(stick, friction, hold):
+    g = torch.Generator().manual_seed(12)
+    u, bar, d = (torch.randn(200, 3, generator=g, dtype=torch.float64) for _ in range(3))
+    e = 1e-7
+    _, u_bar, by = touch(u, stick=stick, friction=friction, hold=hold, bar=bar)
+
+    def power(sign, **change):
+        moved = {"friction": friction, "hold": hold, **{k: v + sign * e for k, v in change.items()}}
+        return (touch(u + (0 if change else sign * e * d), stick=stick, **moved)[0] * bar).sum(1)
+
+    torch.testing.assert_close((power(1) - power(-1)) / (2 * e), (u_bar * d).sum(1), rtol=1e-6, atol=1e-6)
+    if friction:
+        numeric = (power(1, friction=friction) - power(-1, friction=friction)) / (2 * e)
+        torch.testing.assert_close(numeric, by[:, 0], rtol=1e-6, atol=1e-6)
+    if hold:
+        numeric = (power(1, hold=hold) - power(-1, hold=hold)) / (2 * e)
+        torch.testing.assert_close(numeric, by[:, 1], rtol=1e-6, atol=1e-6)

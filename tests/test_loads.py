@@ -1,0 +1,192 @@
+"""Forces, point masses, springs and drag on groups of particles."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from problems import DT, H, block, simulator
+from torch import Tensor
+
+from torchsoro import Drag, Force, PointMass, Prony, Spring
+from torchsoro.loads import attach
+
+MASS = 1070 * (4 * H) ** 3  # of the block, kg
+EVERY = torch.arange(64)
+FREE = (0.0, 0.0, 0.0)
+
+
+def run(loads, *, steps=100, gravity=FREE, velocity=None, **settings):
+    _, body = block(velocity=velocity)
+    return simulator(**settings)(body, duration=steps * DT, gravity=gravity, loads=loads, sample_every=DT)
+
+
+def vector(*values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("transfer", ["apic", "flip"])
+def test_a_force_accelerates(transfer):
+    push = vector(0.01, -0.02, 0.03)
+    pushed = run([Force(particles=EVERY, value=push)], transfer=transfer)
+    torch.testing.assert_close(pushed.center_velocity, pushed.time.unsqueeze(1) * push / MASS, rtol=1e-9, atol=1e-12)
+
+
+def test_a_force_on_some_particles_moves_the_whole_by_its_impulse():
+    pushed = run([Force(particles=torch.tensor([0, 5, 9]), value=vector(0.001, 0.0, 0.002))])
+    torch.testing.assert_close(
+        MASS * pushed.center_velocity[-1], 100 * DT * vector(0.001, 0.0, 0.002), rtol=1e-9, atol=1e-15
+    )
+
+
+def test_a_force_over_time_is_interpolated():
+    time, value = vector(0.0, 50 * DT, 100 * DT), torch.tensor([[0.0, 0, 0], [0, 0, 0.02], [0, 0, 0.02]]).double()
+    pushed = run([Force(particles=EVERY, value=value, time=time)])
+    steps = torch.arange(100, dtype=torch.float64)
+    impulse = (0.02 * (steps / 50).clamp(max=1)).cumsum(0) * DT
+    torch.testing.assert_close(pushed.center_velocity[1:, 2], impulse / MASS, rtol=1e-6, atol=1e-12)
+
+
+def test_the_same_force_twice_is_twice_the_force():
+    force = Force(particles=EVERY, value=vector(0.0, 0.0, 0.01))
+    end = [run([force] * n).center_velocity[-1, 2] for n in (1, 2)]
+    assert float(end[1]) == pytest.approx(2 * float(end[0]), rel=1e-9)
+
+
+def test_a_point_mass_has_inertia_and_weight():
+    push, load = Force(particles=EVERY, value=vector(0.01, 0.0, 0.0)), PointMass(particles=EVERY, mass=3 * MASS)
+    pushed = run([push, load])
+    assert float(pushed.center_velocity[-1, 0]) == pytest.approx(0.01 * 100 * DT / (4 * MASS), rel=1e-9)
+    # Hung on a strong spring with drag, it settles where the spring carries all the weight.
+    stiffness = 20.0
+    spring = Spring(particles=EVERY, stiffness=stiffness)
+    damp = Drag(particles=EVERY, coefficient=2 * math.sqrt(stiffness * 4 * MASS))
+    hung = run([spring, damp, load], steps=3000, gravity=(0.0, 0.0, -9.81))
+    sag = float(hung.center_of_gravity[-1, 2]) - 2 * H
+    assert sag == pytest.approx(-9.81 * 4 * MASS / stiffness, rel=1e-3)
+
+
+@pytest.mark.parametrize("transfer", ["apic", "flip"])
+def test_a_spring_has_its_frequency(transfer):
+    stiffness = 50.0
+    shift = vector(0.0, 0.0, 1e-3)
+    steps = 1200
+    swing = run([Spring(particles=EVERY, stiffness=stiffness, shift=shift)], steps=steps, transfer=transfer)
+    z = swing.center_of_gravity[:, 2] - 2 * H - 1e-3
+    omega = math.sqrt(stiffness / MASS)
+    # Symplectic Euler is exact for a slightly shifted frequency; the amplitude stays.
+    discrete = 2 / DT * math.asin(omega * DT / 2)
+    assert discrete == pytest.approx(omega, rel=1e-3)
+    phase = discrete * swing.time
+    expected = -1e-3 * torch.cos(phase + discrete * DT / 2) / math.cos(discrete * DT / 2)
+    assert omega * steps * DT > 4 * math.pi
+    torch.testing.assert_close(z, expected, rtol=0, atol=2e-8)
+
+
+@settings(max_examples=5)
+@given(rate=st.floats(1.0, 500.0), g=st.floats(-10.0, 10.0))
+def test_drag_ends_in_a_terminal_speed(rate, g):
+    drag = Drag(particles=EVERY, coefficient=rate * MASS)
+    sinking = run([drag], gravity=(0.0, 0.0, g))
+    k = torch.arange(101, dtype=torch.float64)
+    expected = g / rate * (1 - (1 - rate * DT) ** k)
+    torch.testing.assert_close(sinking.center_velocity[:, 2], expected, rtol=1e-9, atol=1e-12)
+
+
+def test_drag_reaches_its_terminal_speed():
+    sinking = run([Drag(particles=EVERY, coefficient=2000 * MASS)], gravity=(0.0, 0.0, -9.81), steps=400)
+    assert float(sinking.center_velocity[-1, 2]) == pytest.approx(-9.81 / 2000, rel=1e-9)
+
+
+def test_loads_have_gradients_and_a_batch():
+    value = torch.tensor([[0.0, 0.0, 0.01], [0.0, 0.0, 0.02]], dtype=torch.float64, requires_grad=True)
+    mass = torch.tensor([0.0, MASS], dtype=torch.float64, requires_grad=True)
+    pushed = run([Force(particles=EVERY, value=value), PointMass(particles=EVERY, mass=mass)])
+    assert pushed.center_velocity.shape == (2, 101, 3)
+    end = pushed.center_velocity[:, -1, 2]
+    total = MASS + mass.detach()
+    torch.testing.assert_close(end, 100 * DT * value[:, 2] / total, rtol=1e-9, atol=0)
+    by_value, by_mass = torch.autograd.grad(end.sum(), [value, mass])
+    torch.testing.assert_close(by_value[:, 2], 100 * DT / total, rtol=1e-8, atol=0)
+    torch.testing.assert_close(by_mass, -100 * DT * value.detach()[:, 2] / total**2, rtol=1e-8, atol=0)
+
+
+@pytest.mark.parametrize("name", ["stiffness", "shift", "coefficient", "position"])
+def test_gradients_of_springs_and_drag_against_differences(name):
+    group, other = torch.arange(8), torch.arange(30, 50)
+
+    def travelled(x: Tensor) -> Tensor:
+        _, body = block()
+        number = {"stiffness": x, "shift": x, "coefficient": x}
+        loads = [
+            Spring(
+                particles=group,
+                stiffness=number["stiffness"] if name == "stiffness" else 3.0,
+                shift=x if name == "shift" else vector(1e-3, 0.0, 2e-3),
+            ),
+            Spring(particles=other, stiffness=1.0, shift=vector(0.0, 1e-3, 0.0)),
+            Drag(particles=other, coefficient=x if name == "coefficient" else 1e-3),
+        ]
+        if name == "position":
+            body = replace(body, position=body.position + x)
+        moved = simulator()(body, duration=20 * DT, gravity=(0.0, 0.0, -1.0), loads=loads)
+        return moved.center_of_gravity[-1].sum() * 1e3
+
+    start = {"stiffness": vector(3.0)[0], "coefficient": vector(1e-3)[0], "shift": vector(1e-3, 2e-3, 3e-3)}
+    x = start.get(name, vector(1e-4, 2e-4, 3e-4)).requires_grad_()
+    (by,) = torch.autograd.grad(travelled(x), x)
+    e = 1e-4 * x.detach()
+    with torch.no_grad():
+        slope = (travelled(x + e) - travelled(x - e)) / 2
+    assert float((by * e).sum()) == pytest.approx(float(slope), rel=1e-5)
+
+
+def test_a_tube_pulls_on_a_visco_elastic_body():
+    # Everything at once, only to see that it runs and that what hangs on the body holds it back.
+    _, body = block()
+    group = torch.arange(4)
+    loads = [
+        Force(particles=EVERY, value=vector(0.002, 0.0, 0.0)),
+        PointMass(particles=group, mass=MASS),
+        Spring(particles=group, stiffness=0.5),
+        Drag(particles=torch.arange(10, 20), coefficient=0.01),
+    ]
+    weight = torch.ones_like(body.mass)  # by default a point mass counts
+    moved = [
+        simulator()(body, duration=500 * DT, prony=Prony.paper(3), gravity=FREE, loads=some, weight=weight)
+        for some in (loads[:1], loads)
+    ]
+    free, held = (float(m.center_of_gravity[-1, 0] - m.center_of_gravity[0, 0]) for m in moved)
+    assert 0 < held < 0.7 * free
+
+
+@pytest.mark.parametrize(
+    ("loads", "message"),
+    [
+        ([Force(particles=torch.tensor([], dtype=torch.int64), value=torch.zeros(3))], r"particles: an empty group"),
+        ([Force(particles=torch.tensor([64]), value=torch.zeros(3))], r"particles: index 64 to 64, wanted 0 to 63"),
+        ([PointMass(particles=torch.tensor([-1, 3]), mass=1.0)], r"particles: index -1 to 3, wanted 0 to 63"),
+        ([Drag(particles=torch.tensor([0.5]), coefficient=1.0)], r"particles: torch\.float32, wanted int64"),
+        ([Drag(particles=torch.ones(64) > 0, coefficient=1.0)], r"particles: torch\.bool, wanted int64"),
+        ([PointMass(particles=EVERY, mass=-1.0)], r"mass = -1\.0: wanted finite and at least 0"),
+        ([PointMass(particles=EVERY, mass=math.nan)], r"mass = nan: wanted finite and at least 0"),
+        ([Drag(particles=EVERY, coefficient=-1.0)], r"drag coefficient = -1\.0: wanted finite and at least 0"),
+        ([Spring(particles=EVERY, stiffness=-1.0)], r"stiffness = -1\.0: wanted finite and at least 0"),
+        (
+            [Spring(particles=EVERY, stiffness=1.0, shift=torch.zeros(2))],
+            r"spring shift: shape \(2,\), wanted \[\.\.\., 3\]",
+        ),
+        ([Spring(particles=EVERY, stiffness=1.0, shift=vector(0, 0, math.nan))], r"spring shift = .*: wanted finite"),
+        ([Spring(particles=EVERY, stiffness=1.0)] * 2, r"springs: two groups share a particle"),
+        ([Force(particles=EVERY, value=torch.zeros(2))], r"force: shape \(2,\), wanted \[\.\.\., 3\]"),
+        ([Force(particles=EVERY, value=vector(0, 0, math.inf))], r"force = .*: wanted finite"),
+    ],
+)
+def test_bad_loads_are_refused(loads, message):
+    _, body = block()
+    with pytest.raises(ValueError, match="^" + message):
+        attach(body, loads)

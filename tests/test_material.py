@@ -1,0 +1,305 @@
+"""Interpolation, filling, the Prony series and its discrete update, and the stable step."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import taichi as ti
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from problems import DT, H, block, simulator
+
+import torchsoro
+from torchsoro import Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
+from torchsoro.kernels import constitutive, layout
+from torchsoro.material import STABLE_COURANT, courant
+from torchsoro.ops.rollout import initial_state
+
+# The annotations of kernels must be values: no ``from __future__ import annotations`` here.
+Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
+Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
+
+
+@ti.kernel
+def shear_particle(
+    state: Reals, coefficients: Reals, prony: Reals, none: Reals, flags: Integers, omega: ti.f64, dt: ti.f64,
+    amplitude: ti.f64, cycles: ti.i32, per_cycle: ti.i32, elements: ti.i32, answer: Reals,
+):  # fmt: skip
+    """Shear one particle by amplitude * sin(omega t) in the simulator's own steps; lock in on the last cycle."""
+    ti.loop_config(serialize=True)
+    for _ in range(1):
+        before = ti.cast(0, ti.f64)
+        for n in range(cycles * per_cycle):
+            after = amplitude * ti.sin(omega * dt * (n + 1))
+            gradient = ti.Matrix([[0.0, after - before, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dt=ti.f64)
+            constitutive.deform(state, 0, 0, 1, prony, 0, elements, -1, gradient, flags)
+            tau = constitutive.stress(state, 0, coefficients, 0, 1, prony, 0, elements, -1, none, 0)
+            before = after
+            if n >= (cycles - 1) * per_cycle:
+                answer[0] += 2 * tau[0, 1] * ti.sin(omega * dt * (n + 1)) / (amplitude * per_cycle)
+                answer[1] += 2 * tau[0, 1] * ti.cos(omega * dt * (n + 1)) / (amplitude * per_cycle)
+
+
+def discrete_modulus(prony, omega, dt):
+    """G*(omega) of the update H <- a H + b (S' - S), from its z-transform."""
+    a, b, g = prony.discrete(dt).unbind(-1)
+    z = torch.exp(1j * omega * dt).unsqueeze(-1)
+    return 1 + (g * b * (1 - 1 / z) / (1 - a / z)).sum(-1)
+
+
+# --------------------------------------------------------------------------------------------- storage and loss (17)
+
+
+@pytest.mark.parametrize("elements", [3, 5])
+def test_discrete_storage_and_loss_modulus_follow_eq_17(elements):
+    prony = Prony.paper(elements)
+    omega = torch.logspace(0, 4, 81, dtype=torch.float64)
+    storage, loss = prony.storage_loss(omega)
+    for dt in (1e-5, 1e-6):
+        G = discrete_modulus(prony, omega, dt)
+        off = torch.stack([G.real / storage - 1, G.imag / loss - 1]).abs().amax(1)
+        print(f"{elements} elements, dt = {dt:g} s: storage off by {off[0]:.2e}, loss by {off[1]:.2e} at most")
+        if dt == 1e-6:
+            assert float(off.max()) < 0.01
+
+
+@pytest.mark.parametrize("elements", [3, 5])
+@pytest.mark.parametrize("omega", [10.0, 1e2, 1e3, 1e4])
+def test_a_particle_in_the_kernels_has_the_moduli_of_eq_17(elements, omega):
+    torchsoro.init("cpu")
+    prony = Prony.paper(elements)
+    per_cycle = max(400, round(2 * math.pi / (omega * 1e-5)))
+    dt = 2 * math.pi / omega / per_cycle
+    cycles = 2 + math.ceil(6 * 0.273 * omega / (2 * math.pi)) if omega < 1e3 else 60
+    zeros = torch.zeros(1, 1, 3, dtype=torch.float64)
+    state = initial_state(zeros, zeros, elements).reshape(-1)
+    coefficients = torch.zeros(layout.COEFFICIENTS, dtype=torch.float64)
+    coefficients[layout.BULK], coefficients[layout.SHEAR] = 2.0, 1.0
+    answer, none, flags = torch.zeros(2).double(), torch.zeros(1).double(), torch.zeros(2, dtype=torch.int32)
+    numbers = prony.discrete(dt).reshape(-1).contiguous()
+    shear_particle(state, coefficients, numbers, none, flags, omega, dt, 1e-3, cycles, per_cycle, elements, answer)
+    storage, loss = prony.storage_loss(torch.tensor([omega], dtype=torch.float64))
+    assert not flags.any()
+    assert float(answer[0]) == pytest.approx(float(storage), rel=0.01)
+    assert float(answer[1]) == pytest.approx(float(loss), rel=0.01)
+    # And to rounding (and strain squared) what the recursion says in closed form.
+    exact = discrete_modulus(prony, torch.tensor([omega], dtype=torch.float64), dt)
+    assert float(answer[0]) == pytest.approx(float(exact.real), rel=1e-3)
+    assert float(answer[1]) == pytest.approx(float(exact.imag), rel=1e-3)
+
+
+def test_the_papers_series_is_relative_to_the_equilibrium_modulus():
+    prony = Prony.paper(5)
+    assert prony.elements == 5
+    assert float(prony.moduli[0]) == pytest.approx(6.36e-4 / 9.06e-4)
+    # 1 + sum g_i / g_inf: physics of Table S1, 18 times stiffer at once with three elements, 1104 times with five.
+    for elements, wanted in ((0, 1.0), (3, 18.0), (4, 156.0), (5, 1104.0)):
+        assert float(1 + Prony.paper(elements).moduli.sum()) == pytest.approx(wanted, rel=5e-3)
+    storage, _ = prony.storage_loss(torch.tensor([0.0, 1e12], dtype=torch.float64))
+    assert storage.tolist() == pytest.approx([1.0, 1104.0], rel=5e-3)
+    storage, loss = prony.storage_loss(torch.tensor([10.0], dtype=torch.float64))
+    wt = 10 * prony.times
+    assert float(storage) == pytest.approx(1 + float((prony.moduli * wt**2 / (1 + wt**2)).sum()))
+    assert float(loss) == pytest.approx(float((prony.moduli * wt / (1 + wt**2)).sum()))
+
+
+def number(value):
+    return torch.tensor([value], dtype=torch.float64)
+
+
+@given(ratio=st.floats(1e-6, 1e3))
+def test_the_update_is_exact_for_a_strain_that_changes_linearly(ratio):
+    # dH/dt + H/tau = dS/dt with dS/dt = 1/dt: H(dt) = tau/dt (1 - exp(-dt/tau)).
+    a, b, g = Prony(moduli=number(2.0), times=number(1 / ratio)).discrete(1.0)[0]
+    assert float(a) == pytest.approx(math.exp(-ratio), rel=1e-12)
+    assert float(b) == pytest.approx(-math.expm1(-ratio) / ratio, rel=1e-12)
+    assert float(g) == 2.0
+
+
+def test_prony_is_differentiable():
+    def numbers(moduli, times):
+        return Prony(moduli=moduli, times=times).discrete(0.1)
+
+    leaves = (torch.rand(2, 3).double().requires_grad_(), (torch.rand(2, 3).double() + 0.1).requires_grad_())
+    assert torch.autograd.gradcheck(numbers, leaves)
+
+
+# ---------------------------------------------------------------------------------------------- interpolation, filling
+
+
+@given(gamma=st.floats(0, 1), epsilon=st.floats(1e-8, 0.5), power=st.floats(1, 5))
+def test_simp(gamma, epsilon, power):
+    value = float(simp(torch.tensor(gamma, dtype=torch.float64), epsilon=epsilon, power=power))
+    assert value == pytest.approx((1 - epsilon) * gamma**power + epsilon, rel=1e-12)
+    assert epsilon * (1 - 1e-12) <= value <= 1 + 1e-12
+    ends = simp(torch.tensor([0.0, 1.0]).double(), epsilon=epsilon, power=power)
+    assert ends.tolist() == pytest.approx([epsilon, 1.0])
+
+
+def chambers():
+    size = (8 * H, 8 * H, 8 * H)
+    middle = (4 * H,) * 3
+    return Domain(
+        size=size, particles=(8, 8, 8), chambers=(Chamber(name="air", center=middle, size=(4 * H,) * 3, wall=H),)
+    )
+
+
+def test_fill_puts_material_where_it_belongs():
+    domain = chambers()
+    gamma = torch.rand(domain.count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    solid, gas = Solid(), Gas(viscosity=2.0, volume_viscosity=3.0)
+    body = fill(domain, gamma, solid=solid, gas=gas)
+    air = domain.region == Region.GAS
+    scale = simp(gamma)[~air]
+    assert int(air.sum()) == 8
+    assert solid.shear == pytest.approx(0.44e6 / 2.8)
+    assert solid.bulk == pytest.approx(0.44e6 / 0.6)
+    torch.testing.assert_close(body.shear[~air], solid.shear * scale)
+    torch.testing.assert_close(body.bulk[~air], solid.bulk * scale)
+    torch.testing.assert_close(body.mass[~air], solid.density * H**3 * scale)
+    for value, wanted in ((body.shear, 0), (body.bulk, 0.14e6), (body.mass, 100 * H**3), (body.volume, H**3)):
+        torch.testing.assert_close(value[air], torch.full((8,), wanted, dtype=torch.float64))
+    assert body.viscosity is not None
+    assert body.volume_viscosity is not None
+    assert body.viscosity[air].tolist() == [2.0] * 8
+    assert body.volume_viscosity[air].tolist() == [3.0] * 8
+    assert not body.viscosity[~air].any()
+    assert bool((body.chamber >= 0).eq(air).all())
+    assert body.chamber.dtype == torch.int32
+    single = fill(domain, gamma.float().expand(3, -1), solid=solid)
+    assert single.mass.shape == (3, domain.count)
+    assert single.mass.dtype == single.position.dtype == torch.float32
+
+
+def test_fill_is_differentiable():
+    domain = chambers()
+    gamma = torch.rand(domain.count, generator=torch.Generator().manual_seed(0), dtype=torch.float64).requires_grad_()
+
+    def numbers(g):
+        # In units in which all are of order one.
+        body = fill(domain, g, solid=Solid())
+        return body.mass / 1e-5, body.bulk / 1e6, body.shear / 1e6
+
+    assert torch.autograd.gradcheck(numbers, (gamma,), fast_mode=True)
+    (by,) = torch.autograd.grad(fill(domain, gamma, solid=Solid()).mass.sum(), gamma)
+    assert not by[domain.region == Region.GAS].any()
+    wanted = 1070 * H**3 * (1 - 1e-5) * 3 * gamma.detach() ** 2
+    torch.testing.assert_close(by[domain.region != Region.GAS], wanted[domain.region != Region.GAS])
+
+
+# --------------------------------------------------------------------------------------------------------- stable step
+
+
+def test_courant_numbers_of_the_papers_robot():
+    domain = Domain(size=(0.007,) * 3, particles=(8, 8, 8))
+    body = fill(domain, torch.ones(domain.count, dtype=torch.float64), solid=Solid())
+    solid, dt, cell = Solid(), 1e-5, 1.75e-3
+    for elements in range(6):
+        prony = Prony.paper(elements)
+        a, tau = [math.exp(-dt / t) for t in prony.times.tolist()], prony.times.tolist()
+        felt = [g * (1 - ai) * t / dt * 2 / (1 + ai) for g, ai, t in zip(prony.moduli.tolist(), a, tau, strict=True)]
+        stiff = math.hypot(1.4 * solid.bulk, 1.25 * solid.shear * (1 + sum(felt)))
+        found = courant(body, prony, dt=dt, cell=cell)
+        assert found.number == pytest.approx(dt / cell * math.sqrt(stiff / solid.density), rel=1e-9)
+        # All five elements are within reach of the paper's step.
+        assert found.number < STABLE_COURANT
+        assert found.term.startswith("elastic waves in the solid")
+        named = f"Maxwell element {1 + felt.index(max(felt))}" if felt else "solid"
+        assert found.term.endswith(named)
+    assert courant(body, None, dt=dt, cell=cell) == courant(body, Prony.paper(0), dt=dt, cell=cell)
+
+
+def test_courant_number_names_gas_and_viscosity():
+    _, body = block((4, 4, 4), air=True, gas=Gas(density=1.2))
+    found = courant(body, None, dt=1e-5, cell=1.75e-3)
+    assert found.term == "pressure waves in the gas"
+    assert found.number == pytest.approx(1e-5 / 1.75e-3 * math.sqrt(1.4 * 0.14e6 / 1.2), rel=1e-9)
+    thick = replace(body, viscosity=torch.full_like(body.mass, 1e4))
+    assert courant(thick, None, dt=DT, cell=2 * H).term == "viscosity"
+
+
+@pytest.mark.parametrize("elements", [0, 3, 5])
+@pytest.mark.parametrize(("factor", "stable"), [(1.0, True), (1.1, False)])
+def test_waves_stay_bounded_up_to_the_stable_step(elements, factor, stable, monkeypatch):
+    domain = Domain(size=(8 * H,) * 3, particles=(8, 8, 8))
+    body = fill(domain, torch.ones(domain.count, dtype=torch.float64), solid=Solid())
+    noise = torch.randn(domain.count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    body, prony = replace(body, velocity=1e-3 * noise), Prony.paper(elements)
+    dt = factor * stable_step(body, prony, cell=2 * H)
+    monkeypatch.setattr("torchsoro.simulator.STABLE_COURANT", 2.0)
+    sim = simulator(dt=dt, transfer="flip")
+
+    def speed():
+        final = sim(body, duration=1500 * dt, gravity=(0.0, 0.0, 0.0), prony=prony).final
+        return float(final[0, layout.VELOCITY : layout.AFFINE].abs().max())
+
+    if stable:
+        assert speed() < float(1e-3 * noise.abs().max())
+    else:
+        with pytest.raises(SimulationDiverged):
+            speed()
+
+
+@pytest.mark.parametrize("elements", [0, 3, 5])
+def test_stable_step_is_the_limit(elements):
+    _, body = block()
+    prony = Prony.paper(elements)
+    limit = stable_step(body, prony, cell=2 * H)
+    assert courant(body, prony, dt=limit, cell=2 * H).number == pytest.approx(STABLE_COURANT, rel=1e-3)
+    assert courant(body, prony, dt=1.01 * limit, cell=2 * H).number > STABLE_COURANT
+    assert stable_step(body, prony, cell=4 * H) > 1.9 * limit
+
+
+# ------------------------------------------------------------------------------------------------------------- refusals
+
+
+def tensors(*rows):
+    return [torch.tensor(r, dtype=torch.float64) for r in rows]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Solid(youngs_modulus=-1.0), r"youngs_modulus = -1\.0: wanted finite and positive"),
+        (lambda: Solid(youngs_modulus=math.nan), r"youngs_modulus = nan: wanted finite and positive"),
+        (lambda: Solid(density=0.0), r"density = 0\.0: wanted finite and positive"),
+        (lambda: Solid(density=math.inf), r"density = inf: wanted finite and positive"),
+        (lambda: Solid(poisson_ratio=0.5), r"poisson_ratio = 0\.5: wanted at least 0 and less than 0\.5"),
+        (lambda: Solid(poisson_ratio=-0.1), r"poisson_ratio = -0\.1: wanted at least 0"),
+        (lambda: Solid(poisson_ratio=math.nan), r"poisson_ratio = nan: wanted"),
+        (lambda: Gas(density=0.0), r"density = 0\.0: wanted finite and positive"),
+        (lambda: Gas(stiffness=-1.0), r"stiffness = -1\.0: wanted finite and at least 0"),
+        (lambda: Gas(viscosity=math.inf), r"viscosity = inf: wanted finite and at least 0"),
+        (lambda: Gas(volume_viscosity=math.nan), r"volume_viscosity = nan: wanted finite and at least 0"),
+        (lambda: Prony.paper(6), r"elements = 6: wanted 0 to 5"),
+        (lambda: Prony.paper(-1), r"elements = -1: wanted 0 to 5"),
+        (
+            lambda: Prony(moduli=torch.ones(2), times=torch.ones(3)),
+            r"moduli, times: shapes \(2,\) and \(3,\), wanted the same",
+        ),
+        (lambda: Prony(moduli=torch.ones(6), times=torch.ones(6)), r"moduli, times: .* M from 0 to 5"),
+        (
+            lambda: Prony(**dict(zip(("moduli", "times"), tensors([-1.0], [1.0]), strict=True))),
+            r"moduli = \[-1\.0\]: wanted finite and at least 0",
+        ),
+        (
+            lambda: Prony(**dict(zip(("moduli", "times"), tensors([1.0], [0.0]), strict=True))),
+            r"times = \[0\.0\]: wanted finite and positive",
+        ),
+        (
+            lambda: Prony(**dict(zip(("moduli", "times"), tensors([1.0], [math.inf]), strict=True))),
+            r"times = \[inf\]: wanted finite and positive",
+        ),
+        (lambda: simp(torch.ones(1), epsilon=0.0), r"epsilon = 0\.0: wanted more than 0 and less than 1"),
+        (lambda: simp(torch.ones(1), epsilon=1.0), r"epsilon = 1\.0: wanted more than 0 and less than 1"),
+        (lambda: simp(torch.ones(1), power=0.0), r"power = 0\.0: wanted finite and positive"),
+        (
+            lambda: fill(chambers(), torch.ones(7), solid=Solid()),
+            r"gamma: shape \(7,\), wanted \[\.\.\., 512\], one value for each particle",
+        ),
+    ],
+)
+def test_bad_numbers_are_refused(make, message):
+    with pytest.raises(ValueError, match="^" + message):
+        make()

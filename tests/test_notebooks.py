@@ -1,0 +1,42 @@
+"""The notebooks run from top to bottom, on a shortened training, and their losses fall."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
+
+
+@pytest.mark.notebook
+@pytest.mark.filterwarnings("default")  # those of the kernel's client are not ours
+def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHSORO_NOTEBOOK_STEPS", "4")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    notebook = nbformat.read(NOTEBOOKS / "01_compose_with_torch.ipynb", as_version=4)
+    losses = "print(volume_loss[-1] / volume_loss[0], bend_loss[-1] - bend_loss[0])"
+    notebook.cells.append(nbformat.v4.new_code_cell(losses))
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    ratio, change = map(float, notebook.cells[-1].outputs[-1].text.split())
+    assert ratio < 0.8
+    assert change < -0.01
+    drawn = [o for cell in notebook.cells for o in cell.get("outputs", []) if "image/png" in o.get("data", {})]
+    assert len(drawn) == 2
+
+
+def test_the_committed_notebooks_hold_their_figures_and_stay_small():
+    paths = sorted(NOTEBOOKS.glob("*.ipynb"))
+    assert paths
+    for path in paths:
+        assert path.stat().st_size < 300_000
+        notebook = nbformat.read(path, as_version=4)
+        nbformat.validate(notebook)
+        outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+        assert any("image/png" in output.get("data", {}) for output in outputs)
+        assert not any(output.output_type == "error" for output in outputs)

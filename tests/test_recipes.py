@@ -1,0 +1,242 @@
+"""The recipes on tiny settings: the files they promise, exact resume, and what their command lines refuse."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import importlib
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+import torch
+import trimesh
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tiny import TINY
+
+from torchsoro.robot import climber, walker
+from torchsoro.settings import Settings
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+TAGS = (
+    "objective/L",
+    "constraint/C",
+    "mass",
+    "cog/x",
+    "cog/y",
+    "cog/z",
+    "multiplier/C",
+    "penalty/C",
+    "grad_norm/phi",
+    "time/iteration",
+)
+
+
+@pytest.fixture(scope="module")
+def recipes() -> Iterator[dict[str, ModuleType]]:
+    sys.path.insert(0, str(RECIPES))
+    try:
+        yield {name: importlib.import_module(name) for name in ("walker", "climber")}
+    finally:
+        sys.path.remove(str(RECIPES))
+
+
+def tiny(out: Path, **changes: Any) -> Settings:
+    return dataclasses.replace(TINY, out=out, **changes)
+
+
+@pytest.fixture(scope="module")
+def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
+    """The folder of an uninterrupted run of the walker, and what it returned."""
+    path = tmp_path_factory.mktemp("runs") / "straight"
+    return path, recipes["walker"].main(tiny(path))
+
+
+def metrics(path: Path) -> list[dict[str, str]]:
+    """Rows of the metrics without the seconds, which no two runs share."""
+    with (path / "metrics.csv").open(newline="") as file:
+        return [{k: v for k, v in row.items() if not k.startswith("time/")} for row in csv.DictReader(file)]
+
+
+def items(path: Path) -> dict[str, Any]:
+    return torch.load(path / "checkpoint.pt", weights_only=True)["items"]
+
+
+def assert_same_run(one: Path, other: Path) -> None:
+    """Equal to the bit: metrics, state and design."""
+    assert metrics(one) == metrics(other)
+    assert torch.equal(items(one)["field"]["phi"], items(other)["field"]["phi"])
+    for name, value in items(one)["adam"]["state"][0].items():
+        assert torch.equal(value, items(other)["adam"]["state"][0][name])
+    designs = [np.load(path / "design.npz")["gamma"] for path in (one, other)]
+    assert np.array_equal(*designs)
+
+
+def test_the_settings_and_the_metrics_are_all_there(straight):
+    path, result = straight
+    held = json.loads((path / "settings.json").read_text())
+    assert set(held) == {field.name for field in dataclasses.fields(Settings)}
+    assert held["particles"] == [8, 8, 8]
+    rows = metrics(path)
+    assert [row["iteration"] for row in rows] == ["0", "1", "2"]
+    for row in rows:
+        assert all(math.isfinite(float(value)) for value in row.values())
+    assert float(rows[0]["constraint/C"]) == pytest.approx(0.25)
+    assert float(rows[2]["constraint/C"]) < 0.25
+    assert float(rows[0]["grad_norm/phi"]) > 0
+    assert result["iterations"] == 3
+    assert result["C"] < float(rows[2]["constraint/C"])
+    assert result["stride"] == pytest.approx(result["L"])  # a single cycle
+    assert 0.004 < result["mass"] < 0.05
+
+
+def test_tensorboard_shows_every_scalar_and_the_shape_every_few_iterations(straight):
+    events = EventAccumulator(str(straight[0])).Reload()
+    for tag in TAGS:
+        assert [event.step for event in events.Scalars(tag)] == [0, 1, 2], tag
+    assert [event.step for event in events.Images("shape/picture")][-1:] == [2]
+    assert any("mesh" in tag for tag in events.Tags()["tensors"])
+
+
+def test_the_design_and_the_part_can_be_used(straight):
+    path, result = straight
+    design = np.load(path / "design.npz")
+    assert design["gamma"].shape == (512,)
+    assert (design["shape"] == 8).all()
+    assert float(design["spacing"]) == pytest.approx(0.035 / 8)
+    assert design["gamma"].min() >= 0
+    assert design["gamma"].max() <= 1
+    lattice = design["gamma"].reshape(design["shape"])
+    assert np.array_equal(lattice, lattice[:, ::-1])
+    part = trimesh.load_mesh(path / "shape.stl")
+    assert part.is_watertight
+    assert part.is_winding_consistent
+    assert 15 < part.extents.max() < 40  # mm
+    report = json.loads((path / "shape.json").read_text())
+    assert report["watertight"]
+    assert report["mass_g"] == pytest.approx(1e3 * result["mass"], rel=0.5)
+
+
+def test_the_movie_plays_and_the_summary_is_a_page(straight):
+    path, _ = straight
+    assert len(iio.imread(path / "walker.mp4", plugin="FFMPEG")) == TINY.frames
+    page = iio.imread(path / "summary.png")
+    assert min(page.shape[:2]) > 500
+    assert page[..., :3].std() > 5
+
+
+def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(recipes, straight, tmp_path):
+    recipes["walker"].main(tiny(tmp_path / "run", iterations=1))
+    again = recipes["walker"].main(tiny(tmp_path / "run", resume=True, picture_every=1, frames=2))
+    assert_same_run(tmp_path / "run", straight[0])
+    assert again == straight[1]
+    steps = [event.step for event in EventAccumulator(str(tmp_path / "run")).Reload().Scalars("objective/L")]
+    assert steps == [0, 1, 2]
+
+
+def command(settings: Settings) -> list[str]:
+    """The flags that make these settings."""
+    flags = ["--resume"] if settings.resume else []
+    for field in dataclasses.fields(settings):
+        value = getattr(settings, field.name)
+        if field.name not in ("resume", "pressure_file"):
+            flags.append("--" + field.name.replace("_", "-"))
+            flags += map(str, value) if isinstance(value, tuple) else [str(value)]
+    return [sys.executable, str(RECIPES / "walker.py"), *flags]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_run_killed_within_an_iteration_resumes_to_the_same_numbers(recipes, straight, tmp_path):
+    path = tmp_path / "run"
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        command(tiny(path)), env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        deadline = time.monotonic() + 300  # the kernels may have to be compiled
+        while not (path / "checkpoint.pt").exists() and process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.002)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    saved = torch.load(path / "checkpoint.pt", weights_only=True)["iteration"]
+    assert saved < 2  # at least one iteration is lost, and done again
+    assert not (path / "summary.png").exists()
+    recipes["walker"].main(tiny(path, resume=True))
+    assert_same_run(path, straight[0])
+
+
+def test_a_checkpoint_of_other_settings_is_refused_and_stays_whole(recipes, straight):
+    path, _ = straight
+    held = {file.name: file.read_bytes() for file in path.iterdir()}
+    with pytest.raises(ValueError, match=r"slope is 0\.3, the run has 0\.0"):
+        recipes["walker"].main(tiny(path, resume=True, slope=0.3))
+    with pytest.raises(ValueError, match="already holds a run; resume it"):
+        recipes["walker"].main(tiny(path))
+    assert {file.name: file.read_bytes() for file in path.iterdir()} == held
+
+
+def test_a_bad_schedule_is_refused_before_the_folder_is_made(recipes, tmp_path):
+    for name, bad in (("penalty", 0.0), ("growth", 1.0), ("tolerance", -1.0)):
+        with pytest.raises(ValueError, match=name):
+            recipes["walker"].main(tiny(tmp_path / "run", **{name: bad}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_path):
+    settings = tiny(tmp_path / "run", iterations=2, settle=0.0, gravity_steps=1, gravity_every=1, frames=2)
+    result = recipes["climber"].main(settings)
+    assert result["iterations"] == 2
+    names = {file.name for file in settings.out.iterdir() if not file.name.startswith("events")}
+    assert names == {
+        "settings.json",
+        "metrics.csv",
+        "checkpoint.pt",
+        "design.npz",
+        "shape.stl",
+        "shape.json",
+        "climber.mp4",
+        "summary.png",
+    }
+    gamma = np.load(settings.out / "design.npz")["gamma"].reshape(8, 8, 8)
+    assert np.array_equal(gamma, gamma[::-1])
+    assert np.array_equal(gamma, gamma[:, ::-1])
+
+
+def test_every_preset_fits_together(recipes):
+    for name, make in (("walker", walker), ("climber", climber)):
+        for preset in ("desk", "paper"):
+            settings = getattr(recipes[name], preset.upper())
+            assert settings.preset == preset
+            assert settings.out == Path("runs") / name
+            robot = make(dataclasses.replace(settings, device="cpu"))
+            assert robot.domain.count == math.prod(settings.particles)
+
+
+@pytest.mark.parametrize(
+    ("recipe", "flags", "message"),
+    [
+        ("climber", ["--slop", "0.3"], "--slop"),
+        ("walker", ["--poisson-ratio", "0.5"], "error: poisson_ratio = 0.5: wanted at least 0 and less than 0.5\n"),
+    ],
+)
+def test_the_command_line_refuses_without_a_traceback_and_before_any_work(recipe, flags, message, tmp_path):
+    ended = subprocess.run(
+        [sys.executable, str(RECIPES / f"{recipe}.py"), "--out", str(tmp_path / "run"), *flags],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert ended.returncode == 2
+    assert message in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert not (tmp_path / "run").exists()

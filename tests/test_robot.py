@@ -1,0 +1,203 @@
+"""A robot made of settings: where it moves, what it is judged by, and what is refused before any simulation."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import pytest
+import torch
+from tiny import TINY
+
+import torchsoro.robot
+from torchsoro import SimulationDiverged, Simulator
+from torchsoro.robot import Outcome, Robot, climber, walker
+from torchsoro.settings import Settings
+
+
+def tiny(**changes: Any) -> Settings:
+    return dataclasses.replace(TINY, **changes)
+
+
+@pytest.fixture(scope="module")
+def judged() -> tuple[Robot, Outcome]:
+    """A walker with a front that differs from its rear, its outcome, and gradients."""
+    robot = walker(tiny())
+    with torch.no_grad():
+        robot.field.phi.copy_(torch.linspace(-0.1, 0.3, 8).reshape(8, 1, 1) + 0.05 * torch.linspace(-1, 1, 8))
+    outcome = robot(robot.field())
+    (outcome.travel / robot.domain.cell).backward()
+    return robot, outcome
+
+
+def test_a_walker_stands_on_the_ground_and_a_climber_between_two_walls():
+    robot = walker(tiny(friction=0.4))
+    assert [(p.axis, p.offset, p.side, p.friction) for p in robot.planes] == [(2, 0.0, 1, 0.4)]
+    assert (robot.direction, robot.field.symmetry) == ((1, 0, 0), ("y",))
+    assert robot.domain.positions[:, 2].min() > 0
+    assert robot.domain.positions[:, :2].mean(0).tolist() == pytest.approx([0, 0], abs=1e-12)
+    robot = climber(tiny(wall_distance=0.04))
+    assert [(p.axis, p.offset, p.side, p.friction) for p in robot.planes] == [
+        (0, -0.02, 1, "stick"),
+        (0, 0.02, -1, "stick"),
+    ]
+    assert (robot.direction, robot.field.symmetry) == ((0, 0, 1), ("x", "y"))
+
+
+def test_a_slope_leans_gravity_back_and_keeps_its_size():
+    assert walker(tiny()).gravity == (0, 0, -9.8)
+    x, y, z = walker(tiny(slope=0.3)).gravity
+    assert x / z == pytest.approx(0.3)
+    assert x < 0
+    assert y == 0
+    assert math.hypot(x, z) == pytest.approx(9.8)
+
+
+def test_an_outcome_agrees_with_its_trajectory_and_its_design(judged):
+    robot, outcome = judged
+    s, gamma, seen = robot.settings, robot.field().detach(), outcome.trajectory
+    settled = int((seen.time - s.settle).abs().argmin())
+    assert float(seen.time[-1]) == pytest.approx(s.settle + s.duration)
+    torch.testing.assert_close(outcome.travel, (seen.center_of_gravity[-1] - seen.center_of_gravity[settled])[0])
+    height = seen.center_of_gravity[:, 2]
+    assert outcome.fall >= 0
+    assert outcome.fall <= height[0] - height.min()
+    density = gamma[robot.design]
+    assert outcome.intermediate.item() == pytest.approx(float((density * (1 - density)).mean()), rel=1e-6)
+    scale = (1 - s.epsilon) * density.double() ** s.power + s.epsilon
+    solid = s.density * robot.domain.volume * (float(scale.sum()) + int(robot.wall.sum()))
+    assert outcome.mass.item() == pytest.approx(solid, rel=1e-5)
+    place = (scale.unsqueeze(-1) * robot.domain.positions[robot.design]).sum(0) / scale.sum()
+    assert outcome.center.tolist() == pytest.approx(place.tolist(), abs=1e-7)
+    assert place[0] > 1e-3  # denser in front
+    assert outcome.center.tolist() == pytest.approx(seen.center_of_gravity[0].tolist(), abs=1e-7)
+    assert seen.position.shape[1:] == (0, 3)
+
+
+def test_the_gradient_reaches_phi_and_is_mirror_symmetric_to_the_bit(judged):
+    robot, _ = judged
+    gradient = robot.field.phi.grad
+    assert torch.isfinite(gradient).all()
+    assert torch.equal(gradient, gradient.flip(1))
+    design = robot.domain.lattice(robot.design)
+    assert (gradient[design] != 0).all()
+    assert (gradient[~design] == 0).all()
+    assert not torch.allclose(gradient, gradient.flip(0))
+
+
+def test_everything_records_all_particles_and_the_same_motion(judged):
+    robot, outcome = judged
+    with torch.no_grad():
+        full = robot(robot.field(), everything=True)
+    assert full.trajectory.position.shape == (len(full.trajectory.time), robot.domain.count, 3)
+    assert torch.equal(full.trajectory.center_of_gravity, outcome.trajectory.center_of_gravity)
+    assert torch.equal(full.travel, outcome.travel)
+
+
+@torch.no_grad()
+def test_a_share_of_gravity_is_a_smaller_gravity():
+    robot = walker(tiny(gravity=8.0))
+    half = robot(robot.field(), gravity_scale=0.5)
+    other = walker(tiny(gravity=4.0))
+    assert torch.equal(half.travel, other(other.field()).travel)
+    assert not torch.equal(half.travel, robot(robot.field()).travel)
+
+
+def test_the_actuation_starts_after_settling(tmp_path):
+    modelled = walker(tiny()).pressure
+    assert modelled.at(torch.tensor([0.0, 0.0099, 0.012], dtype=torch.float64)).tolist()[:2] == [0, 0]
+    assert 0.5 < float(modelled.at(torch.tensor([0.012], dtype=torch.float64))) / TINY.pressure < 0.7  # 1 - 1/e
+    file = tmp_path / "measured.csv"
+    file.write_text("time_s,pressure_pa\n3.0,0\n3.01,50e3\n3.02,10e3\n")
+    measured = walker(tiny(pressure_file=file)).pressure
+    assert measured.time.tolist() == pytest.approx([0.01, 0.02, 0.03])
+    assert measured.pressure.tolist() == [0, 50e3, 10e3]
+
+
+class Fragile:
+    """Stands in for a simulator: diverges in the first tries, and takes note of the steps."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
+        self.steps: list[float] = []
+        self.failures = failures
+        monkeypatch.setattr(torchsoro.robot, "Simulator", self.make)
+
+    def make(self, **settings: Any) -> Any:
+        simulator = Simulator(**settings)
+        real = simulator.forward
+
+        def forward(*args: Any, **keywords: Any) -> Any:
+            self.steps.append(simulator.dt)
+            if len(self.steps) <= self.failures:
+                raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J <= 0", remedy="a smaller step")
+            return real(*args, **keywords)
+
+        simulator.forward = forward
+        return simulator
+
+
+@torch.no_grad()
+def test_a_simulation_that_diverges_is_tried_again_with_half_the_step(monkeypatch):
+    robot = walker(tiny(halvings=2))
+    plain = robot(robot.field())
+    fragile = Fragile(monkeypatch, failures=1)
+    again = robot(robot.field())
+    assert fragile.steps == [TINY.dt, TINY.dt / 2]
+    assert torch.equal(again.trajectory.time, plain.trajectory.time)
+    torch.testing.assert_close(
+        again.trajectory.center_of_gravity, plain.trajectory.center_of_gravity, rtol=0, atol=1e-4
+    )
+    fragile = Fragile(monkeypatch, failures=9)
+    with pytest.raises(SimulationDiverged, match="J <= 0"):
+        robot(robot.field())
+    assert fragile.steps == [TINY.dt, TINY.dt / 2, TINY.dt / 4]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"youngs_modulus": -1.0}, "youngs_modulus = -1.0"),
+        ({"density": math.nan}, "density = nan"),
+        ({"poisson_ratio": 0.5}, "poisson_ratio = 0.5"),
+        ({"elements": 6}, "elements = 6"),
+        ({"air_stiffness": -1.0}, "stiffness = -1.0"),
+        ({"epsilon": 0.0}, "epsilon = 0.0"),
+        ({"power": -3.0}, "power = -3.0"),
+        ({"friction": -0.1}, "friction = -0.1"),
+        ({"dt": 1e-3}, r"dt = 0.001 s: above the limit of about 0.000\d+ s, set by \w+"),
+        ({"wall": 0.0}, "a chamber without wall"),
+        ({"wall": 0.003}, "wall face"),
+        ({"chamber": (0.04375,) * 3}, "leaves the body"),
+        ({"particles": (8, 8, 9)}, "particles"),
+        ({"room": 0.0, "size": (0.0175,) * 3, "chamber": (0.00875,) * 3, "wall": 0.0175 / 8}, "low, high"),
+        ({"filter_radius": 0.0}, "radius"),
+        ({"beta": -1.0}, "beta"),
+        ({"duty": 1.0}, "duty"),
+        ({"rise": 0.0}, "rise"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused_before_any_simulation(changes, message):
+    with pytest.raises(ValueError, match=message):
+        walker(tiny(**changes))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "existing CSV file"),
+        ("time_s,bar\n0,0\n1,1\n", "pressure_pa"),
+        ("time_s,pressure_pa\n0,0\n1,1\n0.5,2\n", "line 4.*increasing"),
+    ],
+)
+def test_a_bad_pressure_file_is_refused_before_any_simulation(text, message, tmp_path):
+    file = tmp_path / "measured.csv"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        walker(tiny(pressure_file=file))
+
+
+def test_walls_closer_than_the_body_is_wide_are_refused():
+    with pytest.raises(ValueError, match=r"wall_distance = 0.03 m: wanted at least the body's 0.035 m"):
+        climber(tiny(wall_distance=0.03))

@@ -1,0 +1,157 @@
+"""Settings and the command line made of them: presets, overrides, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import TINY
+
+from torchsoro import SimulationDiverged
+from torchsoro.settings import Settings, from_command_line, plain_errors
+
+PRESETS = {"desk": dataclasses.replace(TINY, device="auto"), "paper": Settings()}
+
+
+def parse(*arguments: str) -> Settings:
+    return from_command_line(PRESETS, description="Design.", arguments=arguments)
+
+
+def test_the_preset_follows_the_device_unless_it_is_named(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert parse() == PRESETS["desk"]
+    assert parse("--preset", "paper") == PRESETS["paper"]
+    assert parse("--device", "cpu").target == torch.device("cpu")
+    assert parse().target == torch.device("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert parse() == PRESETS["paper"]
+    assert parse().target == torch.device("cuda")
+    assert parse("--preset=desk").preset == "desk"
+    assert parse("--device", "cpu").preset == "desk"
+
+
+def test_every_setting_can_be_overridden():
+    text = {Path: "elsewhere", bool: None, int: "7", float: "0.125", str: "x"}
+    special = {
+        "preset": ("paper",),
+        "device": ("cpu",),
+        "transfer": ("flip",),
+        "friction": ("0.4",),
+        "pressure_file": ("measured.csv",),
+        # Times are whole numbers of these.
+        "dt": ("0.0000125",),
+        "sample_every": ("0.005",),
+        "settle": ("0.25",),
+        "duration": ("0.25",),
+        "c_max": ("0.125",),
+    }
+    for field in dataclasses.fields(Settings):
+        held = getattr(PRESETS["paper"], field.name)
+        flag = "--" + field.name.replace("_", "-")
+        if field.name in special:
+            values = special[field.name]
+        elif isinstance(held, bool):
+            values = ()
+        elif isinstance(held, tuple):
+            values = (text[type(held[0])],) * len(held)
+        else:
+            values = (text[type(held)] if not isinstance(held, Path) else "elsewhere",)
+        seen = getattr(parse("--preset", "paper", flag, *values), field.name)
+        if field.name not in ("preset", "settle"):
+            assert seen != held, field.name
+        if not isinstance(held, bool):
+            assert seen == (tuple(map(type(held[0]), values)) if isinstance(held, tuple) else type(seen)(values[0]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "seen"),
+    [
+        (("--slop", "0.3"), "--slop"),
+        (("--slo", "0.3"), "--slo"),
+        (("0.3",), "0.3"),
+        (("--slope",), "--slope"),
+        (("--slope", "abc"), "abc"),
+        (("--iterations", "2.5"), "2.5"),
+        (("--particles", "8", "8"), "--particles"),
+        (("--preset", "bench"), "bench"),
+        (("--device", "tpu"), "tpu"),
+        (("--friction", "slick"), "slick"),
+        (("--c-max", "0.3"), "c_max = 0.3"),
+        (("--gravity", "-9.8"), "gravity = -9.8"),
+    ],
+)
+def test_what_is_unknown_mistyped_or_out_of_range_ends_with_code_two_and_says_why(arguments, seen, capsys):
+    with pytest.raises(SystemExit) as error:
+        parse(*arguments)
+    assert error.value.code == 2
+    assert seen in capsys.readouterr().err
+
+
+def test_the_help_names_every_setting_with_its_words_and_keeps_commands_on_their_lines(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    with pytest.raises(SystemExit) as error:
+        from_command_line(
+            PRESETS,
+            description="A title.\n\n    python one.py   # first\n    python two.py   # second\n\nThe end\nof it.",
+            arguments=["--help"],
+        )
+    assert not error.value.code
+    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert "$ python one.py   # first" in lines
+    assert "$ python two.py   # second" in lines
+    assert "The end of it." in lines
+    text = "\n".join(lines)
+    for field in dataclasses.fields(Settings):
+        assert "--" + field.name.replace("_", "-") in text
+    assert text.count("(default:") == len(dataclasses.fields(Settings))
+    assert "Equilibrium Young's modulus [Pa]. (default: 440000.0)" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[(name, bad) for name in ("gravity", "slope", "room", "upright") for bad in (-0.1, math.inf, math.nan)],
+        *[(name, bad) for name in ("duration", "frequency", "learning_rate", "dt") for bad in (0.0, -1.0, math.nan)],
+        *[(name, 0) for name in ("iterations", "window", "gravity_every", "picture_every", "frames")],
+        *[(name, -1) for name in ("gravity_steps", "halvings")],
+        *[("c_max", bad) for bad in (0.0, 0.25, math.nan)],
+        ("settle", 0.0100625),  # half a substep too long
+        ("duration", 0.0200625),
+        ("sample_every", 0.0001),
+        ("sample_every", 0.003),  # the end of settling would not be sampled
+    ],
+)
+def test_bad_numbers_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"(^|, ){name}\b|= {name}\b|settle = .* sample_every") as error:
+        dataclasses.replace(TINY, **{name: value})
+    assert "wanted" in str(error.value)
+
+
+def test_cuda_is_refused_where_there_is_none(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    with pytest.raises(ValueError, match="device = 'cuda'"):
+        dataclasses.replace(TINY, device="cuda")
+
+
+def test_gravity_rises_in_steps():
+    assert [TINY.gravity_scale(k) for k in (0, 5)] == [1, 1]
+    slow = dataclasses.replace(TINY, gravity_steps=2, gravity_every=3)
+    assert [slow.gravity_scale(k) for k in range(8)] == [0, 0, 0, 0.5, 0.5, 0.5, 1, 1]
+
+
+def test_what_may_change_on_resume_exists():
+    assert set(TINY.free) <= {field.name for field in dataclasses.fields(Settings)}
+
+
+def test_errors_that_a_user_can_act_on_become_one_line(capsys):
+    broken = SimulationDiverged(step=3, time=1e-3, particle=5, quantity="NaN", remedy="a smaller step")
+    for error, code in ((ValueError("wall = 0"), 2), (broken, 1), (KeyboardInterrupt(), 130)):
+        with pytest.raises(SystemExit) as end, plain_errors():
+            raise error
+        assert end.value.code == code
+    assert capsys.readouterr().err == f"error: wall = 0\nerror: {broken}\n"
+    with pytest.raises(TypeError), plain_errors():
+        raise TypeError("a bug")
