@@ -16,7 +16,7 @@ from pathlib import Path
 
 from walker import DESK as WALKER_DESK
 from walker import PAPER as WALKER_PAPER
-from walker import optimize
+from walker import optimize, report
 
 from torchsoro.robot import climber
 from torchsoro.settings import Settings, from_command_line, plain_errors
@@ -37,9 +37,9 @@ DESK = dataclasses.replace(
     size=(0.035, 0.035, 0.035 / 12 * 16),
     particles=(12, 12, 16),
     settle=0.0,
-    iterations=60,
+    iterations=40,
     learning_rate=0.05,
-    epsilon=1e-4,
+    upright=0.0,
     gravity_steps=5,
     gravity_every=4,
 )
@@ -54,7 +54,4 @@ if __name__ == "__main__":
     chosen = from_command_line({"desk": DESK, "paper": PAPER}, description=__doc__)
     with plain_errors():
         result = main(chosen)
-    print(
-        f"L = {1e3 * result['L']:.2f} mm in {chosen.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
-        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g; everything is in {chosen.out}"
-    )
+    print(report(result, chosen))

@@ -12,6 +12,7 @@ Every number of the settings can be overridden: --help lists them.
 from __future__ import annotations
 
 import dataclasses
+import statistics
 import time
 from pathlib import Path
 
@@ -116,7 +117,17 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
             if stopped:
                 break
         metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name)
-    return {**metrics, "iterations": len(run.metrics["iteration"])}
+    seconds = {key: statistics.median(run.metrics[f"time/{key}"]) for key in ("forward", "backward")}
+    return {**metrics, **seconds, "iterations": len(run.metrics["iteration"])}
+
+
+def report(result: dict[str, float], settings: Settings) -> str:
+    """What ``optimize`` returned, in one sentence."""
+    return (
+        f"L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
+        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g after {result['iterations']} iterations "
+        f"of {result['forward']:.1f} s forward and {result['backward']:.1f} s backward; everything is in {settings.out}"
+    )
 
 
 def main(settings: Settings) -> dict[str, float]:
@@ -128,7 +139,4 @@ if __name__ == "__main__":
     chosen = from_command_line({"desk": DESK, "paper": PAPER}, description=__doc__)
     with plain_errors():
         result = main(chosen)
-    print(
-        f"L = {1e3 * result['L']:.2f} mm in {chosen.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
-        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g; everything is in {chosen.out}"
-    )
+    print(report(result, chosen))

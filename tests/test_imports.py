@@ -35,6 +35,9 @@ fabricate
 scene
 page
 picture
+settings
+robot
+results
 sim2real.recording
 sim2real.residual
 sim2real.location

@@ -101,7 +101,8 @@ class Robot(nn.Module):
         """
         s = self.settings
         body = self._fill(gamma)
-        weight = torch.where(self.design, body.mass, torch.zeros_like(body.mass))
+        solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
+        weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
         trajectory = self._simulate(body, weight, gravity_scale, everything)
         end = s.settle + s.duration
         distance = travel(
@@ -111,7 +112,7 @@ class Robot(nn.Module):
         return Outcome(
             travel=distance,
             intermediate=intermediate_density(gamma, self.design),
-            mass=total_mass(torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))),
+            mass=total_mass(solid),
             fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,

@@ -108,6 +108,8 @@ class Settings:
     """Radius of the density filter [m]."""
     beta: float = 8.0
     """Sharpness of the projection."""
+    counted: Literal["design", "body"] = "design"
+    """Whose centre of gravity travels: the design domain's (the paper's) or the chamber wall's, too."""
     upright: float = 0.0
     """Weight of falling over against travel; 0 in the paper, whose longer runs punish a fall by themselves."""
     sink: float = 0.02
