@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 import imageio.v3 as iio
+import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
@@ -130,7 +131,9 @@ def test_the_design_and_the_part_can_be_used(straight):
 
 def test_the_movie_plays_and_the_summary_is_a_page(straight):
     path, _ = straight
-    assert len(iio.imread(path / "walker.mp4", plugin="FFMPEG")) == TINY.frames
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(path / "walker.mp4"))
+    assert frames == TINY.frames
+    assert seconds > 0
     page = iio.imread(path / "summary.png")
     assert min(page.shape[:2]) > 500
     assert page[..., :3].std() > 5
@@ -140,7 +143,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(recipes, straight,
     recipes["walker"].main(tiny(tmp_path / "run", iterations=1))
     again = recipes["walker"].main(tiny(tmp_path / "run", resume=True, picture_every=1, frames=2))
     assert_same_run(tmp_path / "run", straight[0])
-    assert again == straight[1]
+    seconds = ("forward", "backward")
+    assert {k: v for k, v in again.items() if k not in seconds} == {
+        k: v for k, v in straight[1].items() if k not in seconds
+    }
     steps = [event.step for event in EventAccumulator(str(tmp_path / "run")).Reload().Scalars("objective/L")]
     assert steps == [0, 1, 2]
 
