@@ -87,19 +87,22 @@ def work(path):
         run.log(iteration, {"objective/L": iteration})
         run.save(iteration, field=torch.full((100_000,), float(iteration)))
 
+torch.set_num_threads(1)  # a child that is forked beside OpenMP threads would wait for them for ever
 random.seed(5)
 for trial in range(10):
     path = f"{sys.argv[1]}/{trial}"
     child = os.fork()
     if child == 0:
         work(path)
-    time.sleep(random.uniform(0.05, 0.2))
+    begin = time.monotonic()
+    while not os.path.exists(path + "/checkpoint.pt") and time.monotonic() < begin + 30:
+        time.sleep(0.002)  # a busy machine may take its time to the first checkpoint
+    time.sleep(random.uniform(0, 0.1))
     os.kill(child, signal.SIGKILL)
     assert os.waitpid(child, 0)[1] == signal.SIGKILL  # it did not fail by itself before
-    if os.path.exists(path + "/checkpoint.pt"):
-        state = torch.load(path + "/checkpoint.pt", weights_only=True)
-        assert (state["items"]["field"] == state["iteration"]).all()
-        print(trial, state["iteration"])
+    state = torch.load(path + "/checkpoint.pt", weights_only=True)
+    assert (state["items"]["field"] == state["iteration"]).all()
+    print(trial, state["iteration"])
 """
 
 
@@ -108,7 +111,7 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path):
     done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     found = [[int(word) for word in line.split()] for line in done.stdout.splitlines()]
-    assert len(found) > 3, "most trials should reach a checkpoint"
+    assert len(found) == 10
     for trial, last in found[-3:]:
         path = tmp_path / str(trial)
         with RunFolder(path, {"seed": 1}, resume=True) as run:

@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from torchsoro.levelset import as_array
 from torchsoro.scene import FAINT, FULL, INK, PRESSURE, Camera, PlaneTuple, Scene, Shape, bounds_of
@@ -238,6 +239,7 @@ def history_panel(
     axes.plot(iterations, values, color=color, lw=1.9)
     axes.plot(iterations[-1], values[-1], "o", color=color, ms=5)
     axes.set_ylabel(label, color=INK)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     _plain(axes)
     heading(axes, f"{head}: {values[-1]:.3g}" + (" mm" if "mm" in label else ""))
     if limit is not None:
