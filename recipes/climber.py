@@ -40,6 +40,8 @@ DESK = dataclasses.replace(
     iterations=40,
     learning_rate=0.05,
     upright=0.0,
+    # Otherwise a plate that has come off the chamber and is pushed up by it counts as climbing.
+    counted="body",
     gravity_steps=5,
     gravity_every=4,
 )
