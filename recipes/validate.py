@@ -40,8 +40,8 @@ Curve = tuple[int, float, np.ndarray, np.ndarray, np.ndarray]
 class Unchecked(Simulator):
     """A simulator that takes any time step."""
 
-    def _check_step(self, body: Body, prony: Prony | None) -> None:
-        pass
+    def check_step(self, body: Body, prony: Prony | None) -> None:
+        """Refuse nothing."""
 
 
 def rheology(

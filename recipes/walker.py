@@ -106,6 +106,7 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
                     "penalty/C": lagrangian.penalty,
                     "grad_norm/phi": norm,
                     "field/gamma_mean": gamma.detach().mean(),
+                    "simulation/dt": outcome.dt,
                     "time/forward": middle - begin,
                     "time/backward": end - middle,
                     "time/iteration": time.perf_counter() - begin,

@@ -30,6 +30,7 @@ class Outcome:
         fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
         center: Centre of gravity of the undeformed design domain [3] m, Eq. 14.
         trajectory: The motion.
+        dt: Substep that it took [s]: the settings' or, where that broke down, a half or a quarter of it.
     """
 
     travel: Tensor
@@ -38,6 +39,7 @@ class Outcome:
     fall: Tensor
     center: Tensor
     trajectory: Trajectory
+    dt: float
 
 
 class Robot(nn.Module):
@@ -83,7 +85,7 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
-        self._simulator(s.dt)._check_step(self._fill(torch.ones(self.domain.count)), self.prony)
+        self._simulator(s.dt).check_step(self._fill(torch.ones(self.domain.count)), self.prony)
 
     def forward(self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False) -> Outcome:
         """Simulate a design and judge it.
@@ -103,7 +105,7 @@ class Robot(nn.Module):
         body = self._fill(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory = self._simulate(body, weight, gravity_scale, everything)
+        trajectory, dt = self._simulate(body, weight, gravity_scale, everything)
         end = s.settle + s.duration
         distance = travel(
             trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
@@ -116,18 +118,20 @@ class Robot(nn.Module):
             fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
+            dt=dt,
         )
 
     def _fill(self, gamma: Tensor) -> Body:
         s = self.settings
         return fill(self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power)
 
-    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> Trajectory:
+    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> tuple[Trajectory, float]:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
         for halving in range(s.halvings + 1):
+            dt = s.dt / 2**halving
             try:
-                return self._simulator(s.dt / 2**halving)(
+                trajectory = self._simulator(dt)(
                     body,
                     duration=s.settle + s.duration,
                     prony=self.prony,
@@ -138,6 +142,7 @@ class Robot(nn.Module):
                     weight=weight,
                     probes=torch.arange(self.domain.count) if everything else None,
                 )
+                return trajectory, dt
             except SimulationDiverged:
                 if halving == s.halvings:
                     raise

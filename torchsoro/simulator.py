@@ -178,7 +178,7 @@ class Simulator(nn.Module):
         _check_body(body)
         if start is None:
             self._check_inside(x)
-        self._check_step(body, prony)
+        self.check_step(body, prony)
         attached = attach(body, loads)
         body = attached.body
 
@@ -284,7 +284,16 @@ class Simulator(nn.Module):
                 f"from {self.low} to {self.high} m and a cell of {self.cell:g} m away from its faces"
             )
 
-    def _check_step(self, body: Body, prony: Prony | None) -> None:
+    def check_step(self, body: Body, prony: Prony | None) -> None:
+        """Refuse a time step above the stability limit of the body's fastest wave; every call does this first.
+
+        Args:
+            body: Particles.
+            prony: Maxwell elements of the solids.
+
+        Raises:
+            ValueError: says the limit and the term that sets it.
+        """
         found = courant(body, prony, dt=self.dt, cell=self.cell)
         if found.number > STABLE_COURANT:
             limit = self.dt * STABLE_COURANT / found.number
