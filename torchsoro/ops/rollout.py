@@ -98,7 +98,7 @@ class _Rollout(torch.autograd.Function):
             states = march.forward(state, keep=True, look=lambda k, s: None)
             march.samples = ctx.samples
         bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
-        weight_bar, more = torch.zeros_like(weight), [torch.zeros_like(named.coefficients)]
+        weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(named.coefficients)
         pressure_bar = torch.zeros_like(named.pressure)
 
         def add(k: int, bar: Tensor) -> None:
@@ -115,7 +115,7 @@ class _Rollout(torch.autograd.Function):
                 for total, part in (
                     (bar, by_state),
                     (weight_bar, by_weight),
-                    (more[0], by_coefficients),
+                    (coefficients_bar, by_coefficients),
                     (pressure_bar[k], by_pressure),
                 ):
                     if part is not None:
@@ -123,7 +123,7 @@ class _Rollout(torch.autograd.Function):
 
         sums = march.backward(states, bar, add, prony=ctx.needs_input_grad[6 + _INPUTS.index("prony")])
         ctx.march, ctx.states = None, None
-        sums["coefficients"] += more[0]
+        sums["coefficients"] += coefficients_bar
         sums["pressure"] += pressure_bar
         return None, None, None, None, bar, weight_bar, *(sums[name] for name in _INPUTS)
 
