@@ -1,177 +1,392 @@
 """Speed of the simulator on a walker-like body: solid with Maxwell elements, a gas chamber, ground contact; float32.
 
-    python recipes/benchmark.py                                    # 2,000, 4,096 and 8,000 particles
-    python recipes/benchmark.py --particles 4096 --steps 2000      # longer, one size
-    python recipes/benchmark.py --preset paper --device cuda       # 64,000 particles, cell 1.75 mm, dt = 10 us
-    python recipes/benchmark.py --compile                          # also seconds to compile, without and with the cache
+    python recipes/benchmark.py                                  # naive step, table of sizes, where the time goes
+    python recipes/benchmark.py --only table --particles 4096    # one section, one size
+    python recipes/benchmark.py --five --bits --auto-dt          # also these three
+    python recipes/benchmark.py --compile                        # also seconds to compile, without and with the cache
+    python recipes/benchmark.py --preset paper --json paper.json # 64,000 particles, 75,000 steps, beside the required
 
-Each line is one size. "kept" holds all states for the gradient, "recomputed" every sqrt(steps)-th, as long runs do;
-both count forward and backward together. Times are the best of some repetitions, after one that compiles.
+All is measured in the same run, the best of some repeats after one that compiles and allocates; on CUDA by its events.
+A step of the table is that of a whole call, what it sets up and checks included. M/s are million particle-steps per
+second. "kept" holds all states for the gradient, in as many steps as fit; "recomputed" computes those of each segment
+again, as long runs do; both count forward and backward together. GB is torch's peak on CUDA; Taichi takes up to 0.3 GB
+beside it.
+
+"floor" is what a forward step must at least move (state read and written, coefficients read, node arrays written and
+read) over the bandwidth of a large copy on the same device. It supposes that nothing stays in a cache from one step to
+the next: a state of a few tens of megabytes may stay in that of a large GPU, and a step then take less.
+
+What each optimisation bought
+-----------------------------
 """
 
 from __future__ import annotations
 
-import math
+import dataclasses
+import json
 import os
-import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Callable
-from typing import Literal
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 import tyro
+from naive import Naive
+from timing import (
+    EDGE,
+    Case,
+    Row,
+    Watch,
+    best_of,
+    child,
+    copy_bandwidth,
+    least_bytes,
+    named,
+    peak,
+    say,
+    skipping,
+    table,
+)
+from torch import Tensor
 
-from torchsoro import Chamber, Domain, Prony, Simulator, Solid, Trajectory, fill, ground, square_wave, stable_step
+PAPER_STEPS = 75_000
+SIZES = {"cpu": (2000, 4096, 8000, 16_384), "cuda": (16_384, 64_000, 216_000, 512_000, 2_000_376)}
+SECTIONS = ("naive", "table", "where", "rollout", "bits", "auto-dt", "five", "compile")
+Section = Literal["naive", "table", "where", "rollout", "bits", "auto-dt", "five", "compile"]
+# Quantity, required, aim; on one H200.
+WANTED = (
+    ("forward [us/step]", "45", "25"),
+    ("forward and backward of 75,000 steps [s]", "15", "8"),
+    ("device memory [GB]", "20", "10"),
+    ("same bits in two runs", "yes", "yes"),
+    ("512,000 particles, forward [M/s]", "1,500", "2,500"),
+    ("five Maxwell elements over three", "1.4", ""),
+)
 
-EDGE = 0.035  # of the body [m]
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """Measure the speed of the simulator: naive step, table of sizes and where the time goes, and what is asked for."""
+
+    preset: Literal["desk", "paper"] = "desk"
+    """What to measure; "paper" adds its whole rollout (twice, for the bits), five elements, and what is required."""
+    formulation: Literal["both", "updated", "total"] = "both"
+    """Formulations to measure."""
+    only: tuple[Section, ...] = ()
+    """Measure these sections and no others, whatever the switches below say."""
+    particles: tuple[int, ...] = ()
+    """Sizes of the table; 2,000 to 16,384 on a CPU and 16,384 to 2,000,376 on CUDA if empty."""
+    size: int | None = None
+    """Size of all other sections; 64,000 on CUDA or with "paper", else 4,096."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where; auto takes CUDA if there is one."""
+    table_steps: int = 500
+    """Substeps of a run, but for the whole rollout."""
+    steps: int | None = None
+    """Substeps of the whole rollout (with bits and auto-dt); 75,000 with "paper", else 3,000."""
+    elements: int = 3
+    """Maxwell elements."""
+    repeats: int = 3
+    """Repetitions of which the best counts; the whole rollout runs once."""
+    five: bool = False
+    """Also the cost of five Maxwell elements against three."""
+    bits: bool = False
+    """Also whether two rollouts with their gradients have equal bits."""
+    auto_dt: bool = False
+    """Also the rollout with the largest stable step, and how far its L and gradient are from the small step's."""
+    compile: bool = False
+    """Also the compilation, in fresh processes."""
+    json: Path | None = None
+    """File for all numbers."""
+
+    @property
+    def target(self) -> torch.device:
+        """Where to compute."""
+        auto = "cuda" if torch.cuda.is_available() else "cpu"
+        return torch.device(auto if self.device == "auto" else self.device)
+
+    @property
+    def formulations(self) -> tuple[Literal["updated", "total"], ...]:
+        """Which to measure."""
+        return ("updated", "total") if self.formulation == "both" else (self.formulation,)
+
+    @property
+    def sections(self) -> tuple[str, ...]:
+        """What to measure, in order."""
+        paper = self.preset == "paper"
+        on = {"naive": True, "table": True, "where": True, "rollout": paper, "bits": paper or self.bits}
+        on |= {"five": paper or self.five, "auto-dt": self.auto_dt, "compile": self.compile}
+        return tuple(name for name in SECTIONS if (name in self.only if self.only else on[name]))
+
+    def case(self, formulation: str, **changes: Any) -> Case:
+        """A run of the size that is not the table's."""
+        large = self.target.type == "cuda" or self.preset == "paper"
+        plain: Row = {"count": self.size or (64_000 if large else 4096), "steps": self.table_steps}
+        fixed = {"formulation": formulation, "device": self.target, "elements": self.elements}
+        return Case(**(plain | fixed | changes))
 
 
-def walker(count: int) -> Domain:
-    """A box of about ``count`` particles, 35 mm wide, with a chamber of half its width in the middle."""
-    n = 2 * round(count ** (1 / 3) / 2)
-    height = 2 * round(count / n**2 / 2)
-    h, air = EDGE / n, 2 * round(n / 4)
-    chamber = Chamber(
-        name="air",
-        center=(EDGE / 2, EDGE / 2, height * h / 2),
-        size=(air * h,) * 3,
-        wall=max(1, n // 20) * h,
+def naive_step(options: Options) -> list[Row]:
+    """The naive step, and how many times faster the formulations are."""
+    case = options.case("updated")
+    cells = [n // 2 for n in case.domain.particles]
+    naive = Naive(
+        case.body(case.gamma),
+        case.prony,
+        cell=case.domain.cell,
+        dt=case.substep,
+        low=(-2 * EDGE,) * 3,
+        nodes=(5 * cells[0],) * 3,
     )
-    return Domain(size=(EDGE, EDGE, height * h), particles=(n, n, height), chambers=(chamber,))
+
+    def march() -> None:
+        for _ in range(case.steps):
+            naive.step()
+
+    seconds = {"naive": best_of(options.repeats, march, case.device)[0]}
+    for formulation in options.formulations:
+        with skipping(f"naive, {formulation}"):
+            seconds[formulation] = best_of(options.repeats, options.case(formulation).forward, case.device)[0]
+    return [
+        {
+            "step": name,
+            "particles": case.domain.count,
+            "forward [us]": 1e6 * value / case.steps,
+            "naive over this": seconds["naive"] / value,
+        }
+        for name, value in seconds.items()
+    ]
 
 
-def best_of(repeats: int, work: Callable[[], object], device: torch.device) -> float:
-    """Least seconds that ``work`` takes; on a GPU by its own clock."""
-    seconds = math.inf
-    for _ in range(repeats):
-        if device.type == "cuda":
-            start, end = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
-            torch.cuda.synchronize()
-            begin = time.perf_counter()
-            start.record()
-            work()
-            end.record()
-            torch.cuda.synchronize()
-            # Taichi may launch on a stream of its own, which torch's events do not see.
-            seconds = min(seconds, max(start.elapsed_time(end) / 1e3, time.perf_counter() - begin))
-        else:
-            begin = time.perf_counter()
-            work()
-            seconds = min(seconds, time.perf_counter() - begin)
-    return seconds
-
-
-def measure(
-    count: int, *, device: torch.device, steps: int, elements: int = 3, dt: float | None = None, repeats: int = 3
-) -> dict[str, float]:
-    """Time one size.
-
-    Args:
-        count: Number of particles, about.
-        device: CPU or CUDA.
-        steps: Substeps.
-        elements: Maxwell elements.
-        dt: Substep [s]; half the stable one if None.
-        repeats: Repetitions of which the best counts.
-
-    Returns:
-        Particles, steps, seconds of the first call, microseconds per step and million particle-steps per second:
-        forward; forward and backward with all states kept; the same with recomputation.
-    """
-    domain = walker(count)
-    prony, solid = Prony.paper(elements), Solid()
-    gamma = torch.full((domain.count,), 0.9, device=device, requires_grad=True)
-    cell = domain.cell
-    dt = dt or 0.5 * stable_step(fill(domain, gamma.detach(), solid=solid), prony, cell=cell)
-    wave = square_wave(amplitude=20e3, frequency=5.0, rise=0.01, fall=0.01, end=steps * dt + 0.2)
-
-    def simulate(segment: int | None = None) -> Trajectory:
-        room = EDGE + 4 * cell
-        simulator = Simulator(
-            cell=cell, dt=dt, low=(-room,) * 3, high=(2 * room,) * 3, memory_budget=32 * 2**30, segment=segment
-        )
-        return simulator(
-            fill(domain, gamma, solid=solid),
-            duration=steps * dt,
-            prony=prony,
-            pressure=wave,
-            planes=[ground()],
-            sample_every=steps * dt,
-        )
-
-    def forward() -> None:
-        with torch.no_grad():
-            simulate()
-
-    def both(segment: int | None = None) -> None:
-        gamma.grad = None
-        simulate(segment).center_of_gravity[-1, 2].backward()
-
-    begin = time.perf_counter()
-    both()
-    row: dict[str, float] = {"particles": domain.count, "steps": steps, "first call [s]": time.perf_counter() - begin}
-    cases = {"forward": forward, "kept": both, "recomputed": lambda: both(max(1, math.isqrt(steps)))}
-    for name, work in cases.items():
-        seconds = best_of(repeats, work, device)
-        row[f"{name} [us/step]"] = seconds / steps * 1e6
-        row[f"{name} [M/s]"] = domain.count * steps / seconds / 1e6
+def measure(case: Case, *, repeats: int, bandwidth: float) -> Row:
+    """Time one size: a row of the table."""
+    count, kept, floor = case.domain.count, case.kept(), least_bytes(case) / bandwidth
+    say(f"{case.formulation}, {count:,} particles: forward")
+    forward, _ = best_of(repeats, case.forward, case.device)
+    row: Row = {"particles": count, "formulation": case.formulation, "steps": case.steps}
+    row |= {"floor [us]": 1e6 * floor, "forward [us]": 1e6 * forward / case.steps}
+    row |= {"forward [M/s]": count * case.steps / forward / 1e6, "kept: steps": kept.steps}
+    for name, each in (("kept", kept), ("recomputed", case.recomputed())):
+        say(f"{case.formulation}, {count:,} particles: forward and backward, {name}")
+        seconds, memory = best_of(repeats, each.gradient, case.device)
+        row[f"{name} [us]"] = 1e6 * seconds / each.steps
+        row[f"{name} [M/s]"] = count * each.steps / seconds / 1e6
+        row[f"{name} [GB]"] = memory
     return row
 
 
-def compile_seconds(device: str) -> tuple[float, float]:
+def sizes(options: Options, bandwidth: float) -> list[Row]:
+    """The table over sizes and formulations."""
+    rows = []
+    for count in options.particles or SIZES[options.target.type]:
+        for formulation in options.formulations:
+            case = options.case(formulation, count=count)
+            with skipping(f"{count:,} particles, {formulation}"):
+                rows.append(measure(case, repeats=options.repeats, bandwidth=bandwidth))
+    return rows
+
+
+def tasks(options: Options, formulation: str) -> list[Row]:
+    """Share of each Taichi task in a step forward and back with recomputation."""
+    case = options.case(formulation)
+    say(f"{formulation}: Taichi's profiler, in a process of its own")
+    arguments = (case.count, formulation, case.device.type, case.steps, case.elements)
+    printed = child(f"timing.trace(*{arguments!r})", TI_KERNEL_PROFILER="1")
+    phases = [named(each, case.device.type == "cuda") for each in json.loads(printed.strip().splitlines()[-1])]
+    forward = {kernel for kernel, _ in phases[0].values()}
+    total = sum(spent for phase in phases for _, spent in phase.values())
+    rows = [
+        {
+            "formulation": formulation,
+            "part": "forward" if i == 0 else "recompute" if kernel in forward else "adjoint",
+            "task": task,
+            "[us/step]": 1e3 * spent / case.steps,
+            "share [%]": 100 * spent / total,
+        }
+        for i, phase in enumerate(phases)
+        for task, (kernel, spent) in phase.items()
+    ]
+    return sorted(rows, key=lambda row: ("forward", "recompute", "adjoint").index(row["part"]))
+
+
+def split(options: Options, formulation: str) -> Row:
+    """Forward, recompute and backward by the clock; the recompute is what backward takes longer without the states."""
+    case = options.case(formulation).kept()
+    laps: dict[str, list[float]] = {}
+    for name, each in (("kept", case), ("recomputed", case.recomputed())):
+        say(f"{formulation}: forward and backward by the clock, {name}")
+        each.gradient()
+        watches = [Watch(case.device) for _ in range(options.repeats)]
+        for watch in watches:
+            each.gradient(watch)
+        laps[name] = [1e6 / case.steps * min(lap) for lap in zip(*(w.laps() for w in watches), strict=True)]
+    (kept, adjoint), (forward, backward) = laps["kept"], laps["recomputed"]
+    row: Row = {"formulation": formulation, "forward [us]": forward, "forward, kept [us]": kept}
+    return row | {"recompute [us]": backward - adjoint, "adjoint [us]": adjoint}
+
+
+def where(options: Options) -> dict[str, list[Row]]:
+    """Where the time goes: by Taichi's tasks and by the clock."""
+    tables: dict[str, list[Row]] = {"tasks": [], "split": []}
+    for formulation in options.formulations:
+        with skipping(f"where the time goes, {formulation}"):
+            tables["split"].append(split(options, formulation))
+            tables["tasks"] += tasks(options, formulation)
+    return tables
+
+
+def rollout(case: Case) -> tuple[Row, Tensor, Tensor]:
+    """The whole rollout once, after a short one that compiles: its row, L and gradient."""
+    dataclasses.replace(case, steps=min(case.steps, 300)).recomputed().gradient()
+    say(f"{case.formulation}: forward and backward of {case.steps:,} steps of {case.domain.count:,} particles")
+    peak(case.device, reset=True)
+    watch = Watch(case.device)
+    L, gradient = case.gradient(watch)
+    forward, backward = watch.laps()
+    row: Row = {"formulation": case.formulation, "particles": case.domain.count, "steps": case.steps}
+    row |= {"forward [s]": forward, "forward [us/step]": 1e6 * forward / case.steps, "both [s]": forward + backward}
+    row |= {
+        "memory [GB]": peak(case.device),
+        "L [mm]": 1e3 * float(L),
+        "|dL/dgamma| [mm]": 1e3 * float(gradient.norm()),
+    }
+    return row, L, gradient
+
+
+def rollouts(options: Options) -> dict[str, list[Row]]:
+    """Whole rollouts: one, one more for the bits, one with the largest step."""
+    steps = options.steps or (PAPER_STEPS if options.preset == "paper" else 3000)
+    tables: dict[str, list[Row]] = {"rollout": [], "bits": [], "auto": []}
+    for formulation in options.formulations:
+        case = options.case(formulation, steps=steps)
+        with skipping(f"rollout, {formulation}"):
+            row, L, gradient = rollout(case)
+            tables["rollout"].append(row)
+            if "bits" in options.sections:
+                _, again, other = rollout(case)
+                same: Row = {name: row[name] for name in ("formulation", "particles", "steps")}
+                same |= {"L": torch.equal(L, again), "gradient": torch.equal(gradient, other)}
+                tables["bits"].append(same | {"equal": same["L"] and same["gradient"]})
+            if "auto-dt" in options.sections:
+                auto = dataclasses.replace(case, auto=True)
+                faster, again, other = rollout(auto)
+                row = {"formulation": formulation, "dt [us]": 1e6 * case.substep}
+                row |= {"auto [us]": 1e6 * auto.taken, "auto: both [s]": faster["both [s]"]}
+                row |= {"L, auto [mm]": faster["L [mm]"], "L: difference": abs(float(again / L) - 1)}
+                row["gradient: difference"] = float((other - gradient).norm() / gradient.norm())
+                row["cosine"] = float(torch.nn.functional.cosine_similarity(other, gradient, dim=0))
+                tables["auto"].append(row)
+    return tables
+
+
+def five_elements(options: Options) -> list[Row]:
+    """Cost of five Maxwell elements over that of three, at the same step."""
+    rows = []
+    for formulation in options.formulations:
+        with skipping(f"five elements, {formulation}"):
+            say(f"{formulation}: five Maxwell elements and three")
+            five = options.case(formulation, elements=5)
+            three = dataclasses.replace(five, elements=3, dt=five.substep)
+            row: Row = {"formulation": formulation, "particles": five.domain.count}
+            for name, work in (("forward", Case.forward), ("both", lambda case: case.recomputed().gradient())):
+                times = [best_of(options.repeats, lambda c=c, w=work: w(c), c.device)[0] for c in (three, five)]
+                row |= {f"{name}, {n} [us]": 1e6 * t / five.steps for n, t in zip((3, 5), times, strict=True)}
+                row[f"{name}, ratio"] = times[1] / times[0]
+            rows.append(row)
+    return rows
+
+
+def compile_seconds(options: Options) -> list[Row]:
     """Seconds of a process that takes one small gradient: with an empty cache of kernels, and again."""
-    times = []
-    with tempfile.TemporaryDirectory() as cache:
-        for _ in range(2):
-            begin = time.perf_counter()
-            command = [sys.executable, __file__, "--particles", "512", "--steps", "4", "--repeats", "1"]
-            subprocess.run(
-                [*command, "--device", device],
-                env=os.environ | {"TI_OFFLINE_CACHE_FILE_PATH": cache},
-                check=True,
-                capture_output=True,
-            )
-            times.append(time.perf_counter() - begin)
-    return times[0], times[1]
+    rows = []
+    for formulation in options.formulations:
+        with skipping(f"compilation, {formulation}"), tempfile.TemporaryDirectory() as cache:
+            row: Row = {"formulation": formulation}
+            for name in ("empty cache [s]", "after that [s]"):
+                say(f"{formulation}: a process until its first gradient, {name}")
+                begin = time.perf_counter()
+                arguments = f"count=512, formulation={formulation!r}, steps=4, elements={options.elements}"
+                device = f"device=timing.torch.device({options.target.type!r})"
+                child(f"timing.Case({arguments}, {device}).gradient()", TI_OFFLINE_CACHE_FILE_PATH=cache)
+                row[name] = time.perf_counter() - begin
+            rows.append(row)
+    return rows
 
 
-def main(
-    preset: Literal["desk", "paper"] = "desk",
-    particles: tuple[int, ...] = (2000, 4096, 8000),
-    device: Literal["auto", "cpu", "cuda"] = "auto",
-    steps: int = 500,
-    elements: int = 3,
-    repeats: int = 3,
-    compile: bool = False,
-) -> None:
-    """Measure the speed of the simulator.
+def beside_the_required(results: dict[str, Any], formulations: tuple[str, ...]) -> list[Row]:
+    """What was measured beside what was required of it on one H200; nothing from another size or a shorter run."""
 
-    Args:
-        preset: "paper" measures the paper's walker instead of ``particles``.
-        particles: Sizes to measure.
-        device: Where; auto takes CUDA if there is one.
-        steps: Substeps of a run.
-        elements: Maxwell elements.
-        repeats: Repetitions of which the best counts.
-        compile: Also measure the compilation, in fresh processes.
-    """
-    where = torch.device(("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device)
-    on = torch.cuda.get_device_name() if where.type == "cuda" else f"{os.cpu_count()} CPU threads"
-    print(f"{on}, float32, {elements} Maxwell elements; M/s: million particle-steps per second", flush=True)
-    sizes, dt = ((64_000,), 1e-5) if preset == "paper" else (particles, None)
-    for i, size in enumerate(sizes):
-        row = measure(size, device=where, steps=steps, elements=elements, dt=dt, repeats=repeats)
-        if i == 0:
-            print("  ".join(row))
-        print("  ".join(f"{value:{len(name)}.4g}" for name, value in row.items()), flush=True)
-    if compile:
-        first, cached = compile_seconds(where.type)
-        print(
-            f"a process until its first gradient: {first:.1f} s with an empty kernel cache, {cached:.1f} s after that"
+    def find(section: str, column: str, **where: Any) -> Any:
+        rows = (row for row in results.get(section, []) if all(row[k] == v for k, v in where.items()))
+        return next((row[column] for row in rows), None)
+
+    rows: list[Row] = [{"quantity": q, "required": required, "aim": aim} for q, required, aim in WANTED]
+    for f in formulations:
+        paper: Row = {"formulation": f, "particles": 64_000}
+        whole = paper | {"steps": PAPER_STEPS}
+        ratios = [find("five", f"{name}, ratio", **paper) for name in ("forward", "both")]
+        values = (
+            find("rollout", "forward [us/step]", **whole),
+            find("rollout", "both [s]", **whole),
+            find("rollout", "memory [GB]", **whole),
+            find("bits", "equal", **whole),
+            find("table", "forward [M/s]", formulation=f, particles=512_000),
+            None if None in ratios else max(ratios),
         )
+        for row, value in zip(rows, values, strict=True):
+            row[f] = value
+    return rows
+
+
+TITLES = {
+    "naive": "Naive step: four plain Taichi kernels over the full grid, forward only",
+    "table": "Sizes",
+    "tasks": "Where the time goes: Taichi's tasks in a step forward and back with recomputation",
+    "split": "Where the time goes, by the clock, per step",
+    "rollout": "Whole rollout",
+    "bits": "Equal bits in two whole rollouts",
+    "auto": "The step that the simulator chooses, and relative differences from the small one",
+    "five": "Five Maxwell elements over three",
+    "compile": "A process until its first gradient",
+    "required": "Beside the required (one H200, 64,000 particles, 75,000 steps)",
+}
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Measure, print and write; returns all numbers."""
+    on = torch.cuda.get_device_name() if options.target.type == "cuda" else f"{os.cpu_count()} CPU threads"
+    bandwidth = copy_bandwidth(options.target)
+    torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
+    results: dict[str, Any] = {"device": on, "torch": torch.__version__, "copy [GB/s]": bandwidth / 1e9}
+    print(f"{on}, float32, {options.elements} Maxwell elements; a large copy moves {bandwidth / 1e9:,.0f} GB/s")
+
+    def show(**sections: list[Row]) -> None:
+        for name, rows in sections.items():
+            if rows:
+                results[name] = rows
+                table(TITLES[name], rows)
+
+    try:
+        if "naive" in options.sections:
+            show(naive=naive_step(options))
+        if "table" in options.sections:
+            show(table=sizes(options, bandwidth))
+        if "where" in options.sections:
+            show(**where(options))
+        if {"rollout", "bits", "auto-dt"} & set(options.sections):
+            show(**rollouts(options))
+        if "five" in options.sections:
+            show(five=five_elements(options))
+        if "compile" in options.sections:
+            show(compile=compile_seconds(options))
+        if options.preset == "paper":
+            show(required=beside_the_required(results, options.formulations))
+    finally:
+        if options.json is not None:
+            options.json.write_text(json.dumps(results, indent=1) + "\n")
+    return results
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    main(tyro.cli(Options))

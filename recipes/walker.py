@@ -31,8 +31,7 @@ DESK = dataclasses.replace(
     particles=(12, 12, 12),
     wall=0.035 / 12,
     elements=2,
-    epsilon=1e-3,
-    dt=1.25e-4,
+    dt=1e-4,
     settle=0.1,
     duration=0.2,
     sample_every=0.0025,
@@ -59,6 +58,8 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
         The final metrics (see ``results.deliver``) and the number of iterations.
     """
     s, field = robot.settings, robot.field
+    if s.target.type == "cpu":
+        torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
     def new_adam() -> torch.optim.Adam:
         return torch.optim.Adam(field.parameters(), lr=s.learning_rate)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fill
 from torchsoro.kernels import layout
+from torchsoro.ops.lattice import Lattice
 from torchsoro.ops.march import Inputs, Scene
 from torchsoro.ops.rollout import initial_state, rollout
 
@@ -96,9 +97,22 @@ class Problem:
         """Copies of the tensors that require gradients."""
         return {name: t.clone().requires_grad_() for name, t in self.tensors.items()}
 
+    def smooth(self, name: str, t: Tensor) -> Tensor:
+        """A tensor in place of that name, but unchanged where a step to either side makes another problem.
+
+        Those are coefficients of zero, as of places without a particle, and fillers of one.
+        """
+        if name != "coefficients":
+            return t
+        given = self.tensors[name]
+        free = given != 0
+        free[:, layout.FILLER] &= given[:, layout.FILLER] < 1
+        return torch.where(free, t, given)
+
 
 def problem(
     *,
+    formulation: str = "updated",
     particles: tuple[int, int, int] = (4, 4, 4),
     batch: int = 1,
     elements: int = 2,
@@ -110,7 +124,10 @@ def problem(
     dtype: torch.dtype = torch.float64,
     seed: int = 1,
 ) -> Problem:
-    """A problem in units of the cell, all of whose numbers are of order one and random, so that every term counts."""
+    """A problem in units of the cell, all of whose numbers are of order one and random, so that every term counts.
+
+    In the total-Lagrangian form a corner of the lattice is empty, and its nodes there have no mass.
+    """
     g = torch.Generator().manual_seed(seed)
 
     def randn(*shape: int) -> Tensor:
@@ -119,25 +136,32 @@ def problem(
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=g, dtype=torch.float64)
 
+    total = formulation == "total"
     axes = [5 + spread * 0.5 * (torch.arange(n, dtype=torch.float64) + 0.5) for n in particles]
     x = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(1, -1, 3).repeat(batch, 1, 1)
     count = x.shape[1]
-    x = x + 0.05 * randn(*x.shape)
-    v = 0.3 * randn(*x.shape)
     kind = torch.full((count,), -1, dtype=torch.int32)
     kind[count // 2 : count // 2 + 3], kind[count // 2 + 3 : count // 2 + 5] = 0, 1
+    if total:
+        absent = (x[0] > x[0].amax(0).clamp(min=6.75) - 0.6).all(1) & (kind < 0)
+        kind[absent] = layout.ABSENT
+    else:
+        x = x + 0.05 * randn(*x.shape)
     coefficients = rand(batch, layout.COEFFICIENTS, count) + 0.5
     coefficients[:, layout.VISCOSITY] *= 0.05
     coefficients[:, layout.VOLUME_VISCOSITY] *= 0.05
     coefficients[:, layout.ANCHOR : layout.ANCHOR + 3] = x.transpose(1, 2) + 0.1
+    filler = rand(batch, count)
+    filler[:, ::4], filler[:, 1::7] = 0, 1
+    coefficients[:, layout.FILLER] = filler
+    coefficients[..., kind == layout.ABSENT] = 0
     gravity = 0.3 * randn(steps, batch, 3)
     gravity[..., 2] -= 1
     share = torch.zeros(2, count, dtype=torch.float64)
     share[0, :5], share[1, 3:9] = 0.2, 0.3
-    # The ground sticks or slides; one wall is adhesive and slides, the other holds what is near it back.
-    planes = torch.tensor([[5.0, 0.3, 0.0], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
-    state = initial_state(x, v, elements)
-    state[:, layout.AFFINE :] += 0.1 * randn(*state[:, layout.AFFINE :].shape)
+    share[:, kind == layout.ABSENT] = 0
+    # The ground sticks or slides, and holds a little; a wall is adhesive and slides, another holds what is near it.
+    planes = torch.tensor([[5.0, 0.3, 0.1 * total], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
     tensors = {
         "coefficients": coefficients,
         "prony": rand(batch, elements, layout.PRONY),
@@ -146,9 +170,18 @@ def problem(
         "force": randn(steps, batch, 2, 3),
         "planes": planes.repeat(batch, 1, 1),
         "origin": torch.zeros(batch, 3, dtype=torch.float64),
-        "state": state,
         "weight": rand(batch, count) + 0.1,
     }
+    lattice = None
+    if total:
+        lattice = Lattice(points=particles, low=(5.0, 5.0, 5.0), cell=1.0)
+        motion = torch.cat([0.02 * randn(batch, 3 * lattice.nodes), 0.3 * randn(batch, 3 * lattice.nodes)], 1)
+        history = 0.1 * randn(batch, 6 * elements, count) * (kind != layout.ABSENT)
+        tensors["state"] = torch.cat([motion, history.flatten(1)], 1)
+    else:
+        tensors["state"] = initial_state(x, 0.3 * randn(*x.shape), elements)
+        affine = tensors["state"][:, layout.AFFINE :]
+        affine += 0.1 * randn(*affine.shape)
     reach = 20.0 * spread
     scene = Scene(
         dt=0.02,
@@ -160,6 +193,7 @@ def problem(
         share=share.to(dtype),
         plane_kind=torch.tensor([[2, 1, int(stick)], [0, -1, 0], [1, 1, 0]], dtype=torch.int32),
         springs=True,
-        probes=torch.tensor([0, 7, count - 1]),
+        probes=torch.tensor([0, 7, int((kind == -1).nonzero()[-1])]),
+        lattice=lattice,
     )
     return Problem(scene=scene, tensors={name: t.to(dtype) for name, t in tensors.items()}, samples=samples)

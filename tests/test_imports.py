@@ -21,11 +21,12 @@ ORDER = """
 errors storage
 runtime
 domain
-field actuation contact rheology
+field actuation contact rheology selfcontact
 material
 loads
 kernels
 ops
+assembly
 simulator
 objective
 lagrangian

@@ -53,10 +53,11 @@ def run_tensor(a: Reals, b: Reals, cof: Reals, dev: Reals, dot: Reals, back: Rea
 
 
 @ti.kernel
-def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, tau: Reals, S: Reals, n: ti.i32):
+def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, filler: ti.f64, P: Reals, S: Reals, n: ti.i32):
     for i in range(n):
-        put(tau, i, stress.solid_stress(matrix(F, i), matrix(Q, i), bulk, shear))
-        put(S, i, stress.pull_back(matrix(F, i)))
+        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, filler))
+        if filler < 1:
+            put(S, i, stress.pull_back(matrix(F, i)))
 
 
 @ti.kernel
@@ -72,13 +73,14 @@ def run_solid_adjoint(
     n: ti.i32,
 ):
     for i in range(n):
-        f, q, bulk, shear = stress.solid_stress_adjoint(
-            matrix(F, i), matrix(Q, i), moduli[2 * i], moduli[2 * i + 1], matrix(bar, i)
+        f, q, bulk, shear, filler = stress.piola_adjoint(
+            matrix(F, i), matrix(Q, i), moduli[3 * i], moduli[3 * i + 1], moduli[3 * i + 2], matrix(bar, i)
         )
         put(F_bar, i, f)
         put(Q_bar, i, q)
-        moduli_bar[2 * i] = bulk
-        moduli_bar[2 * i + 1] = shear
+        moduli_bar[3 * i] = bulk
+        moduli_bar[3 * i + 1] = shear
+        moduli_bar[3 * i + 2] = filler
         put(S_bar, i, stress.pull_back_adjoint(matrix(F, i), matrix(bar, i)))
 
 
@@ -93,6 +95,21 @@ def run_viscous(
         )
         J_bar[i] = j
         put(L_bar, i, gradient)
+        eta_bar[2 * i] = shear
+        eta_bar[2 * i + 1] = volume
+
+
+@ti.kernel
+def run_viscous_piola(
+    F: Reals, rate: Reals, eta: Reals, bar: Reals, P: Reals, F_bar: Reals, rate_bar: Reals, eta_bar: Reals, n: ti.i32
+):
+    for i in range(n):
+        put(P, i, stress.viscous_piola(matrix(F, i), matrix(rate, i), eta[2 * i], eta[2 * i + 1]))
+        f, r, shear, volume = stress.viscous_piola_adjoint(
+            matrix(F, i), matrix(rate, i), eta[2 * i], eta[2 * i + 1], matrix(bar, i)
+        )
+        put(F_bar, i, f)
+        put(rate_bar, i, r)
         eta_bar[2 * i] = shear
         eta_bar[2 * i + 1] = volume
 
@@ -140,12 +157,18 @@ def symmetric(n=32, *, seed=1, size=0.3):
     return m + m.mT
 
 
+def first_piola(F, Q=None, *, bulk=2.3, shear=0.7, filler=0.0):
+    """First Piola stress, and pull-back S."""
+    P, S = out(*F.shape), out(*F.shape)
+    Q = torch.zeros_like(F) if Q is None else Q
+    run_solid(flat(F), flat(Q), bulk, shear, filler, flat(P), flat(S), len(F))
+    return P, S
+
+
 def solid(F, Q=None, *, bulk=2.3, shear=0.7):
     """Kirchhoff stress, and pull-back S."""
-    tau, S = out(*F.shape), out(*F.shape)
-    Q = torch.zeros_like(F) if Q is None else Q
-    run_solid(flat(F), flat(Q), bulk, shear, flat(tau), flat(S), len(F))
-    return tau, S
+    P, S = first_piola(F, Q, bulk=bulk, shear=shear)
+    return P @ F.mT, S
 
 
 def splines(x, cell):
@@ -244,30 +267,80 @@ def test_frame_indifference(seed, size):
     torch.testing.assert_close(tau, tau.mT, rtol=0, atol=1e-14)
 
 
-def test_adjoints_of_the_solid():
-    F, Q, bar = deformations(), symmetric(), symmetric(seed=5, size=2.0)
-    moduli = torch.rand(32, 2, generator=torch.Generator().manual_seed(6), dtype=torch.float64) + 0.5
-    found = [out(32, 3, 3), out(32, 3, 3), out(32, 2), out(32, 3, 3)]
+def slope(function, x, direction, e=1e-6):
+    """Central difference along a direction, one for each row."""
+    return (function(x + e * direction) - function(x - e * direction)) / (2 * e)
+
+
+@pytest.mark.parametrize("filler", [0.0, 0.3, 1.0])
+def test_adjoints_of_the_solid(filler):
+    F, Q, bar = deformations(), symmetric(), deformations(seed=5, size=2.0)
+    S_like = symmetric(seed=9)
+    moduli = torch.rand(32, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) + 0.5
+    moduli[:, 2] = filler
+    found = [out(32, 3, 3), out(32, 3, 3), out(32, 3), out(32, 3, 3)]
     run_solid_adjoint(*(flat(t) for t in (F, Q, moduli, bar, *found)), 32)
-    F_bar, Q_bar, moduli_bar, S_bar = found
-    numbers = list(enumerate(moduli.tolist()))
-    e, d, dQ = 1e-6, deformations(seed=7, size=2.0), symmetric(seed=8, size=2.0)
+    F_bar, Q_bar, moduli_bar, _ = found
+    d, dQ = deformations(seed=7, size=2.0), symmetric(seed=8, size=2.0)
 
-    def power(*, f=F, q=Q, k=0.0, m=0.0, which=0):
-        rows = [solid(f[i : i + 1], q[i : i + 1], bulk=a + k, shear=b + m) for i, (a, b) in numbers]
-        return (torch.cat([r[which] for r in rows]) * bar).sum((1, 2))
+    def power(f=F, q=Q, m=moduli):
+        rows = [
+            first_piola(f[i : i + 1], q[i : i + 1], bulk=b, shear=s, filler=v)[0]
+            for i, (b, s, v) in enumerate(m.tolist())
+        ]
+        return (torch.cat(rows) * bar).sum((1, 2))
 
-    def slope(up, down):
-        return (up - down) / (2 * e)
+    def agree(found, wanted):
+        torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-7)
 
-    for numeric, exact in (
-        (slope(power(f=F + e * d), power(f=F - e * d)), (F_bar * d).sum((1, 2))),
-        (slope(power(q=Q + e * dQ), power(q=Q - e * dQ)), (Q_bar * dQ).sum((1, 2))),
-        (slope(power(k=e), power(k=-e)), moduli_bar[:, 0]),
-        (slope(power(m=e), power(m=-e)), moduli_bar[:, 1]),
-        (slope(power(f=F + e * d, which=1), power(f=F - e * d, which=1)), (S_bar * d).sum((1, 2))),
-    ):
-        torch.testing.assert_close(exact, numeric, rtol=1e-7, atol=1e-8)
+    agree((F_bar * d).sum((1, 2)), slope(lambda f: power(f=f), F, d))
+    agree((Q_bar * dQ).sum((1, 2)), slope(lambda q: power(q=q), Q, dQ))
+    for k in range(3 if 0 < filler < 1 else 2):
+        one = torch.nn.functional.one_hot(torch.tensor(k), 3).expand(32, 3).double()
+        agree(moduli_bar[:, k], slope(lambda m: power(m=m), moduli, one))
+    # Of the pull-back, for a symmetric gradient.
+    run_solid_adjoint(*(flat(t) for t in (F, Q, moduli, S_like, *found)), 32)
+    agree((found[3] * d).sum((1, 2)), slope(lambda f: (first_piola(f)[1] * S_like).sum((1, 2)), F, d))
+
+
+def test_filler_is_a_law_of_its_own_with_an_energy_and_stands_being_turned_inside_out():
+    g = torch.Generator().manual_seed(3)
+    F = (2 * torch.randn(64, 3, 3, generator=g, dtype=torch.float64)).requires_grad_()
+    J = torch.linalg.det(F)
+    assert float(J.detach().min()) < -1
+    assert float(J.detach().max()) > 1
+    volumetric = torch.where(J >= 1, torch.log(J.clamp(min=1)), (J - 1) - (J - 1) ** 2 / 2)
+    energy = 0.7 * ((F * F).sum((1, 2)) / 2 - volumetric)
+    (P,) = torch.autograd.grad(energy.sum(), F)
+    found, _ = first_piola(F.detach(), filler=1.0)
+    torch.testing.assert_close(found, P, rtol=1e-11, atol=1e-11)
+    rest, _ = first_piola(rotations(8), filler=1.0)
+    assert float(rest.abs().max()) < 1e-14
+
+
+def test_viscous_piola_is_the_viscous_stress_and_has_its_adjoint():
+    F, rate, bar = deformations(), deformations(seed=3, size=2.0), deformations(seed=4, size=2.0)
+    eta = torch.rand(32, 2, generator=torch.Generator().manual_seed(6), dtype=torch.float64)
+
+    def run(f=F, r=rate, e=eta):
+        found = [out(32, 3, 3), out(32, 3, 3), out(32, 3, 3), out(32, 2)]
+        run_viscous_piola(*(flat(t) for t in (f, r, e, bar, *found)), 32)
+        return found
+
+    P, F_bar, rate_bar, eta_bar = run()
+    J = torch.linalg.det(F)
+    L = rate @ torch.linalg.inv(F)
+    tau, *rest = out(32, 3, 3), out(32), out(32, 3, 3), out(32, 2)
+    run_viscous(J, flat(L), flat(eta), flat(bar), flat(tau), rest[0], flat(rest[1]), flat(rest[2]), 32)
+    torch.testing.assert_close(P @ F.mT, tau, rtol=1e-11, atol=1e-12)
+    d = deformations(seed=7, size=2.0)
+    for bar_of, name, x in ((F_bar, "f", F), (rate_bar, "r", rate)):
+        by = slope(lambda t, name=name: (run(**{name: t})[0] * bar).sum((1, 2)), x, d)
+        torch.testing.assert_close((bar_of * d).sum((1, 2)), by, rtol=1e-6, atol=1e-7)
+    for k in range(2):
+        one = torch.nn.functional.one_hot(torch.tensor(k), 2).expand(32, 2).double()
+        by = slope(lambda e: (run(e=e)[0] * bar).sum((1, 2)), eta, one)
+        torch.testing.assert_close(eta_bar[:, k], by, rtol=1e-6, atol=1e-7)
 
 
 def test_viscous_stress_and_its_adjoint():

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from problems import DT, H, block, simulator
 
 import torchsoro
-from torchsoro import Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
+from torchsoro import Body, Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
 from torchsoro.kernels import constitutive, layout
 from torchsoro.material import STABLE_COURANT, courant
 from torchsoro.ops.rollout import initial_state
@@ -158,7 +158,12 @@ def test_fill_puts_material_where_it_belongs():
     torch.testing.assert_close(body.shear[~air], solid.shear * scale)
     torch.testing.assert_close(body.bulk[~air], solid.bulk * scale)
     torch.testing.assert_close(body.mass[~air], solid.density * H**3 * scale)
-    for value, wanted in ((body.shear, 0), (body.bulk, 0.14e6), (body.mass, 100 * H**3), (body.volume, H**3)):
+    for value, wanted in (
+        (body.shear, Gas().filler),
+        (body.bulk, 0.14e6),
+        (body.mass, 100 * H**3),
+        (body.volume, H**3),
+    ):
         torch.testing.assert_close(value[air], torch.full((8,), wanted, dtype=torch.float64))
     assert body.viscosity is not None
     assert body.volume_viscosity is not None
@@ -303,3 +308,160 @@ def tensors(*rows):
 def test_bad_numbers_are_refused(make, message):
     with pytest.raises(ValueError, match="^" + message):
         make()
+
+
+# ------------------------------------------------------------------------- stable step of the total-Lagrangian form
+
+
+def lattice(shape):
+    """Nodes' weights at the points of a box [P, I], and their slopes [P, I, 3] in cells of 1 m."""
+    weights, slopes = [], []
+    for count in shape:
+        w, s = (torch.zeros(count, (count + 1) // 2 + 2, dtype=torch.float64) for _ in range(2))
+        for p in range(count):
+            x, own = (p % 2 - 0.5) / math.sqrt(3), slice(p // 2, p // 2 + 3)
+            w[p, own] = torch.tensor([(0.5 - x) ** 2 / 2, 0.75 - x * x, (0.5 + x) ** 2 / 2], dtype=torch.float64)
+            s[p, own] = torch.tensor([x - 0.5, -2 * x, x + 0.5], dtype=torch.float64)
+        weights.append(w)
+        slopes.append(s)
+
+    def product(*along):
+        return torch.kron(torch.kron(along[0], along[1]), along[2])
+
+    steep = [product(*(slopes[c] if c == axis else weights[c] for c in range(3))) for axis in range(3)]
+    return product(*weights), torch.stack(steep, -1)
+
+
+def scaled(shape, scale, solid, **more):
+    """A body on that lattice whose points have shares of a solid's density and moduli."""
+    count, volume = math.prod(shape), (1.75e-3 / 2) ** 3
+    return Body(
+        position=torch.zeros(count, 3, dtype=torch.float64),
+        mass=solid.density * volume * scale,
+        volume=torch.full((count,), volume, dtype=torch.float64),
+        bulk=solid.bulk * scale,
+        shear=solid.shear * scale,
+        chamber=torch.full((count,), -1, dtype=torch.int32),
+        **more,
+    )
+
+
+def grows(shape, body, prony, dt, steps=400):
+    """Whether noise grows in the linear lattice, stepped as the simulator does."""
+    weights, slopes = lattice(shape)
+    slopes = slopes / 1.75e-3
+    mass = (weights.T @ body.mass).unsqueeze(-1)
+    v = torch.randn(len(mass), 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    d, start = torch.zeros_like(v), v.norm()
+
+    def parts(field):
+        H = torch.einsum("pib,ia->pab", slopes, field)
+        volumetric = torch.einsum("paa,bc->pbc", H, torch.eye(3, dtype=torch.float64))
+        return H + H.mT - 2 / 3 * volumetric, volumetric
+
+    before, history = 0.0, [0.0] * prony.elements
+    for _ in range(steps):
+        S, volumetric = parts(d)
+        history = [a * H + b * (S - before) for H, (a, b, _) in zip(history, prony.discrete(dt), strict=True)]
+        before = S
+        felt = S + sum((g * H for H, g in zip(history, prony.moduli, strict=True)), torch.zeros_like(S))
+        stress = body.bulk[:, None, None] * volumetric + body.shear[:, None, None] * felt
+        if body.viscosity is not None:
+            stress = stress + body.viscosity[:, None, None] * parts(v)[0]
+        force = torch.einsum("pib,pab->ia", slopes, stress * body.volume[:, None, None])
+        v = v - dt * force / mass
+        d = d + dt * v
+    return not float(v.norm()) < 30 * float(start)
+
+
+@given(
+    shape=st.sampled_from([(1, 1, 1), (1, 1, 4), (2, 2, 2), (3, 2, 1), (4, 3, 2)]),
+    poisson=st.floats(0, 0.49),
+    stiffened=st.floats(0, 3).map(lambda x: 10.0**x),
+    lowest=st.sampled_from([0.0, -1.0, -5.0]),
+    seed=st.integers(0, 999),
+)
+def test_no_lattice_is_unstable_below_a_total_courant_number_of_one(shape, poisson, stiffened, lowest, seed):
+    solid, dt, dx = Solid(poisson_ratio=poisson), 1e-5, 1.75e-3
+    scale = 10 ** (lowest * torch.rand(math.prod(shape), generator=torch.Generator().manual_seed(seed)).double())
+    body = scaled(shape, scale, solid)
+    body = replace(body, shear=stiffened * body.shear)
+    weights, slopes = lattice(shape)
+    P, I = weights.shape  # noqa: E741
+    eye = torch.eye(3, dtype=torch.float64)
+    # H of the motion of node i along c, per square root of its mass.
+    H = torch.einsum("pib,ac,i->pabic", slopes / dx, eye, (weights.T @ body.mass) ** -0.5).reshape(P, 3, 3, 3 * I)
+    trace = torch.einsum("paad->pd", H)
+    even = (H + H.transpose(1, 2)) / 2 - eye[..., None] * trace[:, None, None] / 3
+    stiffness = torch.einsum("p,pd,pe->de", body.bulk * body.volume, trace, trace)
+    stiffness += torch.einsum("p,pabd,pabe->de", 2 * body.shear * body.volume, even, even)
+    highest = float(torch.linalg.eigvalsh(stiffness)[-1]) ** 0.5
+    found = courant(body, None, dt=dt, cell=dx, formulation="total").number
+    assert highest * dt / 2 <= found * (1 + 1e-9)
+    if shape == (1, 1, 1):
+        # The bound is sharp: a lone particle reaches it.
+        assert highest * dt / 2 == pytest.approx(found, rel=1e-6)
+
+
+@pytest.mark.parametrize("viscosity", [None, 20.0])
+@pytest.mark.parametrize("elements", [0, 3, 5])
+def test_a_total_lagrangian_lattice_steps_stably_up_to_a_courant_number_of_one(elements, viscosity, monkeypatch):
+    monkeypatch.setattr("torchsoro.material.STABLE_COURANT", 1.0)
+    prony, solid, cell = Prony.paper(elements), Solid(), 1.75e-3
+    for shape in ((1, 1, 1), (3, 2, 2)):
+        count = math.prod(shape)
+        scale = torch.rand(count, generator=torch.Generator().manual_seed(1), dtype=torch.float64) ** 3 + 1e-5
+        body = scaled(shape, scale, solid, viscosity=None if viscosity is None else viscosity * scale)
+        limit = stable_step(body, prony, cell=cell, formulation="total")
+        assert not grows(shape, body, prony, 0.995 * limit)
+        if count == 1:  # nothing is less stable than a lone particle
+            assert grows(shape, body, prony, 1.01 * limit)
+
+
+def test_total_courant_number_names_what_sets_it():
+    _, body = block((4, 4, 4), air=True)
+    dt, cell, solid = 1e-5, 1.75e-3, Solid()
+
+    def found(body, prony=None):
+        return courant(body, prony, dt=dt, cell=cell, formulation="total")
+
+    elastic = dt / cell * math.sqrt(9 / 8 * 3 * solid.bulk / solid.density)
+    assert found(body).number == pytest.approx(elastic, rel=1e-9)
+    assert found(body).term == "elastic waves in the solid"
+    # The paper's gas would set the updated form's limit here; its stiffness and viscosity carry no waves now.
+    heavy = replace(body, bulk=torch.where(body.chamber >= 0, 1e9, body.bulk))
+    assert heavy.viscosity is not None
+    assert found(replace(heavy, viscosity=torch.where(body.chamber >= 0, 1e9, heavy.viscosity))) == found(body)
+    prony = Prony.paper(5)
+    stiff = solid.shear * (1 + float(prony.step_moduli(dt).sum()))
+    assert found(body, prony).number == pytest.approx(dt / cell * math.sqrt(9 / 4 * stiff / solid.density), rel=1e-9)
+    assert found(body, prony).term.endswith("most by Maxwell element 4")
+    # Filler as stiff as the solid on a tenth of its mass; Maxwell elements are none of its business.
+    filled = replace(body, shear=torch.where(body.chamber >= 0, solid.bulk, body.shear))
+    assert found(filled).term == "elastic waves in the filler of the chambers"
+    assert found(filled).number == pytest.approx(dt / cell * math.sqrt(9 / 4 * solid.bulk / 100), rel=1e-9)
+    thick = replace(body, viscosity=torch.full_like(body.mass, 50.0))
+    both = solid.shear + 2 * 50.0 / dt
+    assert found(thick).term == "viscosity"
+    assert found(thick).number == pytest.approx(dt / cell * math.sqrt(9 / 4 * both / solid.density), rel=1e-9)
+    # A batch has the number of its worst body.
+    twice = replace(body, bulk=torch.stack([body.bulk, 4 * body.bulk]), shear=torch.stack([body.shear, body.shear]))
+    assert found(twice).number == pytest.approx(2 * elastic, rel=1e-9)
+
+
+@pytest.mark.parametrize(("elements", "microseconds"), [(0, 36.4), (3, 22.7), (5, 7.11)])
+def test_total_stable_step_of_the_papers_resin(elements, microseconds):
+    domain = Domain(size=(0.007,) * 3, particles=(8, 8, 8))
+    body = fill(domain, torch.ones(domain.count, dtype=torch.float64), solid=Solid())
+    found = stable_step(body, Prony.paper(elements), cell=1.75e-3, formulation="total")
+    assert found == pytest.approx(microseconds * 1e-6, rel=0.025)
+    number = courant(body, Prony.paper(elements), dt=found, cell=1.75e-3, formulation="total").number
+    assert number == pytest.approx(STABLE_COURANT, rel=1e-3)
+
+
+def test_an_unknown_formulation_is_refused():
+    _, body = block()
+    with pytest.raises(ValueError, match=r"^formulation = 'eulerian': wanted \"updated\" or \"total\""):
+        courant(body, None, dt=DT, cell=2 * H, formulation="eulerian")
+    with pytest.raises(ValueError, match=r"^formulation = 'flip': wanted"):
+        stable_step(body, None, cell=2 * H, formulation="flip")

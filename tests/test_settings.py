@@ -45,6 +45,7 @@ def test_every_setting_can_be_overridden():
         "settle": ("0.25",),
         "duration": ("0.25",),
         "c_max": ("0.125",),
+        "filler": ("0.125", "0.25"),
     }
     hints = typing.get_type_hints(Settings)
     for field in dataclasses.fields(Settings):

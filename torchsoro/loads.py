@@ -111,7 +111,8 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
     """
     x = body.position.detach()
     count = x.shape[-2]
-    mass, spring, drag = body.mass, x.new_zeros(count), x.new_zeros(count)
+    mass, spring = body.mass, x.new_zeros(count)
+    drag = x.new_zeros(count) if body.drag is None else body.drag
     anchor = body.position
     forces = tuple(load for load in loads if isinstance(load, Force))
     shares = [x.new_zeros(0, count)]
@@ -134,7 +135,7 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
                 _check_vector("spring shift", load.shift)
                 place = (group > 0).to(x).unsqueeze(-1)
                 anchor = anchor + place * load.shift.to(x).unsqueeze(-2)
-    loose = not any(isinstance(load, Spring | Drag) for load in loads)
+    loose = body.drag is None and not any(isinstance(load, Spring | Drag) for load in loads)
     return Attached(
         body=replace(body, mass=mass),
         spring=None if loose else spring,

@@ -85,7 +85,8 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
-        self._simulator(s.dt).check_step(self._fill(torch.ones(self.domain.count)), self.prony)
+        everywhere = self._fill(torch.ones(self.domain.count))
+        self._simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
 
     def forward(self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False) -> Outcome:
         """Simulate a design and judge it.
@@ -105,7 +106,7 @@ class Robot(nn.Module):
         body = self._fill(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory, dt = self._simulate(body, weight, gravity_scale, everything)
+        trajectory = self._simulate(body, weight, gravity_scale, everything)
         end = s.settle + s.duration
         distance = travel(
             trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
@@ -118,20 +119,21 @@ class Robot(nn.Module):
             fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
-            dt=dt,
+            dt=trajectory.dt,
         )
 
     def _fill(self, gamma: Tensor) -> Body:
         s = self.settings
-        return fill(self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power)
+        return fill(
+            self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power, filler=s.filler
+        )
 
-    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> tuple[Trajectory, float]:
+    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
         for halving in range(s.halvings + 1):
-            dt = s.dt / 2**halving
             try:
-                trajectory = self._simulator(dt)(
+                trajectory = self._simulator(2**halving)(
                     body,
                     duration=s.settle + s.duration,
                     prony=self.prony,
@@ -142,21 +144,24 @@ class Robot(nn.Module):
                     weight=weight,
                     probes=torch.arange(self.domain.count) if everything else None,
                 )
-                return trajectory, dt
+                return trajectory
             except SimulationDiverged:
                 if halving == s.halvings:
                     raise
         raise AssertionError
 
-    def _simulator(self, dt: float) -> Simulator:
+    def _simulator(self, parts: int) -> Simulator:
+        """A simulator that takes a part of the usual step."""
         s = self.settings
         half = (s.size[0] / 2, s.size[1] / 2)
         return Simulator(
             cell=self.domain.cell,
-            dt=dt,
+            dt="auto" if s.dt == "auto" else s.dt / parts,
+            safety=0.9 / parts,
             low=(-half[0] - s.room, -half[1] - s.room, -s.room),
             high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
             transfer=s.transfer,
+            formulation=s.formulation,
             memory_budget=int(s.memory * 2**30) or None,
         )
 

@@ -39,5 +39,7 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
     # Memory comes from torch; Taichi needs next to none on the GPU.
     if kind == "cuda":
         options["device_memory_GB"] = 0.3
+        # Taichi would start thousands of blocks for every loop, most of them empty.
+        options["saturating_grid_dim"] = 4 * torch.cuda.get_device_properties(0).multi_processor_count
     ti.init(arch=ti.cuda if kind == "cuda" else ti.cpu, offline_cache=True, log_level=ti.WARN, **options)
     _started = kind

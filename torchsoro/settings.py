@@ -89,8 +89,8 @@ class Settings:
     gravity_every: int = 20
     """Iterations between two steps of gravity."""
 
-    dt: float = 1e-5
-    """Substep [s]."""
+    dt: float | Literal["auto"] = "auto"
+    """Substep [s]; auto takes the largest that is stable. The paper's is 1e-5."""
     halvings: int = 2
     """How often a design on which the simulation breaks down is tried again with half the substep."""
     settle: float = 0.25
@@ -99,8 +99,12 @@ class Settings:
     """Time of actuation [s]."""
     sample_every: float = 0.0025
     """Time between two recorded samples [s]."""
+    formulation: Literal["total", "updated"] = "total"
+    """Total-Lagrangian, several times faster and without losses; or updated MLS-MPM, the paper's."""
     transfer: Literal["apic", "flip"] = "apic"
-    """Transfer between particles and grid."""
+    """Transfer between particles and grid, of the updated formulation."""
+    filler: tuple[float, float] = (0.1, 0.3)
+    """Densities between which stress goes over from a law of void, which stands being crushed, to the solid's."""
     memory: float = 0.0
     """Memory for the gradient [GiB]; 0 for 2 on a CPU and 16 on a GPU."""
 
@@ -143,18 +147,23 @@ class Settings:
                 raise ValueError(f"{name} = {value}: wanted finite and at least 0")
         for name in ("duration", "frequency", "learning_rate", "wall_distance", "dt", "pressure", "sample_every"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+            if value != "auto" and not (math.isfinite(value) and value > 0):
                 raise ValueError(f"{name} = {value}: wanted finite and positive")
-        for name, whole in (("settle", "dt"), ("duration", "dt"), ("sample_every", "dt"), ("settle", "sample_every")):
-            value, part = getattr(self, name), getattr(self, whole)
+        whole = [("settle", "sample_every"), ("duration", "sample_every")]
+        if self.dt != "auto":
+            whole = [("settle", "dt"), ("duration", "dt"), ("sample_every", "dt"), *whole[:1]]
+        for name, unit in whole:
+            value, part = getattr(self, name), getattr(self, unit)
             if abs(round(value / part) * part - value) > 1e-6 * value:
-                raise ValueError(f"{name} = {value:g} s: wanted a whole number of {whole} = {part:g} s")
+                raise ValueError(f"{name} = {value:g} s: wanted a whole number of {unit} = {part:g} s")
         for name in ("iterations", "window", "gravity_every", "picture_every", "frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 1")
         for name in ("gravity_steps", "halvings"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 0")
+        if not 0 <= self.filler[0] < self.filler[1] <= 1:
+            raise ValueError(f"filler = {self.filler}: wanted two increasing densities from 0 to 1")
         if not 0 < self.c_max < 0.25:
             raise ValueError(f"c_max = {self.c_max}: wanted more than 0 and less than 0.25")
         if self.device == "cuda" and not torch.cuda.is_available():

@@ -5,20 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from torchsoro.actuation import Waveform
+from torchsoro.assembly import (
+    MEMORY,
+    body_tensors,
+    check_body,
+    check_probes,
+    check_weight,
+    coefficients,
+    gravity_at,
+    on_lattice,
+    supply_at,
+)
 from torchsoro.contact import Plane
 from torchsoro.kernels import layout
-from torchsoro.loads import Attached, Load, attach
-from torchsoro.material import STABLE_COURANT, Body, Prony, courant
+from torchsoro.loads import Load, attach
+from torchsoro.material import STABLE_COURANT, Body, Prony, courant, stable_step
 from torchsoro.ops.march import Inputs, Scene
 from torchsoro.ops.rollout import initial_state, rollout
+from torchsoro.ops.total import total_state
 
 TRANSFERS = {"apic": 0.0, "flip": 1.0}
-_MEMORY = {"cpu": 2 * 2**30, "cuda": 16 * 2**30}
+FORMULATIONS = ("updated", "total")
 _LARGEST = 2**31 - 1  # Taichi indexes a buffer with 32 bits
 _NODE_SHARE = 1.15  # what is kept of the nodes, for each byte of particle state
 
@@ -36,7 +49,8 @@ class Trajectory:
         chamber_volume: Gas volume of each chamber [..., S, chambers] m3.
         chamber_pressure: Mean gas pressure (Eq. 10) of each chamber [..., S, chambers] Pa.
         probes: int64 [P] particle indices.
-        final: Last state [B, S, N]; with it a later run can go on.
+        final: Last state, in the layout of the formulation; with it a later run can go on.
+        dt: Substep [s].
     """
 
     time: Tensor
@@ -48,6 +62,7 @@ class Trajectory:
     chamber_pressure: Tensor
     probes: Tensor
     final: Tensor
+    dt: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,43 +80,57 @@ class Plan:
     memory: int
 
 
-def plan_checkpoints(*, steps: int, state_bytes: int, element_bytes: int, budget: int) -> Plan:
-    """Choose a plan within a memory budget: everything kept if it fits, else segments of about sqrt(steps) substeps.
+def plan_checkpoints(
+    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = _NODE_SHARE
+) -> Plan:
+    """Choose a plan within a memory budget: everything kept if it fits, else segments.
 
     Args:
         steps: Substeps of the rollout.
         state_bytes: Bytes of one state.
         element_bytes: Bytes of a number, 4 or 8.
         budget: Bytes.
+        node_share: What is kept of a step in all, over the state.
 
     Raises:
         ValueError: if no plan fits; says the smallest budget that does.
     """
-    each = int(state_bytes * _NODE_SHARE)
+    each = int(state_bytes * node_share)
     most = max(1, _LARGEST * element_bytes // state_bytes - 1)
     if each * (steps + 1) <= budget and steps <= most:
         return Plan(segment=steps, keep=True, memory=each * (steps + 1))
-    segment = min(most, steps, max(1, math.isqrt(steps)))
+    # Long segments cost little more than short ones to begin with, so the longest that leave room for their starts.
+    segment = min(most, steps, math.isqrt(steps) + 1)
+    least = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    if least > budget:
+        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")
+    segment = min(most, max(segment, (budget - least) // each))
     memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
-    if memory > budget:
-        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {memory / 2**20:.0f} MiB")
     return Plan(segment=segment, keep=False, memory=memory)
 
 
 class Simulator(nn.Module):
-    """Differentiable visco-hyperelastic MLS-MPM on a uniform grid.
+    """Differentiable visco-hyperelastic material point method, in two formulations.
+
+    - "updated": MLS-MPM, the paper's. The grid stays, particles move through it; bodies meet each other on the grid.
+    - "total": total-Lagrangian. The grid is the body's own lattice and moves with it: no loss of energy, the same bits
+      in every run, several times faster. Needs particles on a lattice of half a cell, chambers have one pressure each,
+      and a body does not feel itself where it folds (see ``selfcontact``).
 
     A call simulates a body and returns a :class:`Trajectory`. Gradients flow to every tensor of the body, the Prony
     series, pressure, gravity, planes and loads that requires one.
 
     Args:
         cell: Grid cell dx [m].
-        dt: Substep [s].
+        dt: Substep [s]; "auto" takes the largest that is stable for the body at hand and divides the sampling interval.
         low: Lower corner of the analysis box [m].
         high: Upper corner of the analysis box [m].
-        transfer: "apic" (the paper's; damps a little at every substep) or "flip" (affine FLIP; hardly damps).
+        transfer: "apic" (the paper's; damps a little at every substep) or "flip" (affine FLIP; hardly damps); of the
+            updated formulation.
+        formulation: "updated" or "total".
         memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 16 GiB on CUDA if None.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
+        safety: Share of the largest stable step that dt = "auto" takes.
 
     Raises:
         ValueError: for numbers that are not finite and positive, an empty box, or an unknown transfer.
@@ -111,28 +140,38 @@ class Simulator(nn.Module):
         self,
         *,
         cell: float,
-        dt: float,
+        dt: float | Literal["auto"],
         low: Sequence[float],
         high: Sequence[float],
         transfer: str = "apic",
+        formulation: Literal["updated", "total"] = "updated",
         memory_budget: int | None = None,
         segment: int | None = None,
+        safety: float = 0.9,
     ) -> None:
         super().__init__()
-        for name, value in (("cell", cell), ("dt", dt), ("memory_budget", memory_budget), ("segment", segment)):
-            if value is not None and not (math.isfinite(value) and value > 0):
+        numbers = {"cell": cell, "dt": dt, "memory_budget": memory_budget, "segment": segment, "safety": safety}
+        if dt == "auto":
+            del numbers["dt"]
+        for name, value in numbers.items():
+            if isinstance(value, str) or (value is not None and not (math.isfinite(value) and value > 0)):
                 raise ValueError(f"{name} = {value}: wanted finite and positive")
         if len(low) != 3 or len(high) != 3 or not all(b - a > 6 * cell for a, b in zip(low, high, strict=True)):
             raise ValueError(f"low, high = {tuple(low)}, {tuple(high)}: wanted three numbers each, over 6 cells apart")
         if transfer not in TRANSFERS:
             raise ValueError(f"transfer = {transfer!r}: wanted one of {', '.join(map(repr, TRANSFERS))}")
-        self.cell, self.dt, self.transfer = float(cell), float(dt), transfer
+        if formulation not in FORMULATIONS:
+            raise ValueError(f"formulation = {formulation!r}: wanted one of {', '.join(map(repr, FORMULATIONS))}")
+        self.cell, self.transfer, self.safety = float(cell), transfer, safety
+        self.formulation: Literal["updated", "total"] = formulation
+        self.dt: float | Literal["auto"] = "auto" if dt == "auto" else float(dt)
         self.low, self.high = _triple(low), _triple(high)
         self.memory_budget, self.segment = memory_budget, segment
 
     def extra_repr(self) -> str:
         """For ``print``."""
-        return f"cell={self.cell:g} m, dt={self.dt:g} s, transfer={self.transfer!r}"
+        how = f"transfer={self.transfer!r}" if self.formulation == "updated" else "formulation='total'"
+        return f"cell={self.cell:g} m, dt={self.dt} s, {how}"
 
     def forward(
         self,
@@ -173,26 +212,27 @@ class Simulator(nn.Module):
         """
         x = body.position
         like = {"dtype": x.dtype, "device": x.device}
-        steps = _whole("duration", duration, self.dt)
-        every = max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, self.dt)
-        _check_body(body)
+        if self.dt != "auto":
+            steps, every = _steps(duration, sample_every, self.dt)
+        check_body(body)
         if start is None:
             self._check_inside(x)
-        self.check_step(body, prony)
+        dt = self.step(body, prony, duration=duration, sample_every=sample_every)
+        steps, every = _steps(duration, sample_every, dt)
         attached = attach(body, loads)
         body = attached.body
 
-        times = torch.arange(steps + 1, dtype=torch.float64, device=x.device) * self.dt
-        supply = _supply(body, pressure, times, **like)
-        pull = _gravity(gravity, times[:-1], **like)
+        times = torch.arange(steps + 1, dtype=torch.float64, device=x.device) * dt
+        supply = supply_at(body, pressure, times, **like)
+        pull = gravity_at(gravity, times[:-1], **like)
         forces = [force.at(times[:-1]).to(**like) for force in attached.forces]
-        maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(self.dt).to(**like)
+        maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(dt).to(**like)
         numbers = [[torch.as_tensor(n, **like) for n in plane.numbers()] for plane in planes]
-        mass = body.mass if weight is None else _check_weight(weight, x.shape[-2]).to(**like)
+        mass = body.mass if weight is None else check_weight(weight, x.shape[-2]).to(**like)
 
         ranks = [(x, 2), (maxwell, 2), (supply, 2), (pull, 2), (mass, 1), *((f, 2) for f in forces)]
         ranks += [(n, 0) for plane in numbers for n in plane]
-        ranks += [(t, t_rank) for t, t_rank in _body_tensors(attached)]
+        ranks += [(t, t_rank) for t, t_rank in body_tensors(attached)]
         leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
         try:
             lead = torch.broadcast_shapes(*leads)
@@ -212,7 +252,7 @@ class Simulator(nn.Module):
         if forces:
             force_tensor = torch.stack([wide(f, 2).transpose(0, 1) for f in forces], 2)
         whole = Inputs(
-            coefficients=_coefficients(attached, wide),
+            coefficients=coefficients(attached, wide),
             prony=wide(maxwell, 2),
             pressure=wide(supply, 2).permute(2, 0, 1),
             gravity=wide(pull, 2).transpose(0, 1),
@@ -221,7 +261,7 @@ class Simulator(nn.Module):
             origin=self._origin(planes, planes_tensor, batch, **like),
         )
         scene = Scene(
-            dt=self.dt,
+            dt=dt,
             cell=self.cell,
             blend=TRANSFERS[self.transfer],
             low=self.low,
@@ -234,13 +274,22 @@ class Simulator(nn.Module):
             springs=attached.spring is not None,
             probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
         )
-        _check_probes(scene.probes, x.shape[-2])
+        check_probes(scene.probes, x.shape[-2])
         velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
-        state = initial_state(wide(x, 2), wide(velocity, 2), maxwell.shape[-2]) if start is None else start
+        x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
+        if self.formulation == "total":
+            scene, whole, x, velocity, weights = on_lattice(scene, whole, x, velocity, weights)
+        state = start
+        if state is None and scene.lattice is not None:
+            there = scene.kind != layout.ABSENT
+            state = total_state(scene.lattice, x, velocity, there, maxwell.shape[-2])
+        elif state is None:
+            state = initial_state(x, velocity, maxwell.shape[-2])
         samples = sorted({*range(0, steps + 1, every), steps})
-        seen, final = self._march(scene, whole, state, wide(mass, 1), samples)
+        seen, final = self._march(scene, whole, state, weights, samples)
         shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in seen]
-        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=scene.probes, final=final)
+        where = torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device)
+        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
 
     def _march(
         self, scene: Scene, whole: Inputs, state: Tensor, weight: Tensor, samples: list[int]
@@ -252,10 +301,11 @@ class Simulator(nn.Module):
         )
         segment, keep = steps, False
         if differentiable:
-            budget = self.memory_budget or _MEMORY[state.device.type]
+            budget = self.memory_budget or MEMORY[state.device.type]
             plan = plan_checkpoints(
                 steps=steps,
                 state_bytes=state.numel() * state.element_size(),
+                node_share=_NODE_SHARE if scene.lattice is None else 1 + 3 * scene.lattice.nodes / state.shape[1],
                 element_bytes=state.element_size(),
                 budget=budget,
             )
@@ -284,23 +334,31 @@ class Simulator(nn.Module):
                 f"from {self.low} to {self.high} m and a cell of {self.cell:g} m away from its faces"
             )
 
-    def check_step(self, body: Body, prony: Prony | None) -> None:
-        """Refuse a time step above the stability limit of the body's fastest wave; every call does this first.
+    def step(self, body: Body, prony: Prony | None, *, duration: float, sample_every: float | None = None) -> float:
+        """The substep [s] of a call, which every call asks for first.
 
         Args:
             body: Particles.
             prony: Maxwell elements of the solids.
+            duration: [s].
+            sample_every: Time between two samples [s].
 
         Raises:
-            ValueError: says the limit and the term that sets it.
+            ValueError: if a given step is above the stability limit of the body's fastest wave; says the term that sets
+                it.
         """
-        found = courant(body, prony, dt=self.dt, cell=self.cell)
+        if self.dt == "auto":
+            limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation)
+            each = duration / 100 if sample_every is None else sample_every
+            return each / math.ceil(each / limit)
+        found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation)
         if found.number > STABLE_COURANT:
             limit = self.dt * STABLE_COURANT / found.number
             raise ValueError(
                 f"dt = {self.dt:g} s: above the limit of about {limit:.3g} s, set by {found.term} "
                 f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {STABLE_COURANT})"
             )
+        return self.dt
 
     def _origin(self, planes: Sequence[Plane], numbers: Tensor, batch: int, **like) -> Tensor:
         """A grid node of each simulation: on the first plane of each axis, else the box's lower corner."""
@@ -324,108 +382,10 @@ def _named(seen: list[Tensor]) -> dict[str, Tensor]:
     return dict(zip(names, seen, strict=True))
 
 
-def _body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
-    body = attached.body
-    flat = (body.mass, body.volume, body.bulk, body.shear, body.viscosity, body.volume_viscosity)
-    pairs = [(t, 1) for t in (*flat, attached.spring, attached.drag) if t is not None]
-    return pairs + [(t, 2) for t in (body.velocity, attached.anchor) if t is not None]
-
-
-def _coefficients(attached: Attached, wide) -> Tensor:
-    body = attached.body
-    zero = torch.zeros_like(body.volume)
-    anchor = torch.zeros_like(body.position) if attached.anchor is None else attached.anchor
-    rows: list[Tensor] = [torch.empty(0)] * layout.COEFFICIENTS
-    for place, values in (
-        (layout.MASS, body.mass),
-        (layout.VOLUME, body.volume),
-        (layout.BULK, body.bulk),
-        (layout.SHEAR, body.shear),
-        (layout.VISCOSITY, body.viscosity),
-        (layout.VOLUME_VISCOSITY, body.volume_viscosity),
-        (layout.SPRING, attached.spring),
-        (layout.DRAG, attached.drag),
-    ):
-        rows[place] = wide(zero if values is None else values, 1)
-    for c in range(3):
-        rows[layout.ANCHOR + c] = wide(anchor[..., c], 1)
-    return torch.stack(rows, 1)
-
-
-def _supply(body: Body, pressure: Waveform | None, times: Tensor, **like) -> Tensor:
-    """Supply pressure [..., chambers, T + 1]."""
-    chambers = int(body.chamber.max()) + 1
-    if pressure is None:
-        return torch.zeros(chambers, len(times), **like)
-    values = pressure.at(times.to(pressure.time)).to(**like)
-    if values.ndim == 1:
-        values = values.unsqueeze(0)
-    if values.shape[-2] != chambers:
-        raise ValueError(f"pressure: {values.shape[-2]} chambers, wanted the body's {chambers}")
-    return values
-
-
-def _gravity(gravity, times: Tensor, **like) -> Tensor:
-    """Gravity at each substep [..., T, 3]."""
-    if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
-        wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
-        if gravity[1].shape[-1] != 3:
-            raise ValueError(
-                f"gravity: shape {tuple(gravity[1].shape)}, wanted [..., S, 3] over {len(gravity[0])} times"
-            )
-        values = wave.at(times.to(gravity[0])).transpose(-1, -2).to(**like)
-    else:
-        constant = torch.as_tensor(gravity, **like)
-        if constant.shape[-1:] != (3,):
-            raise ValueError(f"gravity: shape {tuple(constant.shape)}, wanted [..., 3]")
-        values = constant.unsqueeze(-2).expand(*constant.shape[:-1], len(times), 3)
-    if not bool(torch.isfinite(values.detach()).all()):
-        raise ValueError(f"gravity = {gravity}: wanted finite numbers")
-    return values
-
-
-def _check_body(body: Body) -> None:
-    x = body.position
-    if x.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"body.position: dtype {x.dtype}, wanted float32 or float64")
-    if x.device.type not in _MEMORY or (x.is_cuda and x.dtype != torch.float32):
-        raise ValueError(f"body.position: {x.dtype} on {x.device}, wanted float32 on cuda, or either precision on cpu")
-    if x.ndim < 2:
-        raise ValueError(f"body.position: shape {tuple(x.shape)}, wanted [..., N, 3]")
-    count = x.shape[-2]
-    if body.chamber.shape != (count,):
-        raise ValueError(f"body.chamber: shape {tuple(body.chamber.shape)}, wanted [{count}]")
-    for name in ("position", "velocity", "mass", "volume", "bulk", "shear", "viscosity", "volume_viscosity"):
-        value = getattr(body, name)
-        if value is None:
-            continue
-        if value.dtype != x.dtype or value.device != x.device:
-            raise ValueError(f"body.{name}: {value.dtype} on {value.device}, wanted {x.dtype} on {x.device}")
-        vector = name in ("position", "velocity")
-        tail = (count, 3) if vector else (count,)
-        if tuple(value.shape[-len(tail) :]) != tail:
-            raise ValueError(f"body.{name}: shape {tuple(value.shape)}, wanted [..., {', '.join(map(str, tail))}]")
-        finite = torch.isfinite(value.detach())
-        least = value.detach() > 0 if name in ("mass", "volume") else value.detach() >= 0
-        if not bool((finite if vector else finite & least).all()):
-            wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
-            bad = value.detach()[~(finite if vector else finite & least)][0]
-            raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
-
-
-def _check_weight(weight: Tensor, count: int) -> Tensor:
-    if weight.shape[-1:] != (count,):
-        raise ValueError(f"weight: shape {tuple(weight.shape)}, wanted [..., {count}]")
-    if not bool(torch.isfinite(weight.detach()).all() & (weight.detach().sum(-1) > 0).all()):
-        raise ValueError("weight: not finite or all zero, wanted finite numbers with a positive sum")
-    return weight
-
-
-def _check_probes(probes: Tensor, count: int) -> None:
-    if probes.dtype != torch.int64 or probes.ndim != 1:
-        raise ValueError(f"probes: {probes.dtype} of shape {tuple(probes.shape)}, wanted int64 [P]")
-    if len(probes) and (int(probes.min()) < 0 or int(probes.max()) >= count):
-        raise ValueError(f"probes: {int(probes.min())} to {int(probes.max())}, wanted 0 to {count - 1}")
+def _steps(duration: float, sample_every: float | None, dt: float) -> tuple[int, int]:
+    """Substeps in all, and between two samples."""
+    steps = _whole("duration", duration, dt)
+    return steps, max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, dt)
 
 
 def _whole(name: str, value: float, dt: float) -> int:

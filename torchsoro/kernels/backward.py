@@ -17,9 +17,10 @@ from torchsoro.kernels.forward import (
     Integers,
     Reals,
     external_force,
-    lowest_node,
+    place,
 )
 from torchsoro.kernels.layout import (
+    ACTIVE,
     ADJOINT_NEW,
     AFFINE,
     ANCHOR,
@@ -30,6 +31,7 @@ from torchsoro.kernels.layout import (
     NODE,
     NODE_NEW,
     NODE_VELOCITY,
+    NOW,
     PLANE,
     POSITION,
     PRONY,
@@ -47,17 +49,21 @@ from torchsoro.kernels.tensor import (
     store_vector,
 )
 from torchsoro.kernels.transfer import grid_to_particle_adjoint, particle_to_grid_adjoint
+from torchsoro.kernels.warp import shared
+
+BLOCK = 256  # as in ``forward``; here some registers go to memory for it
 
 
 @ti.kernel
 def substep_adjoint(
-    atomic: ti.template(),
+    gpu: ti.template(),
     serial_nodes: ti.template(),
     clock: Integers,
     numbers: Reals,
     state: Reals,
     coefficients: Reals,
     kind: Integers,
+    order: Integers,
     prony: Reals,
     pressure: Reals,
     gravity: Reals,
@@ -101,13 +107,17 @@ def substep_adjoint(
     rows: ti.i32,
     want_prony: ti.i32,
 ):
-    """Go back by one substep; clock[0] counts from ``steps`` - 1 down to -1 (scatter of the first substep only)."""
-    unit = ti.static(1 if atomic else CPU_UNIT)
+    """Go back by one substep; clock[NOW] counts from ``steps`` - 1 down to -1 (scatter of the first substep only)."""
+    unit = ti.static(1 if gpu else CPU_UNIT)
+    all_nodes = batch * node_lanes * unit
+    all_lanes = batch * lanes * unit
     if ti.static(serial_nodes):
         ti.loop_config(serialize=True)
-    for w in range(batch * node_lanes * unit):
+    for w in range(all_nodes):
+        t = clock[NOW]
+        if w == 0:
+            clock[ACTIVE] = t
         if w % unit == 0:
-            t = clock[0]
             nodes = nx * ny * nz
             b = w // unit // node_lanes
             lane = w // unit % node_lanes
@@ -115,7 +125,7 @@ def substep_adjoint(
             cell = numbers[CELL]
             dt = numbers[DT]
             parts = lanes
-            if ti.static(atomic):
+            if ti.static(gpu):
                 parts = 1
             each = (nodes + node_lanes - 1) // node_lanes
             for i in range(lane * each, ti.min(nodes, (lane + 1) * each)):
@@ -123,58 +133,32 @@ def substep_adjoint(
                 if t + 1 < steps:
                     time = first + t + 1
                     node_adjoint(
-                        atomic,
-                        grid,
-                        node,
-                        (((t + 1) * batch + b) * nodes + i) * NODE,
-                        node_bar,
-                        (b * nodes + i) * NODE,
-                        before,
-                        (((t + 1) * batch + b) * nodes + i) * BEFORE,
-                        before_bar,
-                        (b * nodes + i) * BEFORE,
-                        numbers[BLEND] > 0,
-                        gravity,
-                        (time * batch + b) * 3,
-                        gravity_bar,
-                        ((time * rows + row) * batch + b) * 3,
-                        planes,
-                        plane_kind,
-                        b * plane_count * PLANE,
-                        planes_bar,
-                        (row * batch + b) * plane_count * PLANE,
-                        plane_count,
-                        x,
-                        cell,
-                        dt,
-                        b,
-                        i,
-                        batch,
-                        nodes,
-                        parts,
+                        *(gpu, grid, node, (((t + 1) * batch + b) * nodes + i) * NODE),
+                        *(node_bar, (b * nodes + i) * NODE),
+                        *(before, (((t + 1) * batch + b) * nodes + i) * BEFORE),
+                        *(before_bar, (b * nodes + i) * BEFORE, numbers[BLEND] > 0),
+                        *(gravity, (time * batch + b) * 3, gravity_bar, ((time * rows + row) * batch + b) * 3),
+                        *(planes, plane_kind, b * plane_count * PLANE),
+                        *(planes_bar, (row * batch + b) * plane_count * PLANE, plane_count),
+                        *(x, cell, dt, b, i, batch, nodes, parts),
                     )
                 if t >= 0:
                     move(
-                        node,
-                        ((t * batch + b) * nodes + i) * NODE,
-                        before,
-                        ((t * batch + b) * nodes + i) * BEFORE,
-                        new,
-                        (b * nodes + i) * NODE_NEW,
-                        gravity,
-                        ((first + t) * batch + b) * 3,
-                        planes,
-                        plane_kind,
-                        b * plane_count * PLANE,
-                        plane_count,
-                        x,
-                        cell,
-                        dt,
-                        numbers[BLEND],
+                        *(node, ((t * batch + b) * nodes + i) * NODE),
+                        *(before, ((t * batch + b) * nodes + i) * BEFORE),
+                        *(new, (b * nodes + i) * NODE_NEW),
+                        *(gravity, ((first + t) * batch + b) * 3),
+                        *(planes, plane_kind, b * plane_count * PLANE, plane_count),
+                        *(x, cell, dt, numbers[BLEND]),
                     )
-    for w in range(batch * lanes * unit):
+    if ti.static(gpu):
+        ti.loop_config(block_dim=BLOCK)
+    for w in range(all_lanes):
+        t = clock[ACTIVE]
+        if w == 0:
+            clock[NOW] = t - 1
         if w % unit == 0:
-            t = clock[0]
+            pool, marks = ti.static(shared(gpu, BLOCK, grid))
             nodes = nx * ny * nz
             b = w // unit // lanes
             lane = w // unit % lanes
@@ -185,21 +169,26 @@ def substep_adjoint(
             blend = numbers[BLEND]
             size = ti.Vector([nx, ny, nz])
             plane = ny * nz
-            part = lane
-            if ti.static(atomic):
-                part = 0
             low = load_vector(origin, 3 * b, 1)
             prony_at = b * elements * PRONY
             prony_row = (row * batch + b) * elements * PRONY
             mat0 = b * COEFFICIENTS * particles
             each = (particles + lanes - 1) // lanes
-            for p in range(lane * each, ti.min(particles, (lane + 1) * each)):
+            begin, end, part = lane * each, ti.min(particles, (lane + 1) * each), lane
+            if ti.static(gpu):
+                begin, end, part = lane, lane + 1, 0
+            for n in range(begin, end):
+                p = n
+                live = True
+                if ti.static(gpu):
+                    live = order[b * lanes + n] >= 0
+                    p = ti.max(order[b * lanes + n], 0)
                 phase = kind[p]
                 mat = mat0 + p
                 here = b * components * particles + p
                 slot = ((first + t + 1) * batch + b) * components * particles + p
                 f_bar = low * 0
-                if t + 1 < steps:
+                if t + 1 < steps and live:
                     time = first + t + 1
                     pressure_at = (time * batch + b) * chambers
                     force_at = (time * batch + b) * groups * 3
@@ -209,56 +198,26 @@ def substep_adjoint(
                     mass = coefficients[mat + MASS * particles]
                     volume = coefficients[mat + VOLUME * particles]
                     tau = stress(
-                        state,
-                        slot,
-                        coefficients,
-                        mat,
-                        particles,
-                        prony,
-                        prony_at,
-                        elements,
-                        phase,
-                        pressure,
-                        pressure_at,
+                        *(state, slot, coefficients, mat, particles),
+                        *(prony, prony_at, elements, phase, pressure, pressure_at),
                     )
                     push = external_force(
                         coefficients, mat, particles, p, springs, force, force_at, share, groups, x, v
                     )
                     per_volume = dt * 4 * inverse_cell
                     A = (mass * cell) * C - (per_volume * volume) * tau
-                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
-                    f = (x - low) * inverse_cell - base
-                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
-                    node0 += base[2] - box_low[3 * b + 2]
+                    f, node0 = place(x, low, inverse_cell, box_low, b, size, flags)
                     mass_bar, q_bar, A_bar, by_f = particle_to_grid_adjoint(
-                        node_bar,
-                        b * nodes * NODE,
-                        NODE,
-                        NODE_VELOCITY,
-                        node0,
-                        nz,
-                        plane,
-                        f,
-                        mass,
-                        mass * v + dt * push,
-                        A,
+                        *(node_bar, b * nodes * NODE, NODE, NODE_VELOCITY),
+                        *(node0, nz, plane, f, mass, mass * v + dt * push, A),
                     )
                     add(False, coefficients_bar, mat + VOLUME * particles, -(per_volume * contract(tau, A_bar)))
                     push_bar = dt * q_bar
                     tau_bar = (-per_volume * volume) * A_bar
                     if blend > 0:
-                        _, q_more, A_more, f_more = particle_to_grid_adjoint(
-                            before_bar,
-                            b * nodes * BEFORE,
-                            BEFORE,
-                            0,
-                            node0,
-                            nz,
-                            plane,
-                            f,
-                            mass,
-                            mass * v,
-                            (mass * cell) * C,
+                        _mass, q_more, A_more, f_more = particle_to_grid_adjoint(
+                            *(before_bar, b * nodes * BEFORE, BEFORE, 0),
+                            *(node0, nz, plane, f, mass, mass * v, (mass * cell) * C),
                         )
                         q_bar += q_more
                         A_bar += A_more
@@ -280,88 +239,46 @@ def substep_adjoint(
                         for c in ti.static(range(3)):
                             add(False, coefficients_bar, mat + (ANCHOR + c) * particles, spring * push_bar[c])
                     for g in range(groups):
+                        force_bar_at = ((time * rows + row) * batch + b) * groups * 3 + 3 * g
                         for c in ti.static(range(3)):
-                            add(
-                                atomic,
-                                force_bar,
-                                ((time * rows + row) * batch + b) * groups * 3 + 3 * g + c,
-                                share[g * particles + p] * push_bar[c],
-                            )
+                            add(gpu, force_bar, force_bar_at + c, share[g * particles + p] * push_bar[c])
                     C_bar += stress_adjoint(
-                        atomic,
-                        state,
-                        slot,
-                        bar,
-                        here,
-                        coefficients,
-                        coefficients_bar,
-                        mat,
-                        particles,
-                        prony,
-                        prony_at,
-                        prony_bar,
-                        prony_row,
-                        want_prony,
-                        elements,
-                        phase,
-                        pressure,
-                        pressure_at,
-                        pressure_bar,
-                        ((time * rows + row) * batch + b) * chambers,
+                        *(gpu, state, slot, bar, here, coefficients, coefficients_bar, mat, particles),
+                        *(prony, prony_at, prony_bar, prony_row, want_prony, elements, phase),
+                        *(pressure, pressure_at, pressure_bar, ((time * rows + row) * batch + b) * chambers),
                         tau_bar,
                     )
                     store_vector(bar, here + POSITION * particles, particles, x_bar + inverse_cell * by_f)
                     store_vector(bar, here + VELOCITY * particles, particles, v_bar)
                     store_matrix(bar, here + AFFINE * particles, particles, C_bar)
                 if t >= 0:
-                    at = ((first + t) * batch + b) * components * particles + p
-                    x = load_vector(state, at + POSITION * particles, particles)
-                    L = load_matrix(state, slot + AFFINE * particles, particles)
-                    x_bar = load_vector(bar, here + POSITION * particles, particles)
-                    v_bar = load_vector(bar, here + VELOCITY * particles, particles)
-                    L_bar = load_matrix(bar, here + AFFINE * particles, particles)
-                    L_bar += dt * deform_adjoint(
-                        atomic,
-                        state,
-                        at,
-                        slot,
-                        bar,
-                        here,
-                        particles,
-                        prony,
-                        prony_at,
-                        prony_bar,
-                        prony_row,
-                        want_prony,
-                        elements,
-                        phase,
-                        dt * L,
-                    )
-                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
-                    f = (x - low) * inverse_cell - base
-                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
-                    node0 += base[2] - box_low[3 * b + 2]
+                    # A thread without a particle adds nothing, but takes part in its warp's sums.
+                    f, node0 = low * 0, -1
+                    x_bar, v_bar = low * 0, low * 0
+                    none = low.outer_product(low) * 0
+                    L_bar = none
+                    if live:
+                        at = ((first + t) * batch + b) * components * particles + p
+                        x = load_vector(state, at + POSITION * particles, particles)
+                        L = load_matrix(state, slot + AFFINE * particles, particles)
+                        x_bar = load_vector(bar, here + POSITION * particles, particles)
+                        v_bar = load_vector(bar, here + VELOCITY * particles, particles)
+                        L_bar = load_matrix(bar, here + AFFINE * particles, particles)
+                        L_bar += dt * deform_adjoint(
+                            *(gpu, state, at, slot, bar, here, particles),
+                            *(prony, prony_at, prony_bar, prony_row, want_prony, elements, phase, dt * L),
+                        )
+                        f, node0 = place(x, low, inverse_cell, box_low, b, size, flags)
                     by_f = grid_to_particle_adjoint(
-                        atomic,
-                        new,
-                        b * nodes * NODE_NEW,
-                        grid,
-                        (part * batch + b) * nodes * ADJOINT_NEW,
-                        node0,
-                        nz,
-                        plane,
-                        f,
-                        blend,
-                        dt * x_bar,
-                        (4 * inverse_cell) * L_bar,
-                        v_bar,
+                        *(gpu, pool, marks, w % BLOCK, new, b * nodes * NODE_NEW),
+                        *(grid, (part * batch + b) * nodes * ADJOINT_NEW),
+                        *(node0, nz, plane, f, blend, dt * x_bar, (4 * inverse_cell) * L_bar, v_bar),
                     )
                     f_bar += by_f
-                    store_vector(bar, here + POSITION * particles, particles, x_bar + inverse_cell * by_f)
-                    store_vector(bar, here + VELOCITY * particles, particles, blend * v_bar)
-                    store_matrix(bar, here + AFFINE * particles, particles, 0 * L)
-                for c in ti.static(range(3)):
-                    add(atomic, origin_bar, (row * batch + b) * 3 + c, -inverse_cell * f_bar[c])
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        clock[0] = clock[0] - 1
+                    if live:
+                        store_vector(bar, here + POSITION * particles, particles, x_bar + inverse_cell * by_f)
+                        store_vector(bar, here + VELOCITY * particles, particles, blend * v_bar)
+                        store_matrix(bar, here + AFFINE * particles, particles, none)
+                if live:
+                    for c in ti.static(range(3)):
+                        add(gpu, origin_bar, (row * batch + b) * 3 + c, -inverse_cell * f_bar[c])

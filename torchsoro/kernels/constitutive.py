@@ -9,6 +9,7 @@ from torchsoro.kernels.layout import (
     AFFINE,
     BULK,
     DEFORMATION,
+    FILLER,
     FLAG_COLLAPSED,
     HISTORY,
     PRONY,
@@ -21,10 +22,10 @@ from torchsoro.kernels.layout import (
 )
 from torchsoro.kernels.stress import (
     gas_pressure,
+    piola,
+    piola_adjoint,
     pull_back,
     pull_back_adjoint,
-    solid_stress,
-    solid_stress_adjoint,
     viscous_stress,
     viscous_stress_adjoint,
 )
@@ -77,7 +78,8 @@ def stress(
         Q = F * 0
         if elements > 0:
             Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
-        tau = solid_stress(F, Q, bulk, coefficients[mat + SHEAR * particles])
+        shear, filler = coefficients[mat + SHEAR * particles], coefficients[mat + FILLER * particles]
+        tau = piola(F, Q, bulk, shear, filler) @ F.transpose()
     else:
         tau = plus_identity(tau, -J * gas_pressure(J, bulk, pressure[pressure_at + kind]))
     eta = coefficients[mat + VISCOSITY * particles]
@@ -125,8 +127,10 @@ def stress_adjoint(
         if elements > 0:
             Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
         shear = coefficients[mat + SHEAR * particles]
-        by_F, Q_bar, bulk_bar, shear_bar = solid_stress_adjoint(F, Q, bulk, shear, tau_bar)
-        F_bar += by_F
+        filler = coefficients[mat + FILLER * particles]
+        by_F, Q_bar, bulk_bar, shear_bar, filler_bar = piola_adjoint(F, Q, bulk, shear, filler, tau_bar @ F)
+        F_bar += by_F + tau_bar.transpose() @ piola(F, Q, bulk, shear, filler)
+        add(False, coefficients_bar, mat + FILLER * particles, filler_bar)
         add(False, coefficients_bar, mat + BULK * particles, bulk_bar)
         add(False, coefficients_bar, mat + SHEAR * particles, shear_bar)
         for e in range(elements):

@@ -26,14 +26,19 @@ def plane_distance(planes: ti.template(), plane_kind: ti.template(), at, k, x, c
 
 
 @ti.func
-def normal_of(plane_kind: ti.template(), k, like):
-    """Unit normal of plane k, pointing to the free side."""
-    axis, sign = plane_kind[3 * k + PLANE_AXIS], plane_kind[3 * k + PLANE_SIGN]
+def axis_normal(axis, sign, like):
+    """Unit vector along an axis, of the given sign."""
     n = like * 0
     for i in ti.static(range(3)):
         if axis == i:
             n[i] = sign
     return n
+
+
+@ti.func
+def normal_of(plane_kind: ti.template(), k, like):
+    """Unit normal of plane k, pointing to the free side."""
+    return axis_normal(plane_kind[3 * k + PLANE_AXIS], plane_kind[3 * k + PLANE_SIGN], like)
 
 
 @ti.func
@@ -113,3 +118,47 @@ def contact(planes: ti.template(), plane_kind: ti.template(), at, count, x, mass
         if touches(distance):
             r = touch(r, n, plane_kind[3 * k + PLANE_STICK], planes[at + PLANE * k + PLANE_FRICTION], hold)
     return r
+
+
+@ti.func
+def lands(u, n, gap, dt):
+    """Whether a step of dt would end behind a plane that is ``gap`` away."""
+    return u.dot(n) * dt + ti.max(gap, gap * 0) < 0
+
+
+@ti.func
+def land(u, n, gap, dt, stick, friction, hold):
+    """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
+
+    A point that would end behind the plane ends on it: the second result, the last way over dt along the normal, moves
+    it there, and is gone afterwards as the impact takes the velocity. So the height at which a body comes to rest does
+    not depend on where it fell from, also for the gradient. Once there, this is :func:`touch`. Where a body sticks, its
+    tangential way in that step is lost; to stop it exactly at the time of impact would multiply the gradient by the
+    ratio of tangential and normal speed at every landing. ``hold`` is negative where adhesion does not reach.
+    """
+    r = u
+    way = gap * 0
+    if lands(u, n, gap, dt):
+        r = touch(u, n, stick, friction, gap * 0)
+        way = -ti.max(gap, gap * 0) / dt
+    elif u.dot(n) > 0 and hold >= 0:
+        r = touch(u, n, stick, friction, hold)
+    return r, way
+
+
+@ti.func
+def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, way_bar):
+    """Adjoint of :func:`land`: gradients by u, gap, friction and hold."""
+    u_bar = r_bar
+    gap_bar = gap * 0
+    friction_bar = gap * 0
+    hold_bar = gap * 0
+    if lands(u, n, gap, dt):
+        by_u, by_friction, _ = touch_adjoint(u, n, stick, friction, gap * 0, r_bar)
+        u_bar, friction_bar = by_u, by_friction
+        if gap > 0:
+            gap_bar = -way_bar / dt
+    elif u.dot(n) > 0 and hold >= 0:
+        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, hold, r_bar)
+        u_bar, friction_bar, hold_bar = by_u, by_friction, by_hold
+    return u_bar, gap_bar, friction_bar, hold_bar

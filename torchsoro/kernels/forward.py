@@ -2,13 +2,15 @@
 
 Fusing the gather of one substep with the scatter of the next leaves one pass over the particles per substep. On a CPU
 the particles are cut into lanes, each with a grid of its own that the node pass adds up in a fixed order, so that a
-run has the same bits whatever the number of threads; on a GPU every particle is a lane and the grid is shared.
+run has the same bits whatever the number of threads; on a GPU every particle is a lane, in the order of the cells,
+and the grid is shared.
 """
 
 import taichi as ti
 
 from torchsoro.kernels.constitutive import deform, stress
 from torchsoro.kernels.layout import (
+    ACTIVE,
     AFFINE,
     ANCHOR,
     BEFORE,
@@ -18,6 +20,7 @@ from torchsoro.kernels.layout import (
     MASS,
     NODE,
     NODE_NEW,
+    NOW,
     PLANE,
     POSITION,
     PRONY,
@@ -34,6 +37,7 @@ from torchsoro.kernels.tensor import (
     store_vector,
 )
 from torchsoro.kernels.transfer import grid_to_particle, particle_to_grid
+from torchsoro.kernels.warp import shared
 
 Reals = ti.types.ndarray(ndim=1)
 Integers = ti.types.ndarray(dtype=ti.i32, ndim=1)
@@ -43,6 +47,9 @@ DT, CELL, INVERSE_CELL, BLEND = 0, 1, 2, 3
 
 # Taichi hands a CPU thread no fewer than 512 iterations of a loop: a lane is that many, of which one works.
 CPU_UNIT = 512
+
+# Threads of a block on a GPU. So many make the compiler keep to 128 registers, and 16 warps run at a time.
+BLOCK = 256
 
 
 @ti.func
@@ -55,6 +62,16 @@ def lowest_node(x, inverse_cell, box_low: ti.template(), b, size, flags: ti.temp
             flags[FLAG_LEFT_BOX] = 1
             base[c] = ti.max(0, ti.min(local, size[c] - 3)) + box_low[3 * b + c]
     return base
+
+
+@ti.func
+def place(x, low, inverse_cell, box_low: ti.template(), b, size, flags: ti.template()):
+    """A particle's place above its lowest node, in cells, and the number of that node in the active box."""
+    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
+    f = (x - low) * inverse_cell - base
+    node0 = (base[0] - box_low[3 * b]) * (size[1] * size[2]) + (base[1] - box_low[3 * b + 1]) * size[2]
+    node0 += base[2] - box_low[3 * b + 2]
+    return f, node0
 
 
 @ti.func
@@ -84,13 +101,14 @@ def external_force(
 
 @ti.kernel
 def substep(
-    atomic: ti.template(),
+    gpu: ti.template(),
     serial_nodes: ti.template(),
     clock: Integers,
     numbers: Reals,
     state: Reals,
     coefficients: Reals,
     kind: Integers,
+    order: Integers,
     prony: Reals,
     pressure: Reals,
     gravity: Reals,
@@ -123,45 +141,47 @@ def substep(
     ring: ti.i32,
     node_ring: ti.i32,
 ):
-    """Advance by one substep; clock[0] counts from -1 (scatter only) to ``steps`` - 1 within a chunk."""
-    unit = ti.static(1 if atomic else CPU_UNIT)
+    """Advance by one substep; clock[NOW] counts from -1 (scatter only) to ``steps`` - 1 within a chunk.
+
+    The pass over the nodes reads clock[NOW] and the one over the particles clock[ACTIVE]; each sets the other's.
+    """
+    unit = ti.static(1 if gpu else CPU_UNIT)
+    # Bounds of both loops before the first: else a GPU has a task of its own for each.
+    all_nodes = batch * nx * ny * nz
+    all_lanes = batch * lanes * unit
     if ti.static(serial_nodes):
         ti.loop_config(serialize=True)
-    for w in range(batch * nx * ny * nz):
-        s = clock[0]
+    for w in range(all_nodes):
+        s = clock[NOW]
+        if w == 0:
+            clock[ACTIVE] = s
         if s >= 0:
             nodes = nx * ny * nz
             b = w // nodes
             i = w % nodes
             cell = numbers[CELL]
             parts = lanes
-            if ti.static(atomic):
+            if ti.static(gpu):
                 parts = 1
             node_at = (((s % node_ring) * batch + b) * nodes + i) * NODE
             before_at = (((s % node_ring) * batch + b) * nodes + i) * BEFORE
             both = numbers[BLEND] > 0
             collect(grid, node, node_at, grid_before, before, before_at, both, b, i, batch, nodes, parts)
             move(
-                node,
-                node_at,
-                before,
-                before_at,
-                new,
-                (b * nodes + i) * NODE_NEW,
-                gravity,
-                ((first + s) * batch + b) * 3,
-                planes,
-                plane_kind,
-                b * plane_count * PLANE,
-                plane_count,
+                *(node, node_at, before, before_at, new, (b * nodes + i) * NODE_NEW),
+                *(gravity, ((first + s) * batch + b) * 3),
+                *(planes, plane_kind, b * plane_count * PLANE, plane_count),
                 node_position(box_low, origin, b, i, ti.Vector([nx, ny, nz]), cell),
-                cell,
-                numbers[DT],
-                numbers[BLEND],
+                *(cell, numbers[DT], numbers[BLEND]),
             )
-    for w in range(batch * lanes * unit):
+    if ti.static(gpu):
+        ti.loop_config(block_dim=BLOCK)
+    for w in range(all_lanes):
+        s = clock[ACTIVE]
+        if w == 0:
+            clock[NOW] = s + 1
         if w % unit == 0:
-            s = clock[0]
+            pool, marks = ti.static(shared(gpu, BLOCK, grid))
             nodes = nx * ny * nz
             b = w // unit // lanes
             lane = w // unit % lanes
@@ -171,25 +191,27 @@ def substep(
             blend = numbers[BLEND]
             size = ti.Vector([nx, ny, nz])
             plane = ny * nz
-            part = lane
-            if ti.static(atomic):
-                part = 0
             low = load_vector(origin, 3 * b, 1)
             prony_at = b * elements * PRONY
             mat = b * COEFFICIENTS * particles
             each = (particles + lanes - 1) // lanes
+            begin, end, part = lane * each, ti.min(particles, (lane + 1) * each), lane
+            if ti.static(gpu):
+                begin, end, part = lane, lane + 1, 0
             step = first + s + 1
-            for p in range(lane * each, ti.min(particles, (lane + 1) * each)):
+            for n in range(begin, end):
+                p = n
+                live = True
+                if ti.static(gpu):
+                    live = order[b * lanes + n] >= 0
+                    p = ti.max(order[b * lanes + n], 0)
                 phase = kind[p]
-                out = (((first + s + 1) % ring) * batch + b) * components * particles + p
-                if s >= 0:
+                out = ((step % ring) * batch + b) * components * particles + p
+                if s >= 0 and live:
                     at = (((first + s) % ring) * batch + b) * components * particles + p
                     x = load_vector(state, at + POSITION * particles, particles)
                     v = load_vector(state, at + VELOCITY * particles, particles)
-                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
-                    f = (x - low) * inverse_cell - base
-                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
-                    node0 += base[2] - box_low[3 * b + 2]
+                    f, node0 = place(x, low, inverse_cell, box_low, b, size, flags)
                     u, moment, r = grid_to_particle(new, b * nodes * NODE_NEW, node0, nz, plane, f, blend > 0)
                     L = moment * (4 * inverse_cell)
                     store_vector(state, out + POSITION * particles, particles, x + dt * u)
@@ -197,60 +219,34 @@ def substep(
                     store_matrix(state, out + AFFINE * particles, particles, L)
                     deform(state, at, out, particles, prony, prony_at, elements, phase, dt * L, flags)
                 if s + 1 < steps:
-                    x = load_vector(state, out + POSITION * particles, particles)
-                    v = load_vector(state, out + VELOCITY * particles, particles)
-                    C = load_matrix(state, out + AFFINE * particles, particles)
-                    mass = coefficients[mat + MASS * particles + p]
-                    volume = coefficients[mat + VOLUME * particles + p]
-                    tau = stress(
-                        state,
-                        out,
-                        coefficients,
-                        mat + p,
-                        particles,
-                        prony,
-                        prony_at,
-                        elements,
-                        phase,
-                        pressure,
-                        (step * batch + b) * chambers,
-                    )
-                    push = external_force(
-                        coefficients,
-                        mat + p,
-                        particles,
-                        p,
-                        springs,
-                        force,
-                        (step * batch + b) * groups * 3,
-                        share,
-                        groups,
-                        x,
-                        v,
-                    )
-                    A_before = (mass * cell) * C
-                    A = A_before - (dt * volume * 4 * inverse_cell) * tau
-                    base = lowest_node(x - low, inverse_cell, box_low, b, size, flags)
-                    f = (x - low) * inverse_cell - base
-                    node0 = (base[0] - box_low[3 * b]) * plane + (base[1] - box_low[3 * b + 1]) * nz
-                    node0 += base[2] - box_low[3 * b + 2]
+                    # A thread without a particle adds nothing, but takes part in its warp's sums.
+                    mass = dt * 0
+                    f, node0 = low * 0, -1
+                    q, q_before = low * 0, low * 0
+                    A = low.outer_product(low) * 0
+                    A_before = A
+                    if live:
+                        x = load_vector(state, out + POSITION * particles, particles)
+                        v = load_vector(state, out + VELOCITY * particles, particles)
+                        C = load_matrix(state, out + AFFINE * particles, particles)
+                        mass = coefficients[mat + MASS * particles + p]
+                        volume = coefficients[mat + VOLUME * particles + p]
+                        tau = stress(
+                            *(state, out, coefficients, mat + p, particles),
+                            *(prony, prony_at, elements, phase, pressure, (step * batch + b) * chambers),
+                        )
+                        push = external_force(
+                            *(coefficients, mat + p, particles, p, springs),
+                            *(force, (step * batch + b) * groups * 3, share, groups, x, v),
+                        )
+                        A_before = (mass * cell) * C
+                        A = A_before - (dt * volume * 4 * inverse_cell) * tau
+                        q_before = mass * v
+                        q = q_before + dt * push
+                        f, node0 = place(x, low, inverse_cell, box_low, b, size, flags)
                     particle_to_grid(
-                        atomic,
-                        grid,
-                        (part * batch + b) * nodes * NODE,
-                        grid_before,
-                        (part * batch + b) * nodes * BEFORE,
-                        blend > 0,
-                        node0,
-                        nz,
-                        plane,
-                        f,
-                        mass,
-                        mass * v + dt * push,
-                        A,
-                        mass * v,
-                        A_before,
+                        *(gpu, pool, marks, w % BLOCK),
+                        *(grid, (part * batch + b) * nodes * NODE),
+                        *(grid_before, (part * batch + b) * nodes * BEFORE, blend > 0),
+                        *(node0, nz, plane, f, mass, q, A, q_before, A_before),
                     )
-    ti.loop_config(serialize=True)
-    for _ in range(1):
-        clock[0] = clock[0] + 1

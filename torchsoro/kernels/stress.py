@@ -1,74 +1,135 @@
-"""Stress laws of the particles and their adjoints: neo-Hookean solid with Maxwell elements, gas, Newtonian viscosity.
+"""Stress laws of the particles and their adjoints: neo-Hookean solid with Maxwell elements, filler, gas, viscosity.
 
-All stresses are Kirchhoff stresses ``tau = J sigma``. Equation numbers are those of Kobayashi et al.,
-"Computational synthesis of locomotive soft robots by topology optimization".
+Solids give their first Piola stress P by the deformation gradient F; the Kirchhoff stress is ``tau = P F^T = J sigma``.
+Equation numbers are those of Kobayashi et al., "Computational synthesis of locomotive soft robots by topology
+optimization".
 """
 
 import taichi as ti
 
-from torchsoro.kernels.tensor import cofactor, contract, deviator, plus_identity
-
-
-@ti.func
-def isochoric(F, J):
-    """Isochoric part of the deformation gradient, J^(-1/3) F."""
-    return F * ti.exp(-ti.log(J) / 3)
+from torchsoro.kernels.tensor import cofactor, contract, cross, plus_identity
 
 
 @ti.func
 def pull_back(F):
-    """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(Cb)/3 Cb^-1) / J (inside Eq. 8)."""
+    """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(C)/3 C^-1) / J with C = F^T F (in Eq. 8)."""
     J = F.determinant()
-    Fb = isochoric(F, J)
-    Cb = Fb.transpose() @ Fb
-    return plus_identity(cofactor(Cb) * (-Cb.trace() / 3), 1) / J
+    C = F.transpose() @ F
+    return plus_identity(cofactor(C) * (-C.trace() / (3 * J * J * J)), 1 / J)
 
 
 @ti.func
 def pull_back_adjoint(F, S_bar):
     """Adjoint of :func:`pull_back`: the gradient by F for the symmetric gradient S_bar by S."""
-    J = F.determinant()
-    Fb = isochoric(F, J)
-    Cb = Fb.transpose() @ Fb
-    inverse = cofactor(Cb)  # det Cb = 1
-    trace = Cb.trace()
-    S = plus_identity(inverse * (-trace / 3), 1) / J
-    Cb_bar = plus_identity(inverse @ S_bar @ inverse * (trace / (3 * J)), -contract(S_bar, inverse) / (3 * J))
-    J_bar = -contract(S_bar, S) / J
-    return isochoric_adjoint(F, J, Fb, 2 * Fb @ Cb_bar, J_bar)
+    cof = cofactor(F)
+    J = contract(cof, F) / 3
+    C = F.transpose() @ F
+    trace, G = C.trace(), cofactor(C)
+    scale = 1 / (3 * J * J * J)
+    along = contract(S_bar, G) * scale
+    C_bar = plus_identity(cross(C, S_bar) * (-trace * scale), -along)
+    J_bar = -S_bar.trace() / (J * J) + 3 * trace * along / J
+    return 2 * F @ C_bar + J_bar * cof
 
 
 @ti.func
-def isochoric_adjoint(F, J, Fb, Fb_bar, J_bar):
-    """Gradient by F of a function of (Fb, J), where Fb = J^(-1/3) F and J = det F."""
-    by_J = J_bar - contract(Fb_bar, Fb) / (3 * J)
-    return Fb_bar * ti.exp(-ti.log(J) / 3) + cofactor(F) * by_J
+def solid_piola(F, Q, bulk, shear):
+    """Eqs. 3-8 as first Piola stress, with Q = sum_i g_i H_i.
+
+    The Kirchhoff stress K/2 [(J-1) + ln J / J] J I + mu dev(Fb A Fb^T), A = I + J Q, Fb = J^(-1/3) F, times F^-T.
+    """
+    J = F.determinant()
+    shrink = ti.exp(-2 * ti.log(J) / 3)
+    FA = F + J * (F @ Q)
+    pressure = bulk / 2 * (J * (J - 1) + ti.log(J)) - shear * shrink * contract(F, FA) / 3
+    return shear * shrink * FA + pressure / J * cofactor(F)
 
 
 @ti.func
-def solid_stress(F, Q, bulk, shear):
-    """Eqs. 3-8: K/2 [(J-1) + ln J / J] J I + mu dev(Bb) + mu J dev(Fb Q Fb^T), with Q = sum_i g_i H_i."""
-    J = F.determinant()
-    Fb = isochoric(F, J)
-    shape = Fb @ Fb.transpose() + J * (Fb @ Q @ Fb.transpose())
-    return plus_identity(shear * deviator(shape), bulk / 2 * (J * (J - 1) + ti.log(J)))
+def solid_piola_adjoint(F, Q, bulk, shear, P_bar):
+    """Adjoint of :func:`solid_piola`: gradients by F, Q, bulk and shear modulus."""
+    cof = cofactor(F)
+    J = contract(cof, F) / 3
+    log = ti.log(J)
+    shrink = ti.exp(-2 * log / 3)
+    FQ = F @ Q
+    FA = F + J * FQ
+    spread = contract(F, FA) / 3
+    volumetric = (J * (J - 1) + log) / 2
+    beta = (bulk * volumetric - shear * shrink * spread) / J
+    beta_bar = contract(P_bar, cof)
+    pressure_bar = beta_bar / J
+    alpha_bar = contract(P_bar, FA) - pressure_bar * spread  # by shear * shrink
+    alpha = shear * shrink
+    # contract(F, FA) is quadratic in F and linear in A.
+    FA_bar = alpha * P_bar - (alpha * pressure_bar / 3) * F
+    J_bar = pressure_bar * (bulk * (J - 0.5 + 0.5 / J) - beta) - 2 * alpha * alpha_bar / (3 * J)
+    J_bar += contract(FA_bar, FQ)
+    F_bar = FA_bar + J * (FA_bar @ Q) - (alpha * pressure_bar / 3) * FA + beta * cross(F, P_bar) + J_bar * cof
+    half = (J / 2) * (F.transpose() @ FA_bar)
+    return F_bar, half + half.transpose(), pressure_bar * volumetric, alpha_bar * shrink
 
 
 @ti.func
-def solid_stress_adjoint(F, Q, bulk, shear, tau_bar):
-    """Adjoint of :func:`solid_stress`: gradients by F, Q, bulk and shear modulus."""
+def filler_piola(F, shear):
+    """Stress of void: mu (F - l'(J) cof F) with l = ln J above J = 1 and its second-order expansion below.
+
+    Defined and bounded for every F, also collapsed and turned inside out, and objective; J = 1 is at rest.
+    """
     J = F.determinant()
-    Fb = isochoric(F, J)
-    pushed = Fb @ Q @ Fb.transpose()
-    dev_bar = deviator(tau_bar)
-    trace_bar = tau_bar.trace()
-    shear_bar = contract(dev_bar, Fb @ Fb.transpose() + J * pushed)
-    bulk_bar = trace_bar * (J * (J - 1) + ti.log(J)) / 2
-    J_bar = bulk * trace_bar * (J - 0.5 + 0.5 / J) + shear * contract(dev_bar, pushed)
-    both = shear * (dev_bar + dev_bar.transpose())
-    Fb_bar = both @ (Fb + J * (Fb @ Q))
-    Q_bar = Fb.transpose() @ both @ Fb * (J / 2)
-    return isochoric_adjoint(F, J, Fb, Fb_bar, J_bar), Q_bar, bulk_bar, shear_bar
+    slope = 2 - J
+    if J > 1:
+        slope = 1 / J
+    return shear * (F - slope * cofactor(F))
+
+
+@ti.func
+def filler_piola_adjoint(F, shear, P_bar):
+    """Adjoint of :func:`filler_piola`: gradients by F and shear modulus."""
+    cof = cofactor(F)
+    J = contract(cof, F) / 3
+    slope = 2 - J
+    curvature = J * 0 - 1
+    if J > 1:
+        slope = 1 / J
+        curvature = -slope * slope
+    along = contract(P_bar, cof)
+    F_bar = shear * (P_bar - slope * cross(F, P_bar) - (curvature * along) * cof)
+    return F_bar, contract(P_bar, F) - slope * along
+
+
+@ti.func
+def piola(F, Q, bulk, shear, filler):
+    """First Piola stress of a solid of which a share ``filler`` (0 to 1) is void."""
+    P = F * 0
+    if filler < 1:
+        P = (1 - filler) * solid_piola(F, Q, bulk, shear)
+    if filler > 0:
+        P += filler * filler_piola(F, shear)
+    return P
+
+
+@ti.func
+def piola_adjoint(F, Q, bulk, shear, filler, P_bar):
+    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, and filler."""
+    F_bar = F * 0
+    Q_bar = F * 0
+    bulk_bar = shear * 0
+    shear_bar = shear * 0
+    filler_bar = shear * 0
+    if filler < 1:
+        by_F, by_Q, by_bulk, by_shear = solid_piola_adjoint(F, Q, bulk, shear, P_bar)
+        F_bar, Q_bar = (1 - filler) * by_F, (1 - filler) * by_Q
+        bulk_bar, shear_bar = (1 - filler) * by_bulk, (1 - filler) * by_shear
+        if filler > 0:
+            filler_bar -= bulk * by_bulk + shear * by_shear  # the law is linear in its moduli
+    if filler > 0:
+        by_F, by_shear = filler_piola_adjoint(F, shear, P_bar)
+        F_bar += filler * by_F
+        shear_bar += filler * by_shear
+        if filler < 1:
+            filler_bar += shear * by_shear
+    return F_bar, Q_bar, bulk_bar, shear_bar, filler_bar
 
 
 @ti.func
@@ -95,3 +156,26 @@ def viscous_stress_adjoint(J, gradient, viscosity, volume_viscosity, tau_bar):
     viscosity_bar = contract(both, gradient) - 2 * volume_bar / 3
     J_bar = viscosity * contract(both, gradient) + bulk_viscosity * volume_bar
     return J_bar, gradient_bar, J * viscosity_bar, J * volume_bar
+
+
+@ti.func
+def viscous_piola(F, rate, viscosity, volume_viscosity):
+    """:func:`viscous_stress` as first Piola stress, from F and its rate: L = F' F^-1."""
+    J = F.determinant()
+    back = cofactor(F) / J
+    return viscous_stress(J, rate @ back.transpose(), viscosity, volume_viscosity) @ back
+
+
+@ti.func
+def viscous_piola_adjoint(F, rate, viscosity, volume_viscosity, P_bar):
+    """Adjoint of :func:`viscous_piola`: gradients by F, its rate, viscosity and volume viscosity."""
+    J = F.determinant()
+    cof = cofactor(F)
+    back = cof / J  # F^-T
+    L = rate @ back.transpose()
+    P = viscous_stress(J, L, viscosity, volume_viscosity) @ back
+    tau_bar = P_bar @ back.transpose()
+    J_bar, L_bar, by_viscosity, by_volume = viscous_stress_adjoint(J, L, viscosity, volume_viscosity, tau_bar)
+    rate_bar = L_bar @ back
+    F_bar = J_bar * cof - back @ P_bar.transpose() @ P - L.transpose() @ rate_bar
+    return F_bar, rate_bar, by_viscosity, by_volume

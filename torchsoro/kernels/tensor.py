@@ -85,6 +85,17 @@ def cofactor(m):
 
 
 @ti.func
+def cross(m, n):
+    """The part of the cofactor of m + n that is linear in both; contracted with a third, symmetric in all three."""
+    c = m
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        a, b = ti.static((i + 1) % 3, (i + 2) % 3)
+        k, o = ti.static((j + 1) % 3, (j + 2) % 3)
+        c[i, j] = m[a, k] * n[b, o] + n[a, k] * m[b, o] - m[a, o] * n[b, k] - n[a, o] * m[b, k]
+    return c
+
+
+@ti.func
 def deviator(m):
     """The deviatoric part, m - tr(m)/3 I."""
     third = m.trace() / 3

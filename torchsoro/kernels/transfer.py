@@ -15,12 +15,16 @@ from torchsoro.kernels.layout import (
     NODE_VELOCITY,
 )
 from torchsoro.kernels.spline import slopes, weights
-from torchsoro.kernels.tensor import add, load_vector
+from torchsoro.kernels.tensor import load_vector
+from torchsoro.kernels.warp import add_runs, find_runs, lay
 
 
 @ti.func
 def particle_to_grid(
-    atomic: ti.template(),
+    gpu: ti.template(),
+    pool: ti.template(),
+    marks: ti.template(),
+    slot,
     grid: ti.template(),
     grid_at,
     before: ti.template(),
@@ -38,11 +42,15 @@ def particle_to_grid(
 ):
     """Scatter mass and momentum: w (q + A (o - f)) with o the node's offset and f the particle's place, in cells.
 
-    If ``both``, also the momentum before forces, to a grid of its own.
+    If ``both``, also the momentum before forces, to a grid of its own. ``pool``, ``marks`` and ``slot`` are for the
+    sums of a warp, see ``warp``; there ``node0`` is -1 for none.
     """
     w = weights(f)
     start = q - A @ f
     start_before = q_before - A_before @ f
+    runs = 0
+    if ti.static(gpu):
+        runs = find_runs(marks, slot, node0)
     for i in range(3):
         for j in range(3):
             wij = w[i, 0] * w[j, 1]
@@ -51,17 +59,24 @@ def particle_to_grid(
             for c in ti.static(range(3)):
                 line[c] += i * A[c, 0] + j * A[c, 1]
                 line_before[c] += i * A_before[c, 0] + j * A_before[c, 1]
-            node = node0 + i * plane + j * row
-            at = grid_at + node * NODE
+            shift = i * plane + j * row
+            at = grid_at + (node0 + shift) * NODE
             for k in ti.static(range(3)):
                 weight = wij * w[k, 2]
-                add(atomic, grid, at + k * NODE + NODE_MASS, weight * mass)
+                lay(gpu, pool, slot, k * NODE + NODE_MASS, grid, at + k * NODE + NODE_MASS, weight * mass)
                 for c in ti.static(range(3)):
-                    add(atomic, grid, at + k * NODE + NODE_VELOCITY + c, weight * (line[c] + k * A[c, 2]))
-                if both:
+                    value = weight * (line[c] + k * A[c, 2])
+                    lay(gpu, pool, slot, k * NODE + NODE_VELOCITY + c, grid, at + k * NODE + NODE_VELOCITY + c, value)
+            if ti.static(gpu):
+                add_runs(pool, marks, slot, runs, NODE, NODE, grid, grid_at + shift * NODE)
+            if both:
+                at = before_at + (node0 + shift) * BEFORE
+                for k in ti.static(range(3)):
                     for c in ti.static(range(3)):
-                        value = weight * (line_before[c] + k * A_before[c, 2])
-                        add(atomic, before, before_at + (node + k) * BEFORE + c, value)
+                        value = wij * w[k, 2] * (line_before[c] + k * A_before[c, 2])
+                        lay(gpu, pool, slot, k * BEFORE + c, before, at + k * BEFORE + c, value)
+                if ti.static(gpu):
+                    add_runs(pool, marks, slot, runs, BEFORE, BEFORE, before, before_at + shift * BEFORE)
 
 
 @ti.func
@@ -157,7 +172,10 @@ def grid_to_particle(new: ti.template(), new_at, node0, row, plane, f, both):
 
 @ti.func
 def grid_to_particle_adjoint(
-    atomic: ti.template(),
+    gpu: ti.template(),
+    pool: ti.template(),
+    marks: ti.template(),
+    slot,
     new: ti.template(),
     new_at,
     grid: ti.template(),
@@ -181,17 +199,23 @@ def grid_to_particle_adjoint(
     moved_start = start + transferred_bar
     if blend == 0:
         start = moved_start
+    runs = 0
+    there = node0
+    if ti.static(gpu):
+        runs = find_runs(marks, slot, node0)
+        there = ti.max(node0, 0)
     for i in range(3):
         for j in range(3):
             wij = w[i, 0] * w[j, 1]
             line = start
-            shift = moved_start
+            moved_line = moved_start
             for c in ti.static(range(3)):
                 tilt = i * moment_bar[c, 0] + j * moment_bar[c, 1]
                 line[c] += tilt
-                shift[c] += tilt
-            at = grid_at + (node0 + i * plane + j * row) * ADJOINT_NEW
-            new_line = new_at + (node0 + i * plane + j * row) * NODE_NEW
+                moved_line[c] += tilt
+            shift = i * plane + j * row
+            at = grid_at + (node0 + shift) * ADJOINT_NEW
+            new_line = new_at + (there + shift) * NODE_NEW
             flat = zero
             slope = zero
             for k in ti.static(range(3)):
@@ -201,19 +225,25 @@ def grid_to_particle_adjoint(
                 velocity += weight * u
                 for c in ti.static(range(3)):
                     tilt = k * moment_bar[c, 2]
-                    add(atomic, grid, at + k * ADJOINT_NEW + ADJOINT_MOVED + c, weight * (shift[c] + tilt))
+                    share = weight * (moved_line[c] + tilt)
+                    lay(gpu, pool, slot, 3 * k + c, grid, at + k * ADJOINT_NEW + ADJOINT_MOVED + c, share)
                     value += (line[c] + tilt) * u[c]
                 if blend > 0:
                     for c in ti.static(range(3)):
-                        add(
-                            atomic,
-                            grid,
-                            at + k * ADJOINT_NEW + ADJOINT_FLIP + c,
-                            weight * blend * transferred_bar[c],
-                        )
                         value += transferred_bar[c] * new[new_line + k * NODE_NEW + NODE_TRANSFER + c]
                 flat += w[k, 2] * value
                 slope += dw[k, 2] * value
+            if ti.static(gpu):
+                add_runs(pool, marks, slot, runs, 3, ADJOINT_NEW, grid, grid_at + shift * ADJOINT_NEW + ADJOINT_MOVED)
+            if blend > 0:
+                for k in ti.static(range(3)):
+                    for c in ti.static(range(3)):
+                        share = wij * w[k, 2] * blend * transferred_bar[c]
+                        lay(gpu, pool, slot, 3 * k + c, grid, at + k * ADJOINT_NEW + ADJOINT_FLIP + c, share)
+                if ti.static(gpu):
+                    add_runs(
+                        pool, marks, slot, runs, 3, ADJOINT_NEW, grid, grid_at + shift * ADJOINT_NEW + ADJOINT_FLIP
+                    )
             f_bar[0] += dw[i, 0] * w[j, 1] * flat
             f_bar[1] += w[i, 0] * dw[j, 1] * flat
             f_bar[2] += wij * slope

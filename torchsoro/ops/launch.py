@@ -14,6 +14,10 @@ import taichi as ti
 from taichi.lang import impl
 from torch import Tensor
 
+# What a kernel was compiled to; asking Taichi again takes milliseconds. Kernel and program are kept, so that no other
+# can take their place in memory.
+_compiled: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
+
 
 def capture(kernel, *arguments) -> Callable[[int], None]:
     """Fix a kernel's arguments: templates, contiguous tensors on Taichi's device, and integers.
@@ -30,7 +34,10 @@ def capture(kernel, *arguments) -> Callable[[int], None]:
     primal = kernel._primal
     compiled = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
     program: Any = impl.get_runtime().prog
-    data = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
+    if (id(program), id(compiled)) not in _compiled:
+        data = program.compile_kernel(program.config(), program.get_device_caps(), compiled)
+        _compiled[id(program), id(compiled)] = program, compiled, data
+    data = _compiled[id(program), id(compiled)][2]
     values = [
         value
         for argument, value in zip(primal.arguments, arguments, strict=True)

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from torchsoro.errors import SimulationDiverged
 from torchsoro.kernels import backward, forward, layout
+from torchsoro.kernels.warp import WARP
+from torchsoro.ops.lattice import Lattice
 from torchsoro.ops.launch import capture
 from torchsoro.runtime import init
 
@@ -39,6 +41,7 @@ class Scene:
         plane_kind: int32 [planes, 3]: axis, side (+1 or -1), 1 for stick or 0 for Coulomb.
         springs: Whether any particle has a spring or drag.
         probes: int64 [P], particles whose motion is recorded.
+        lattice: Of the total-Lagrangian form; None for the updated form.
     """
 
     dt: float
@@ -51,6 +54,7 @@ class Scene:
     plane_kind: Tensor
     springs: bool
     probes: Tensor
+    lattice: Lattice | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -78,7 +82,10 @@ class Inputs:
 
 @dataclass(eq=False)
 class Chunk:
-    """Substeps with one active box: its lowest nodes [B, 3], its size in nodes, and its node velocities if kept."""
+    """Substeps with one active box: its lowest nodes [B, 3], its size in nodes, and its node velocities if kept.
+
+    On a GPU also the order in which threads take the particles.
+    """
 
     first: int
     steps: int
@@ -86,6 +93,7 @@ class Chunk:
     size: tuple[int, int, int]
     node: Tensor
     before: Tensor
+    order: Tensor
 
     @property
     def nodes(self) -> int:
@@ -116,11 +124,12 @@ class March:
         self.elements = inputs.prony.shape[1]
         self.components = layout.state_components(self.elements)
         per_simulation = max(1, CPU_LANES // self.batch)
-        self.lanes = self.count if self.gpu else min(self.count, per_simulation)
+        padded = -(-self.count // WARP) * WARP
+        self.lanes = padded if self.gpu else min(self.count, per_simulation)
         self.rows = GPU_ROWS if self.gpu else self.lanes
         self.numbers = like.new_tensor([scene.dt, scene.cell, 1 / scene.cell, scene.blend])
         self.flags = torch.zeros(2, dtype=torch.int32, device=like.device)
-        self.clock = torch.zeros(1, dtype=torch.int32, device=like.device)
+        self.clock = torch.zeros(3, dtype=torch.int32, device=like.device)
         self.zeroed: dict[str, Tensor] = {}
         self.chunks: list[Chunk] = []
 
@@ -164,14 +173,14 @@ class March:
                 single_until = first + chunk.steps
         return states
 
-    def backward(self, states: Tensor, bar: Tensor, add: Look, *, prony: bool) -> dict[str, Tensor]:
+    def backward(self, states: Tensor, bar: Tensor, add: Look, *, wanted: frozenset[str]) -> dict[str, Tensor]:
         """Carry the gradient by the last state back to the first, in place.
 
         Args:
             states: All states, from ``forward(keep=True)``.
             bar: Gradient by the last state [B, S, N]; holds the one by the first state afterwards.
             add: Called with each sampled substep and ``bar``, to add the gradient by what was seen there.
-            prony: Whether the gradient by the Maxwell elements is wanted; it costs more than the others.
+            wanted: Names of the inputs whose gradient is wanted; that by the Maxwell elements costs extra.
 
         Returns:
             Gradients by the fields of ``Inputs``, under their names.
@@ -190,7 +199,7 @@ class March:
         if self.steps in self.samples:
             add(self.steps, bar)
         for chunk in reversed(self.chunks):
-            self._retreat(chunk, states, bar, sums, add, prony)
+            self._retreat(chunk, states, bar, sums, add, "prony" in wanted)
         by_time = ("pressure", "gravity", "force")
         return {name: s if name == "coefficients" else s.sum(1 if name in by_time else 0) for name, s in sums.items()}
 
@@ -206,7 +215,8 @@ class March:
         slots = steps if keep else 1
         node = state.new_empty(slots * self.batch * nx * ny * nz * layout.NODE)
         flip = node.numel() // layout.NODE * layout.BEFORE if self.scene.blend > 0 else 0
-        return Chunk(first, steps, low.contiguous(), (nx, ny, nz), node, state.new_empty(flip))
+        order = cell_order(x / cell, self.lanes) if self.gpu else low[:0]
+        return Chunk(first, steps, low.contiguous(), (nx, ny, nz), node, state.new_empty(flip), order)
 
     def _zeros(self, name: str, size: int) -> Tensor:
         """A buffer that every chunk leaves all zero, made larger where needed."""
@@ -223,7 +233,8 @@ class March:
         parts = 1 if self.gpu else self.lanes
         flip = self._zeros("before", parts * self.batch * chunk.nodes * layout.BEFORE if s.blend > 0 else 0)
         return [
-            *(self.clock, self.numbers, states, i.coefficients, s.kind, i.prony, i.pressure, i.gravity, i.force),
+            *(self.clock, self.numbers, states, i.coefficients, s.kind, chunk.order),
+            *(i.prony, i.pressure, i.gravity, i.force),
             *(s.share, i.planes, s.plane_kind, i.origin, chunk.low, scratch, chunk.node, flip),
             *(chunk.before, new, self.flags),
         ]
@@ -250,8 +261,7 @@ class March:
             states.shape[0],
             slots,
         )
-        self.clock.fill_(-1)
-        done = -1
+        self.clock[layout.NOW] = done = -1
         wanted = [k - chunk.first for k in self.samples if chunk.first < k <= chunk.first + chunk.steps]
         for stop in sorted({*wanted, chunk.steps}):
             launch(stop - done)
@@ -282,7 +292,7 @@ class March:
             self.rows,
             int(prony),
         )
-        self.clock.fill_(chunk.steps - 1)
+        self.clock[layout.NOW] = chunk.steps - 1
         at = chunk.steps
         # The gradient by a sampled state enters after the pass that leaves the rest of it in ``bar``.
         for stop in sorted({0, *(k - chunk.first for k in self.samples)}, reverse=True):
@@ -333,6 +343,26 @@ class March:
                     batch=b,
                     remedy=remedy,
                 )
+
+
+def cell_order(x: Tensor, length: int) -> Tensor:
+    """Particles in the order of their lowest nodes, so that neighbouring threads add to the same ones.
+
+    Within a cell they go by z, so that this holds for longer while they move along z.
+
+    Args:
+        x: Positions [B, 3, N] in cells.
+        length: At least N.
+
+    Returns:
+        int32 [B, length]; -1 fills up.
+    """
+    place = torch.floor((x - 0.5) * x.new_tensor([1.0, 1.0, 8.0]).unsqueeze(-1)).long()
+    place -= place.amin(-1, keepdim=True)
+    size = place.amax((0, 2)) + 1
+    key = (place[:, 0] * size[1] + place[:, 1]) * size[2] + place[:, 2]
+    order = torch.argsort(key, dim=-1, stable=True).to(torch.int32)
+    return torch.nn.functional.pad(order, (0, length - order.shape[1]), value=-1)
 
 
 def _flat(tensors: list[Tensor]) -> list[Tensor]:

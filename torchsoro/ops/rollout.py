@@ -10,6 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from torchsoro.kernels import layout
 from torchsoro.ops.march import Inputs, March, Scene
+from torchsoro.ops.total import TotalMarch, total_observe
 
 _INPUTS = tuple(f.name for f in fields(Inputs))
 _OBSERVED = 6
@@ -36,7 +37,7 @@ def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tenso
     """What is recorded of a state; plain torch operations, so that torch differentiates it.
 
     Args:
-        state: [B, S, N].
+        state: [B, S, N], or [B, L] of the total-Lagrangian form.
         weight: Particle weights of the centre of gravity [B, N].
         coefficients: [B, COEFFICIENTS, N].
         pressure: Supply pressure of each chamber now [B, chambers] in Pa.
@@ -46,6 +47,8 @@ def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tenso
         Positions and velocities of the probes [B, P, 3] (m, m/s), position and velocity of the centre of gravity
         [B, 3], volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa.
     """
+    if scene.lattice is not None:
+        return total_observe(state, weight, coefficients, pressure, scene)
     x, v = state[:, : layout.VELOCITY], state[:, layout.VELOCITY : layout.AFFINE]
     share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
@@ -66,12 +69,17 @@ def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tenso
     )
 
 
+def _march(scene: Scene, inputs: Inputs, first: int, samples: tuple[int, ...]) -> March | TotalMarch:
+    kind = March if scene.lattice is None else TotalMarch
+    return kind(scene, inputs, first=first, samples=samples)
+
+
 class _Rollout(torch.autograd.Function):
     @staticmethod
     def forward(ctx, scene: Scene, first: int, samples: tuple[int, ...], keep: bool, state, weight, *inputs):
         named = Inputs(**dict(zip(_INPUTS, inputs, strict=True)))
         seen: list[tuple[Tensor, ...]] = []
-        march = March(scene, named, first=first, samples=samples)
+        march = _march(scene, named, first, samples)
         states = march.forward(
             state,
             keep=keep,
@@ -94,7 +102,7 @@ class _Rollout(torch.autograd.Function):
         named = Inputs(**dict(zip(_INPUTS, inputs, strict=True)))
         march, states = ctx.march, ctx.states
         if march is None:
-            march = March(ctx.scene, named, first=ctx.first, samples=())
+            march = _march(ctx.scene, named, ctx.first, ())
             states = march.forward(state, keep=True, look=lambda k, s: None)
             march.samples = ctx.samples
         bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
@@ -121,7 +129,8 @@ class _Rollout(torch.autograd.Function):
                     if part is not None:
                         total += part
 
-        sums = march.backward(states, bar, add, prony=ctx.needs_input_grad[6 + _INPUTS.index("prony")])
+        wanted = frozenset(n for n, needed in zip(_INPUTS, ctx.needs_input_grad[6:], strict=True) if needed)
+        sums = march.backward(states, bar, add, wanted=wanted)
         ctx.march, ctx.states = None, None
         sums["coefficients"] += coefficients_bar
         sums["pressure"] += pressure_bar
@@ -143,7 +152,8 @@ def rollout(
     Args:
         scene: What stays the same: grid, particle kinds, planes, probes.
         inputs: Coefficients and what acts over time.
-        state: [B, S, N], see :func:`initial_state`.
+        state: [B, S, N], see :func:`initial_state`; or [B, L], see ``total.total_state``, if the scene has a lattice,
+            whose points then stand for the particles everywhere.
         weight: Particle weights of the centre of gravity [B, N].
         first: Number of the segment's first substep in the whole run, for messages.
         samples: Substeps to observe, increasing, from 0 (before the first) to T.
@@ -160,8 +170,12 @@ def rollout(
     batch, _, count = inputs.coefficients.shape
     elements, steps = inputs.prony.shape[1], inputs.gravity.shape[0]
     chambers, groups, planes = inputs.pressure.shape[-1], scene.share.shape[0], scene.plane_kind.shape[0]
+    lattice = scene.lattice
+    whole = (batch, layout.state_components(elements), count)
+    if lattice is not None:
+        whole = (batch, layout.lattice_components(lattice.nodes, count, elements))
     shapes = {
-        "state": (state, (batch, layout.state_components(elements), count)),
+        "state": (state, whole),
         "weight": (weight, (batch, count)),
         "coefficients": (inputs.coefficients, (batch, layout.COEFFICIENTS, count)),
         "prony": (inputs.prony, (batch, elements, layout.PRONY)),
