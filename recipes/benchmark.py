@@ -18,6 +18,16 @@ the next: a state of a few tens of megabytes may stay in that of a large GPU, an
 
 What each optimisation bought
 -----------------------------
+64,000 particles, three elements, one H200, in microseconds per forward step; the first line of each is where it began.
+
+- Updated: 147 with one particle per thread and scalar atomics. Threads sorted by cell that sum among their warp before
+  they add, loop bounds known at the launch (three tasks a step instead of five) and blocks of 256 threads: 75.
+- Total: 68 with forces summed along z and then over 36 lines for each node. Summing axis by axis, and all loop bounds
+  found once a launch: 58 a call. Sums over a chamber in three levels, all its small buffers in six arguments (an
+  argument costs a microsecond a launch): 40 in long runs. Four blocks a multiprocessor instead of thousands, most of
+  them empty: 30.
+- A kernel's compiled form looked up once instead of for every segment (4 ms), and the longest segments that fit into
+  memory instead of sqrt(steps): forward and backward of 5,000 steps from 264 to 114 a step.
 """
 
 from __future__ import annotations

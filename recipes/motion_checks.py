@@ -13,6 +13,7 @@ from torchsoro import Body, Prony, SimulationDiverged, Simulator, Solid, ground
 from torchsoro.kernels import layout
 from torchsoro.material import courant
 from torchsoro.ops.lattice import Lattice
+from torchsoro.ops.total import total_state
 
 PAPER_CELL, PAPER_STEP = 1.75e-3, 1e-5
 
@@ -85,9 +86,9 @@ def ramp(
                 start=None if form == "total" else moving(body, rate, elements),
             )
         if form == "total":
-            S = -float(rate[0, 1]) * steps * dt  # of I - tr(C) / 3 C^-1, to second order
+            sheared = float(rate[0, 1]) * steps * dt
             kept = seen.final[0, -6 * elements * len(arm) :].reshape(elements, 6, -1)[:, 3]
-            history = -(kept - prony.discrete(dt)[:, 1:2] * S)
+            history = kept + prony.discrete(dt)[:, 1:2] * sheared * (1 + sheared**2 / 3)
         else:
             history = seen.final[0, layout.HISTORY :].reshape(elements, 6, -1)[:, 3]
         for tau, found in zip(prony.times.tolist(), history, strict=True):
@@ -170,25 +171,23 @@ def fall(steps: int = 2000, dt: float = 2e-5, forms: Sequence[str] = FORMS) -> l
     throw, pull = torch.tensor([[0.1, 0.0, 0.3], [0.0, 0.0, -9.81]], dtype=EXACT)
     for form in forms:
         body = block((8, 8, 8), PAPER_CELL, (0, 0, 0), Solid())
-        arm = body.position - body.position.mean(0)
+        lattice = Lattice.around(body.position, PAPER_CELL)
+        if form == "total":
+            velocity = (body.position - body.position.mean(0)) @ spin.T + throw
+            everywhere = torch.ones(len(velocity), dtype=torch.bool)
+            start = total_state(lattice, body.position[None], velocity[None], everywhere, 0)
+        else:
+            start = moving(body, spin)
+            start[0, layout.VELOCITY : layout.AFFINE] += throw.unsqueeze(-1)
         simulator = Simulator(cell=PAPER_CELL, dt=dt, low=(-0.05,) * 3, high=(0.06,) * 3, **arguments(form))
-        start, setting = None, {"gravity": pull, "sample_every": dt}
         with torch.no_grad():
-            if form == "total":
-                body, setting["sample_every"] = (
-                    dataclasses.replace(body, velocity=arm @ spin.T + throw),
-                    steps // 100 * dt,
-                )
-                before = _nodal_angular_momentum(body, simulator(body, duration=dt, gravity=pull).final[0])
-                seen = simulator(body, duration=steps * dt, **setting)
-                after = _nodal_angular_momentum(body, seen.final[0])
-            else:
-                start = moving(body, spin)
-                start[0, layout.VELOCITY : layout.AFFINE] += throw.unsqueeze(-1)
-                seen = simulator(body, duration=steps * dt, gravity=pull, start=start)
-                before, after = _angular_momentum(start[0]), _angular_momentum(seen.final[0])
+            seen = simulator(body, duration=steps * dt, gravity=pull, start=start)
         t, way = seen.time.unsqueeze(-1), seen.center_of_gravity - seen.center_of_gravity[0]
         path = throw * t + pull * t * (t + dt) / 2  # the parabola of the semi-implicit step
+        if form == "total":
+            before, after = (_nodal_angular_momentum(lattice, body.mass, state) for state in (start, seen.final))
+        else:
+            before, after = (_angular_momentum(state[0]) for state in (start, seen.final))
         rows.append(
             {
                 "form": form,
@@ -198,3 +197,18 @@ def fall(steps: int = 2000, dt: float = 2e-5, forms: Sequence[str] = FORMS) -> l
             }
         )
     return rows
+
+
+def _angular_momentum(state: torch.Tensor) -> torch.Tensor:
+    """About the mean position, for particles of mass 1: of their motion, and of their own spin (dx^2 / 4 skew C)."""
+    x, v = state[layout.POSITION : layout.VELOCITY].T, state[layout.VELOCITY : layout.AFFINE].T
+    C = state[layout.AFFINE : layout.DEFORMATION].reshape(3, 3, -1)
+    own = torch.stack([C[2, 1] - C[1, 2], C[0, 2] - C[2, 0], C[1, 0] - C[0, 1]], -1) * PAPER_CELL**2 / 4
+    return (torch.linalg.cross(x - x.mean(0), v - v.mean(0)) + own).sum(0)
+
+
+def _nodal_angular_momentum(lattice: Lattice, mass: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
+    """About the centre of gravity, of the nodes of the total form."""
+    moved, v = state[0, : 6 * lattice.nodes].view(2, 3, -1).transpose(1, 2)
+    x, m = lattice.node_places + moved, lattice.to_nodes(mass).unsqueeze(-1)
+    return torch.linalg.cross(x - (m * x).sum(0) / m.sum(), m * v).sum(0)

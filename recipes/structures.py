@@ -47,22 +47,33 @@ HELD_LENGTH = 0.5 / math.sqrt(3.0)
 
 
 def cantilever(
-    cells: int, *, length: float, width: float, solid: Solid, dt: float, form: str, gravity: float, duration: float
+    cells: int,
+    *,
+    length: float,
+    width: float,
+    solid: Solid,
+    dt: float,
+    form: str,
+    gravity: float,
+    duration: float,
+    shift: float = 0.0,
 ) -> Row:
     """Clamp a square bar at x = 0, let it go under gravity, and fit a damped oscillation to the tip.
 
     The bar goes on for two cells behind the clamp, where planes with unlimited adhesion hold every node. Nodes of the
     total formulation lie half a cell beside the clamp's face, and the first in front of it is held, too. So that bar
-    acts as one that is ``HELD_LENGTH`` cells shorter, and is to be compared with a beam of its free length.
+    acts as one that is ``HELD_LENGTH`` cells shorter, and is to be compared with a beam of its free length. ``shift``
+    moves the bar across the updated formulation's grid, along y and z, in cells.
     """
     begin = time.perf_counter()
     cell = width / cells
     counts = (round(2 * length / cell) + 4, 2 * cells, 2 * cells)
-    body = block(counts, cell, (-2 * cell, 0, 0), solid)
-    far = 1.5 * length
+    body = block(counts, cell, (-2 * cell, shift * cell, shift * cell), solid)
+    far = math.ceil(1.5 * length / cell) * cell
     simulator = Simulator(cell=cell, dt=dt, low=(-far,) * 3, high=(far,) * 3, **arguments(form))
     front, lost = (0.51 * cell, HELD_LENGTH * cell) if form == "total" else (0.0, 0.0)
-    tip = ((body.position - torch.tensor([length, width / 2, width / 2])) ** 2).sum(-1).argmin().reshape(1)
+    middle = width / 2 + shift * cell
+    tip = ((body.position - torch.tensor([length, middle, middle])) ** 2).sum(-1).argmin().reshape(1)
     steps = round(duration / dt)
     with torch.no_grad():
         seen = simulator(
@@ -142,6 +153,19 @@ def damping(
     """Damping ratio of a purely elastic bar, 100 x 30 x 30 mm, let go under gravity; the true one is zero."""
     setting: Row = {"length": 0.1, "width": 0.03, "solid": SILICONE, "gravity": 9.81, "duration": duration}
     return [cantilever(cells, dt=dt, form=form, **setting) for form in forms for cells, dt in cases]
+
+
+def shifted(
+    shifts: Sequence[float] = (0.0, 0.25, 0.5), forms: Sequence[str] = FORMS, duration: float = 1.2
+) -> list[Row]:
+    """The bar of :func:`damping`, coarse, moved across the grid by parts of a cell; the total form's moves with it."""
+    setting: Row = {"length": 0.1, "width": 0.03, "solid": SILICONE, "gravity": 9.81, "duration": duration}
+    rows = []
+    for form, shift in itertools.product(forms, shifts):
+        found = cantilever(3, dt=131e-6, form=form, shift=shift, **setting)
+        names = ("f [Hz]", "Timoshenko [Hz]", "damping", "sag [mm]", "seconds")
+        rows.append({"form": form, "shift [cells]": shift, **{name: found[name] for name in names}})
+    return rows
 
 
 def bar(

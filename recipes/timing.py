@@ -23,6 +23,7 @@ from torchsoro import (
     Body,
     Chamber,
     Domain,
+    Gas,
     Prony,
     SimulationDiverged,
     Simulator,
@@ -96,7 +97,8 @@ class Case:
 
     def body(self, gamma: Tensor) -> Body:
         """The lattice filled with material."""
-        return fill(self.domain, gamma, solid=Solid(), filler=FILLER)
+        gas = Gas(density=3.0 if self.formulation == "total" else 100.0)
+        return fill(self.domain, gamma, solid=Solid(), gas=gas, filler=FILLER)
 
     @cached_property
     def substep(self) -> float:
@@ -172,7 +174,8 @@ class Case:
 
     def recomputed(self) -> Case:
         """The same in two segments or more, whose states backward computes again, as in long runs."""
-        return dataclasses.replace(self, segment=max(1, min(self.steps // 2, self.kept().steps)))
+        kept = self.kept()
+        return dataclasses.replace(self, segment=max(1, min(self.steps // 2, kept.steps)), budget=kept.budget)
 
 
 class Watch:

@@ -59,7 +59,8 @@ class Gas:
         stiffness: k [Pa]; 0 for a regulated supply, 0.14 MPa for sealed air.
         viscosity: Shear viscosity mu_v [Pa s].
         volume_viscosity: zeta [Pa s].
-        density: [kg/m3]; artificially high, as the stable step falls with its square root.
+        density: [kg/m3]; artificially high, as the updated form's stable step falls with its square root. The
+            total-Lagrangian form stands ``AIR``, which is next to nothing.
         filler: Shear modulus of what keeps a chamber's points apart in the total-Lagrangian form, where the pressure
             is uniform and air has no stiffness of its own against distortion [Pa].
 
@@ -198,7 +199,10 @@ def simp(gamma: Tensor, *, epsilon: float = 1e-5, power: float = 3.0) -> Tensor:
     return (1 - epsilon) * gamma**power + epsilon
 
 
-VOID_DRAG = 1e3  # drag over mass of void [1/s]
+VOID_DRAG = 1e3  # drag over mass of void, and of the air in a chamber [1/s]
+# Density of air in the total-Lagrangian form [kg/m3]: of next to no weight, yet the filler's waves are slower than the
+# solid's.
+AIR = 3.0
 
 
 def fill(
@@ -222,8 +226,9 @@ def fill(
         power: See :func:`simp`.
         filler: Densities between which the stress goes over, smoothly, from the law of void to that of the solid. In a
             finite-strain law void of next to no stiffness is crushed and turned inside out; the law of void stands
-            that. Void is slowed down, too, at ``VOID_DRAG``, lest its light outer ends crack like whips. None for the
-            solid's law everywhere.
+            that. Void and chambers are slowed down, too, at ``VOID_DRAG`` times the mass of void or of air of at most
+            ``AIR``, lest light outer ends crack like whips and the filler of a chamber flutter. None for the solid's
+            law everywhere.
 
     Returns:
         A body on gamma's device and in its precision.
@@ -254,7 +259,7 @@ def fill(
         viscosity=torch.where(air, torch.tensor(gas.viscosity, **like), zero),
         volume_viscosity=torch.where(air, torch.tensor(gas.volume_viscosity, **like), zero),
         filler=void,
-        drag=None if void is None else VOID_DRAG * mass * void,
+        drag=None if void is None else VOID_DRAG * torch.where(air, domain.volume * min(gas.density, AIR), mass * void),
     )
 
 

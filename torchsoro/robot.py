@@ -13,7 +13,7 @@ from torchsoro.contact import Plane, ground
 from torchsoro.domain import Chamber, Domain
 from torchsoro.errors import SimulationDiverged
 from torchsoro.field import DesignField
-from torchsoro.material import Body, Gas, Prony, Solid, fill
+from torchsoro.material import AIR, Body, Gas, Prony, Solid, fill
 from torchsoro.objective import center_of_gravity, intermediate_density, total_mass, travel
 from torchsoro.settings import Settings
 from torchsoro.simulator import Simulator, Trajectory
@@ -76,7 +76,10 @@ class Robot(nn.Module):
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
-        self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=s.air_density)
+        air = s.air_density
+        if air == "auto":
+            air = AIR if s.formulation == "total" else Gas().density
+        self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=air)
         self.prony = Prony.paper(s.elements)
         self.pressure = _pressure(s)
         angle = math.atan(s.slope)

@@ -60,8 +60,8 @@ class Settings:
     """Air spring of the chamber [Pa]; 0 for a regulated supply."""
     air_viscosity: float = 1.83e-5
     """Shear viscosity of the air [Pa s]."""
-    air_density: float = 100.0
-    """Density of the air, artificially high [kg/m3]."""
+    air_density: float | Literal["auto"] = "auto"
+    """Density of the air [kg/m3]; auto: 3, but in the updated formulation the paper's 100, artificially high."""
 
     pressure: float = 80e3
     """Supply pressure while the valve is open [Pa]."""

@@ -112,15 +112,15 @@ def _tables(scene: Scene) -> Arena:
 
 def _integers(scene: Scene) -> list[Tensor]:
     assert scene.lattice is not None
-    kind, (nx, ny, nz), (mx, my, mz) = scene.kind.cpu(), scene.lattice.points, scene.lattice.shape
-    x, y, z = torch.meshgrid(*(torch.arange(n) for n in (nx, ny, nz)), indexing="ij")
+    kind, (nx, ny, nz), (mx, my, mz) = scene.kind, scene.lattice.points, scene.lattice.shape
+    x, y, z = torch.meshgrid(*(torch.arange(n, device=kind.device) for n in (nx, ny, nz)), indexing="ij")
     corner = (((x // 2 * my + y // 2) * mz + z // 2) * 8 + 4 * (x % 2) + 2 * (y % 2) + z % 2).reshape(-1)
     gas = [(kind == c).nonzero().squeeze(1) for c in range(int(kind.max()) + 1)]
     members = torch.cat([kind.new_zeros(0).long(), *gas])
-    rank = torch.zeros_like(kind).index_copy(0, members, torch.arange(len(members)).to(kind))
+    rank = torch.zeros_like(kind).index_copy(0, members, torch.arange(len(members), device=kind.device).to(kind))
     filled = torch.tensor([0, *(len(g) for g in gas)]).cumsum(0)
     # Lines, sheets and nodes that have points of a chamber beside them.
-    wx, wy, wz = (spline(n, QUADRATURE)[0] for n in scene.lattice.points)
+    wx, wy, wz = (spline(n, QUADRATURE)[0].to(kind.device) for n in scene.lattice.points)
     near = [[kind.new_zeros(0, n)] for n in (nx * ny * mz, nx * my * mz, mx * my * mz)]
     for c in range(len(gas)):
         line = (kind == c).double().view(nx, ny, nz) @ wz
@@ -128,8 +128,7 @@ def _integers(scene: Scene) -> list[Tensor]:
         node = torch.einsum("xjk,xi->ijk", sheet, wx)
         for rows, row in zip(near, (line, sheet, node), strict=True):
             rows.append((row.reshape(1, -1) > 0).to(kind))
-    found = [kind, scene.plane_kind.cpu(), corner.to(kind), rank, filled.to(kind), *map(torch.cat, near)]
-    return [t.to(scene.kind.device) for t in found]
+    return [kind, scene.plane_kind, corner.to(kind), rank, filled.to(kind), *map(torch.cat, near)]
 
 
 def _stencil(scene: Scene, name: str, points: Callable[[], Tensor], place: float, like: Tensor) -> tuple[Tensor, ...]:

@@ -1,0 +1,128 @@
+"""The gradient of a walker's travel against central differences, along smooth random directions.
+
+    python recipes/gradient.py                       # coarse, on a laptop
+    python recipes/gradient.py --preset paper        # 64,000 particles
+
+From rest on the ground the body is inflated for a while. A central difference is only as good as the motion is smooth
+over the perturbation: where a node touches down a substep earlier it has a jump, and small perturbations drown in
+float32's rounding. So the table gives a range of sizes. "spread" is how far L strays from a straight line through the
+two ends and the middle, over the difference of the ends: large where the motion is not smooth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from torch import Tensor
+from walker import DESK, PAPER
+
+from torchsoro.robot import Robot, walker
+from torchsoro.settings import Settings
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """Compare the gradient of a walker's travel with central differences along smooth random directions."""
+
+    preset: Literal["desk", "paper"] = "desk"
+    """Size of the walker."""
+    formulation: Literal["total", "updated"] = "total"
+    """Of the simulator."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where; auto takes CUDA if there is one."""
+    settle: float = 0.05
+    """Time at rest [s]."""
+    duration: float = 0.05
+    """Time of actuation [s]."""
+    after: int = 0
+    """Design iterations before, on travel alone."""
+    directions: int = 3
+    """How many."""
+    sizes: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003, 0.001)
+    """Largest changes of the design field."""
+
+
+def smooth(robot: Robot, seed: int) -> Tensor:
+    """A random direction of the design field with a wave length of the body's, at most 1."""
+    g = torch.Generator().manual_seed(seed)
+    x = robot.domain.positions / robot.domain.size[0]
+    waves = [
+        math.sin(phase) + torch.sin(2 * math.pi * (x @ k) + phase)
+        for k, phase in (
+            (torch.randn(3, generator=g, dtype=torch.float64), float(6.28 * torch.rand(1, generator=g)))
+            for _ in range(4)
+        )
+    ]
+    direction = torch.stack(waves).sum(0)
+    phi = robot.field.phi
+    return robot.domain.lattice(direction / direction.abs().max()).to(phi)
+
+
+def rows(settings: Settings, options: Options) -> list[dict[str, Any]]:
+    """The table."""
+    robot = walker(settings)
+    phi = robot.field.phi
+    with torch.no_grad():
+        phi.copy_(0.5 * smooth(robot, 100) + 0.2)
+    adam = torch.optim.Adam([phi], lr=settings.learning_rate)
+    for _ in range(options.after):
+        adam.zero_grad()
+        (-robot(robot.field()).travel / robot.domain.cell).backward()
+        adam.step()
+        robot.field.clamp_()
+    phi.grad = None
+    start = phi.detach().clone()
+
+    def travel(step: Tensor) -> float:
+        with torch.no_grad():
+            phi.copy_(start + step)
+            return float(robot(robot.field()).travel)
+
+    robot(robot.field()).travel.backward()
+    assert phi.grad is not None
+    gradient, middle = phi.grad.clone(), travel(torch.zeros_like(start))
+    table = []
+    for seed in range(options.directions):
+        direction = smooth(robot, seed)
+        exact = float((gradient * direction).sum())
+        for size in options.sizes:
+            up, down = travel(size * direction), travel(-size * direction)
+            found = (up - down) / (2 * size)
+            table.append(
+                {
+                    "direction": seed,
+                    "size": size,
+                    "central difference [mm]": 1e3 * found,
+                    "gradient [mm]": 1e3 * exact,
+                    "error [%]": 100 * (exact / found - 1),
+                    "spread": abs(up + down - 2 * middle) / abs(up - down),
+                }
+            )
+    return table
+
+
+def main(options: Options) -> list[dict[str, Any]]:
+    """Print the table; returns it."""
+    preset = {"desk": DESK, "paper": PAPER}[options.preset]
+    settings = dataclasses.replace(
+        preset,
+        out=Path("runs/gradient"),
+        device=options.device,
+        formulation=options.formulation,
+        settle=options.settle,
+        duration=options.duration,
+    )
+    table = rows(settings, options)
+    print("  ".join(table[0]))
+    for row in table:
+        print("  ".join(f"{value:{len(name)}.4g}" for name, value in row.items()), flush=True)
+    return table
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
