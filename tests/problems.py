@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -15,6 +16,7 @@ from torchsoro.ops.rollout import initial_state, rollout
 
 H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
 DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s
+WAYS = {"apic": {"transfer": "apic"}, "flip": {"transfer": "flip"}, "total": {"formulation": "total"}}
 TENSORS = ("coefficients", "prony", "pressure", "gravity", "force", "planes", "origin", "state", "weight")
 
 
@@ -42,6 +44,11 @@ def block(
 def simulator(*, dt: float = DT, reach: float = 0.1, **settings) -> Simulator:
     """A simulator for :func:`block`, whose box reaches so far (m) on every side."""
     return Simulator(**{"cell": 2 * H, "dt": dt, "low": (-reach,) * 3, "high": (reach,) * 3, **settings})
+
+
+def ways(*names: str):
+    """Parametrise a test by ``way``: what :func:`simulator` takes for each of these names."""
+    return pytest.mark.parametrize("way", [WAYS[name] for name in names], ids=names)
 
 
 def vector(*values: float) -> Tensor:

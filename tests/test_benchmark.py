@@ -65,7 +65,7 @@ def test_states_are_kept_for_as_many_steps_as_taichi_can_index(timing):
     case = timing.Case(count=216_000, formulation="updated", device=CPU, steps=500)
     kept = case.kept()
     assert kept.steps * 42 * 216_000 < 2**31 and kept.steps * 4 * 42 * 216_000 < kept.budget
-    assert case.recomputed().segment == 22
+    assert case.recomputed().segment == min(250, kept.steps)
 
 
 def test_floor_of_the_papers_walker_is_its_state_there_and_back(timing):
@@ -127,7 +127,8 @@ def test_naive_step_is_the_simulators(recipes):
         sample_every=steps * dt,
     )
     assert float((seen.position[-1] - seen.position[0]).abs().max()) > 1e-5
-    torch.testing.assert_close(naive.position, seen.position[-1], rtol=0, atol=2e-8)
+    # The two add up a stress in another order; 4e-8 is ten units in the last place of a place of 35 mm.
+    torch.testing.assert_close(naive.position, seen.position[-1], rtol=0, atol=4e-8)
     torch.testing.assert_close(naive.velocity, seen.velocity[-1], rtol=0, atol=2e-5)
 
 

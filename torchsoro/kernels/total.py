@@ -251,6 +251,6 @@ def total_substep(
                         store_vector(kept, ints[PUSHED] + (slot + b) * 3 * nodes + i, nodes, v)
                         after, onto = meet(ints, fixed, state, at - i, b, i, n, ints[PLANES], mass, v)
                         v = after
-                        d += dt * onto
-                    store_vector(state, out, nodes, d + dt * v)
+                        d += dt * (onto + v)
+                    store_vector(state, out, nodes, d)
                     store_vector(state, out + 3 * nodes, nodes, v)
