@@ -129,7 +129,8 @@ def test_naive_step_is_the_simulators(recipes):
     assert float((seen.position[-1] - seen.position[0]).abs().max()) > 1e-5
     # The two add up a stress in another order; 4e-8 is ten units in the last place of a place of 35 mm.
     torch.testing.assert_close(naive.position, seen.position[-1], rtol=0, atol=4e-8)
-    torch.testing.assert_close(naive.velocity, seen.velocity[-1], rtol=0, atol=2e-5)
+    # Random velocities of 0.1 m/s: a thousandth, as rounding decides whether a node that hardly moves is held.
+    torch.testing.assert_close(naive.velocity, seen.velocity[-1], rtol=0, atol=1e-4)
 
 
 # The sections -----------------------------------------------------------------------------------------------------
