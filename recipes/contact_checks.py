@@ -39,7 +39,8 @@ def restitution(
         body = block((2 * size,) * 3, PAPER_CELL, (0, 0, PAPER_CELL / 2), Solid())
         down = torch.tensor([0.0, 0.0, -speed], dtype=EXACT).expand_as(body.position)
         room = 4 * size * PAPER_CELL
-        simulator = Simulator(cell=PAPER_CELL, dt=PAPER_STEP, low=(-room,) * 3, high=(2 * room,) * 3, **arguments(form))
+        dt = "auto" if form == "total" else PAPER_STEP
+        simulator = Simulator(cell=PAPER_CELL, dt=dt, low=(-room,) * 3, high=(2 * room,) * 3, **arguments(form))
         with torch.no_grad():
             seen = simulator(
                 dataclasses.replace(body, velocity=down),

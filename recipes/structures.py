@@ -73,7 +73,8 @@ def cantilever(
     simulator = Simulator(cell=cell, dt=dt, low=(-far,) * 3, high=(far,) * 3, **arguments(form))
     front, lost = (0.51 * cell, HELD_LENGTH * cell) if form == "total" else (0.0, 0.0)
     middle = width / 2 + shift * cell
-    tip = ((body.position - torch.tensor([length, middle, middle])) ** 2).sum(-1).argmin().reshape(1)
+    off = ((body.position - torch.tensor([length, middle, middle])) ** 2).sum(-1)
+    tip = off.round(decimals=9).argmin().reshape(1)  # of several that are as near, always the same
     steps = round(duration / dt)
     with torch.no_grad():
         seen = simulator(
@@ -148,7 +149,7 @@ def timoshenko(length: float, width: float, solid: Solid) -> float:
 def damping(
     cases: Sequence[tuple[int, float]] = ((3, 131e-6), (3, 22e-6), (6, 65e-6), (6, 22e-6)),
     forms: Sequence[str] = FORMS,
-    duration: float = 1.2,
+    duration: float = 0.5,
 ) -> list[Row]:
     """Damping ratio of a purely elastic bar, 100 x 30 x 30 mm, let go under gravity; the true one is zero."""
     setting: Row = {"length": 0.1, "width": 0.03, "solid": SILICONE, "gravity": 9.81, "duration": duration}
@@ -156,7 +157,7 @@ def damping(
 
 
 def shifted(
-    shifts: Sequence[float] = (0.0, 0.25, 0.5), forms: Sequence[str] = FORMS, duration: float = 1.2
+    shifts: Sequence[float] = (0.0, 0.25, 0.5), forms: Sequence[str] = FORMS, duration: float = 0.5
 ) -> list[Row]:
     """The bar of :func:`damping`, coarse, moved across the grid by parts of a cell; the total form's moves with it."""
     setting: Row = {"length": 0.1, "width": 0.03, "solid": SILICONE, "gravity": 9.81, "duration": duration}

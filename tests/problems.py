@@ -69,7 +69,12 @@ def falling(x: Tensor, v: Tensor, g: Tensor, *, dt: float, steps: Tensor) -> tup
 
 
 def momenta(body: Body, state: Tensor, cell: float) -> tuple[Tensor, Tensor]:
-    """Linear and angular momentum of a state [1, S, N], with the part that APIC carries in C."""
+    """Linear and angular momentum of a final state of one simulation: of particles with what C carries, or of nodes."""
+    if state.ndim == 2:
+        lattice = Lattice.around(body.position, cell)
+        d, v = state[0, : 6 * lattice.nodes].view(2, 3, -1).transpose(1, 2)
+        m = lattice.to_nodes(lattice.spread(body.mass)).unsqueeze(-1)
+        return (m * v).sum(0), (m * torch.linalg.cross(lattice.node_places + d, v)).sum(0)
     s = state[0]
     x, v = s[:3].T, s[3:6].T
     C = s[layout.AFFINE : layout.DEFORMATION].reshape(3, 3, -1).permute(2, 0, 1)

@@ -53,7 +53,8 @@ def total_observe(
     places = lattice.places.to(state)
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     share = weight / weight.sum(-1, keepdim=True)
-    nodal = lattice.to_nodes(share, "mark").unsqueeze(1)
+    # With the weights of the nodes' masses, so that momentum is what forces gave it.
+    nodal = lattice.to_nodes(share).unsqueeze(1)
     volumes, means = [state.new_zeros(batch, 0)], [state.new_zeros(batch, 0)]
     for c in range(pressure.shape[1]):
         gas = (scene.kind == c).nonzero().squeeze(1)
