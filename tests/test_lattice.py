@@ -35,8 +35,9 @@ def affine(where, seed, scale=1.0):
 
 def quadrature(lat):
     """Places of the points of quadrature [points, 3]: from those of the particles to the cell's two Gauss points."""
-    cell = torch.tensor(lat.low) + lat.cell * (((lat.places - torch.tensor(lat.low)) / lat.cell).floor() + 0.5)
-    return cell + (lat.places - cell) * QUADRATURE / PARTICLES
+    low = torch.tensor(lat.low, dtype=torch.float64)
+    center = low + lat.cell * (((lat.places - low) / lat.cell).floor() + 0.5)
+    return center + (lat.places - center) * QUADRATURE / PARTICLES
 
 
 # ------------------------------------------------------------------------------------------------------------- weights
@@ -142,7 +143,7 @@ def test_an_affine_field_known_at_the_particles_is_found_at_the_nodes(points, se
     )
 
 
-# -------------------------------------------------------------------------------------------------- a lattice for a body
+# --------------------------------------------------------------------------------------------- a lattice for a body
 
 
 @given(points=SHAPES, seed=st.integers(0, 999), cell=st.floats(1e-4, 10.0))
@@ -259,7 +260,7 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
     laid = {
         (ints, layout.KIND): p.scene.kind,
         (ints, layout.PLANE_KIND): p.scene.plane_kind,
-        (march.fixed.buffer, layout.NUMBERS): torch.tensor(numbers(lat, p.scene.dt)).double(),
+        (march.fixed.buffer, layout.NUMBERS): torch.tensor(numbers(lat, p.scene.dt), dtype=torch.float64),
         (march.fixed.buffer, layout.COEFFICIENT): t["coefficients"],
         (march.fixed.buffer, layout.ELEMENT): t["prony"],
         (march.fixed.buffer, layout.PLANE_NUMBERS): t["planes"],

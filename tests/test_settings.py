@@ -46,6 +46,7 @@ def test_every_setting_can_be_overridden():
         "duration": ("0.25",),
         "c_max": ("0.125",),
         "filler": ("0.125", "0.25"),
+        "air_density": ("2.5",),
     }
     hints = typing.get_type_hints(Settings)
     for field in dataclasses.fields(Settings):
