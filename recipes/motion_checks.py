@@ -99,7 +99,11 @@ def ramp(
 
 
 def grows(count: int, dt: float, *, form: str, solid: Solid, speed: float = 0.0, steps: int = 2000) -> bool:
-    """Whether the noise (1 mm/s) of a cube of 5 cells grows, or its impact on the ground ends the run."""
+    """Whether the noise (1 mm/s) of a cube of 5 cells grows tenfold in energy, or its impact on the ground ends the run.
+
+    Without losses, some of the noise that only the lattice's nodes see becomes visible in the particles; so not any
+    growth is one of instability.
+    """
     corner = (0.0, 0.0, 0.5 * PAPER_CELL) if speed else tuple(c * PAPER_CELL for c in (0.11, 0.27, 0.41))
     body = block((10, 10, 10), PAPER_CELL, corner, solid)
     velocity = 1e-3 * torch.randn(body.position.shape, generator=torch.Generator().manual_seed(0), dtype=EXACT)
@@ -119,7 +123,7 @@ def grows(count: int, dt: float, *, form: str, solid: Solid, speed: float = 0.0,
             )
     except SimulationDiverged:
         return True
-    return not bool((seen.velocity[-1] ** 2).sum() < (seen.velocity[0] ** 2).sum())
+    return not bool((seen.velocity[-1] ** 2).sum() < 10 * (seen.velocity[0] ** 2).sum())
 
 
 def stability(

@@ -202,6 +202,7 @@ def doubled(x):
         (doubled, r"two particles share a lattice place, wanted one particle for each"),
         (lambda x: torch.stack([x, 1.01 * x]), r"simulations of a batch whose bodies differ by more than a shift"),
     ],
+    ids=["off", "turned", "stretched", "doubled", "batch"],
 )
 def test_a_body_that_fits_no_lattice_is_refused(place, message):
     body = moved(position=place)
