@@ -99,7 +99,7 @@ def ramp(
 
 
 def grows(count: int, dt: float, *, form: str, solid: Solid, speed: float = 0.0, steps: int = 2000) -> bool:
-    """Whether the noise (1 mm/s) of a cube of 5 cells grows tenfold in energy, or its impact on the ground ends the run.
+    """Whether the noise (1 mm/s) of a cube of 5 cells grows tenfold in energy, or its impact ends the run.
 
     Without losses, some of the noise that only the lattice's nodes see becomes visible in the particles; so not any
     growth is one of instability.
