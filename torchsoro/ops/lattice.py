@@ -41,7 +41,9 @@ def spline(count: int, place: float) -> tuple[Tensor, Tensor, Tensor]:
         for k in range(3):
             weight[2 * cell + odd, cell + k] = numbers[k]
             slope[2 * cell + odd, cell + k] = slopes[k]
-    points = (torch.arange(count) // 2).double() + 0.5 + torch.tensor([-place, place]).double().repeat(cells)
+    points = (
+        (torch.arange(count) // 2).double() + 0.5 + torch.tensor([-place, place], dtype=torch.float64).repeat(cells)
+    )
     nodes = torch.arange(cells + 2).double() - 0.5
     return weight, points[:, None] - nodes[None, :], slope
 
