@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from problems import DT, H, block, constant, momenta, problem, simulator, vector
+from problems import DT, H, block, constant, momenta, simulator, vector
 from torch import Tensor
 
 from torchsoro import Body, Domain, Force, Gas, Plane, Prony, Solid, Spring, fill, ground
@@ -176,7 +176,7 @@ def test_a_block_slides_as_far_as_coulomb_says(mu, speed):
         body, duration=steps * DT, prony=Prony.paper(3), planes=[ground(friction=mu)], sample_every=steps * DT
     )
     slid = run.center_of_gravity[-1, 0] - run.center_of_gravity[0, 0]
-    assert float(slid) == pytest.approx(speed**2 / (2 * mu * G), rel=0.03)
+    assert float(slid.detach()) == pytest.approx(speed**2 / (2 * mu * G), rel=0.03)
     (by,) = torch.autograd.grad(slid, v)
     assert float(by) == pytest.approx(speed / (mu * G), rel=0.03)
 
@@ -222,16 +222,14 @@ def test_sealed_air_resists_by_its_stiffness():
     found = {}
     for stiffness in (0.0, 1e5, 1e6):
         _, body = block((8, 8, 8), air=True, gas=Gas(stiffness=stiffness))
-        run = total()(
-            viscous(body, 20.0), duration=1600 * DT, gravity=FREE, pressure=constant(500.0), sample_every=100 * DT
-        )
+        body = replace(body, drag=1000 * body.mass)
+        run = total()(body, duration=800 * DT, gravity=FREE, pressure=constant(500.0), sample_every=200 * DT)
         growth = run.chamber_volume[:, 0] / body.volume[body.chamber == 0].sum() - 1
         torch.testing.assert_close(run.chamber_pressure[:, 0], 500 - stiffness * growth, rtol=1e-10, atol=1e-9)
-        assert float(growth[-1]) == pytest.approx(float(growth[-2]), rel=0.05)
         found[stiffness] = float(growth[-1])
     compliance = found[0.0] / 500
     for stiffness in (1e5, 1e6):
-        assert found[stiffness] == pytest.approx(found[0.0] / (1 + stiffness * compliance), rel=0.02)
+        assert found[stiffness] == pytest.approx(found[0.0] / (1 + stiffness * compliance), rel=0.01)
 
 
 def test_a_chamber_presses_evenly_whatever_its_shape_in_the_body():
@@ -310,41 +308,3 @@ def test_bodies_of_a_batch_may_lie_apart():
     # What falls a way first ends elsewhere; along the ground a shift is a shift.
     (by,) = torch.autograd.grad(together.center_of_gravity[:, -1, :2].sum(), shift)
     torch.testing.assert_close(by[:, :2], torch.ones(2, 2).double(), rtol=0, atol=1e-9)
-
-
-def test_nodes_without_mass_have_the_gradient_of_what_they_do():
-    # The problem's lattice has an empty corner, whose outermost node carries nothing: nothing acts on it.
-    p = problem(formulation="total")
-    corner, nodes = 63, 64
-    x = p.tensors["state"].clone().requires_grad_()
-    end = p.run({"state": x})[0]
-    assert torch.equal(end, p.run({"state": x}, keep=False)[0])
-    (by,) = torch.autograd.grad(end[0, corner], x)
-    step = torch.zeros_like(x)
-    for place in (corner, 3 * nodes + corner):
-        step[0, place] = 1.0
-        moved = p.run({"state": (x + step).detach()})[0]
-        assert float((moved - end)[0, corner]) == pytest.approx(float(by[0, : place + 1].sum()))
-        assert not (moved - end)[0, corner + 1 : 3 * nodes : nodes].any()
-
-
-def test_the_gradient_knows_of_what_is_not_there_yet():
-    # Stiffness and viscosity of exactly zero have derivatives all the same.
-    _, body = block()
-    body = replace(body, velocity=body.position @ vector(0.0, 3.0, 1.0).diag())
-
-    def end(stiffness: Tensor, viscosity: Tensor) -> Tensor:
-        held = replace(body, viscosity=viscosity.expand(64))
-        spring = Spring(particles=torch.arange(8), stiffness=stiffness, shift=vector(0.0, 0.0, 1e-3))
-        run = total()(held, duration=50 * DT, gravity=FREE, loads=[spring], probes=torch.tensor([0, 40]))
-        return run.position[-1, :, 2].diff().sum() + run.center_of_gravity[-1, 2]
-
-    zero = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    (by,) = torch.autograd.grad(end(zero[0], zero[1]), zero)
-    for k, e in ((0, 1e-3), (1, 1e-3)):
-        step = torch.zeros(2, dtype=torch.float64)
-        step[k] = e
-        with torch.no_grad():
-            slope = float(end(step[0], step[1]) - end(0 * step[0], 0 * step[1])) / e
-        assert abs(slope) > 0
-        assert float(by[k]) == pytest.approx(slope, rel=1e-2)
