@@ -12,6 +12,9 @@ from torchsoro.kernels.layout import (
     PLANE_STICK,
 )
 
+# Slope below which a point that lands is taken to graze the plane.
+GRAZING = 0.2
+
 
 @ti.func
 def plane_distance(planes: ti.template(), plane_kind: ti.template(), at, k, x, cell):
@@ -127,37 +130,62 @@ def lands(u, n, gap, dt):
 
 
 @ti.func
-def land(u, n, gap, dt, stick, friction, hold):
-    """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
+def time_to_land(u, n, gap, dt):
+    """Share of a step of dt after which a point arrives at the plane, and whether its normal speed alone sets it.
 
-    A point that would end behind the plane ends on it: the second result, the last way over dt along the normal, moves
-    it there, and is gone afterwards as the impact takes the velocity. So the height at which a body comes to rest does
-    not depend on where it fell from, also for the gradient. Once there, this is :func:`touch`. Where a body sticks, its
-    tangential way in that step is lost; to stop it exactly at the time of impact would multiply the gradient by the
-    ratio of tangential and normal speed at every landing. ``hold`` is negative where adhesion does not reach.
+    A point that grazes the plane counts as arriving at a slope of GRAZING at least: its place on the plane, and so
+    the gradient, would otherwise depend without bound on how high it was.
     """
-    r = u
-    way = gap * 0
-    if lands(u, n, gap, dt):
-        r = touch(u, n, stick, friction, gap * 0)
-        way = -ti.max(gap, gap * 0) / dt
-    elif u.dot(n) > 0 and hold >= 0:
-        r = touch(u, n, stick, friction, hold)
-    return r, way
+    tangential = u - u.dot(n) * n
+    falling = -u.dot(n) >= GRAZING * tangential.norm()
+    speed = ti.select(falling, -u.dot(n), GRAZING * tangential.norm())
+    return ti.max(gap, gap * 0) / (speed * dt), falling
 
 
 @ti.func
-def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, way_bar):
+def land(u, n, gap, dt, stick, friction, hold):
+    """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
+
+    A point that would end behind the plane ends on it: the second result, which is gone afterwards as the impact takes
+    the velocity, moves it along its way until it arrives, in place of the velocity after the impact. So where a body
+    comes to rest, along the plane too, is a continuous function of where it came from, and has a gradient. To stop the
+    velocity as well only when it arrives would multiply that gradient at every landing. Once there, this is
+    :func:`touch`. ``hold`` is negative where adhesion does not reach.
+    """
+    r = u
+    onto = u * 0
+    if lands(u, n, gap, dt):
+        r = touch(u, n, stick, friction, gap * 0)
+        share, _ = time_to_land(u, n, gap, dt)
+        lost = u - r
+        onto = share * (lost - lost.dot(n) * n) - ti.max(gap, gap * 0) / dt * n
+    elif u.dot(n) > 0 and hold >= 0:
+        r = touch(u, n, stick, friction, hold)
+    return r, onto
+
+
+@ti.func
+def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, onto_bar):
     """Adjoint of :func:`land`: gradients by u, gap, friction and hold."""
     u_bar = r_bar
     gap_bar = gap * 0
     friction_bar = gap * 0
     hold_bar = gap * 0
     if lands(u, n, gap, dt):
-        by_u, by_friction, _ = touch_adjoint(u, n, stick, friction, gap * 0, r_bar)
-        u_bar, friction_bar = by_u, by_friction
+        share, falling = time_to_land(u, n, gap, dt)
+        lost = u - touch(u, n, stick, friction, gap * 0)
+        along = onto_bar - onto_bar.dot(n) * n
+        by_u, by_friction, _ = touch_adjoint(u, n, stick, friction, gap * 0, r_bar - share * along)
+        u_bar, friction_bar = by_u + share * along, by_friction
         if gap > 0:
-            gap_bar = -way_bar / dt
+            share_bar = lost.dot(along)
+            gap_bar = share_bar * share / gap - onto_bar.dot(n) / dt
+            speed_bar = -share_bar * share * share * dt / gap
+            if falling:
+                u_bar -= speed_bar * n
+            else:
+                tangential = u - u.dot(n) * n
+                u_bar += speed_bar * GRAZING * tangential / tangential.norm()
     elif u.dot(n) > 0 and hold >= 0:
         by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, hold, r_bar)
         u_bar, friction_bar, hold_bar = by_u, by_friction, by_hold

@@ -105,7 +105,7 @@ def meet(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b,
             stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
             left, way = land(r, normal, gap, fixed[STEP_SIZE], stick, friction, hold)
             r = left
-            onto += way * normal
+            onto += way
     return r, onto
 
 
@@ -147,7 +147,7 @@ def meet_adjoint(
             normal = axis_normal(axis, sign, u)
             friction, stick = fixed[plane + PLANE_FRICTION], ints[kind + PLANE_STICK]
             by_u, gap_bar, by_friction, hold_bar = land_adjoint(
-                arriving, normal, gap, dt, stick, friction, hold, u_bar, onto_bar.dot(normal)
+                arriving, normal, gap, dt, stick, friction, hold, u_bar, onto_bar
             )
             u_bar = by_u
             bar = ints[PLANE_BAR] + (b * ints[PLANES] + k) * PLANE * nodes + i
