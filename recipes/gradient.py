@@ -4,8 +4,8 @@
     python recipes/gradient.py --preset paper        # 64,000 particles
 
 From rest on the ground the body is inflated for a while. A central difference is only as good as the motion is smooth
-over the perturbation: where a node touches down a substep earlier it has a jump, and small perturbations drown in
-float32's rounding. So the table gives a range of sizes. "spread" is how far L strays from a straight line through the
+over the perturbation: where a foot that sticks is caught or let go a substep earlier it has a jump, so here feet slide
+(see ``--friction``); and small perturbations drown in float32's rounding. So the table gives a range of sizes. "spread" is how far L strays from a straight line through the
 two ends and the middle, over the difference of the ends: large where the motion is not smooth.
 """
 
@@ -35,6 +35,8 @@ class Options:
     """Of the simulator."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where; auto takes CUDA if there is one."""
+    friction: Literal["stick"] | float = 0.5
+    """Of the ground. Where feet stick, travel has a jump for each that is caught or let go a substep earlier."""
     settle: float = 0.05
     """Time at rest [s]."""
     duration: float = 0.05
@@ -114,6 +116,7 @@ def main(options: Options) -> list[dict[str, Any]]:
         out=Path("runs/gradient"),
         device=options.device,
         formulation=options.formulation,
+        friction=options.friction,
         settle=options.settle,
         duration=options.duration,
     )

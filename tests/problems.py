@@ -205,6 +205,7 @@ def problem(
         share=share.to(dtype),
         plane_kind=torch.tensor([[2, 1, int(stick)], [0, -1, 0], [1, 1, 0]], dtype=torch.int32),
         springs=True,
+        viscous=True,
         probes=torch.tensor([0, 7, int((kind == -1).nonzero()[-1])]),
         lattice=lattice,
     )

@@ -156,6 +156,29 @@ def test_gradients_of_springs_and_drag_against_differences(name, way):
 
 
 @ways("apic", "total")
+@pytest.mark.parametrize("name", ["stiffness", "viscosity"])
+def test_the_gradient_knows_of_what_is_not_there_yet(name, way):
+    # A search for physics left out begins at zero.
+    _, body = block()
+
+    def travelled(x: Tensor) -> Tensor:
+        loads = [Force(particles=torch.arange(8), value=vector(0.0, 0.0, 0.05))]
+        if name == "stiffness":
+            loads.append(Spring(particles=torch.arange(8), stiffness=x, shift=vector(1e-3, 0.0, 2e-3)))
+        thick = replace(body, viscosity=x.expand_as(body.mass)) if name == "viscosity" else body
+        moved = simulator(**way)(thick, duration=20 * DT, gravity=(0.0, 0.0, -1.0), loads=loads, probes=EVERY)
+        return moved.velocity[-1, :8, 2].sum() + moved.position[-1].sum()
+
+    x = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(travelled(x), x)
+    e = torch.tensor(1e-5, dtype=torch.float64)
+    with torch.no_grad():
+        found = (4 * travelled(e) - travelled(2 * e) - 3 * travelled(0 * e)) / (2 * e)
+    assert slope != 0
+    assert float(slope) == pytest.approx(float(found), rel=1e-5)
+
+
+@ways("apic", "total")
 def test_a_tube_pulls_on_a_visco_elastic_body(way):
     # Everything at once, only to see that it runs and that what hangs on the body holds it back.
     _, body = block()

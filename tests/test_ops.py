@@ -98,6 +98,7 @@ def test_gradcheck_of_a_bare_body(form):
     p.scene = replace(
         p.scene,
         springs=False,
+        viscous=False,
         share=p.scene.share[:0],
         plane_kind=p.scene.plane_kind[:0],
         kind=p.scene.kind.clamp(max=-1),

@@ -12,15 +12,19 @@ from torch import Tensor
 class Plane:
     """An axis-aligned plane; the body stays on its free side.
 
-    Contact acts on grid nodes on and behind the plane. The grid is laid so that a layer of nodes lies on the first
-    plane of each axis, wherever that is; a further plane of the same axis should be a whole number of cells away.
+    In the updated formulation contact acts on grid nodes on and behind the plane. The grid is laid so that a layer of
+    nodes lies on the first plane of each axis, wherever that is; a further plane of the same axis should be a whole
+    number of cells away. In the total one it acts on the surface of the body, at any distance of planes.
 
     Attributes:
         axis: 0, 1 or 2: the plane's normal is x, y or z.
-        offset: Where it cuts the axis [m], a number or a tensor [...]; its gradient is that of shifting the grid.
+        offset: Where it cuts the axis [m], a number or a tensor [...]; in the updated formulation its gradient
+            is that of shifting the grid.
         side: +1 if the body lies on the positive side, else -1.
-        friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
-        adhesion: Traction that must be overcome to lift off [Pa], number or tensor [...].
+        friction: "stick" (no slip while pressed on, the paper's rule; in the total formulation a coefficient of 5, so
+            that what hardly presses is let go gently) or Coulomb coefficient, number or tensor [...].
+        adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
+            [...].
 
     Raises:
         ValueError: for an axis, side, friction or adhesion out of range.

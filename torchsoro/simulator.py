@@ -272,6 +272,7 @@ class Simulator(nn.Module):
                 [[p.axis, p.side, int(p.sticks)] for p in planes], dtype=torch.int32, device=x.device
             ).reshape(-1, 3),
             springs=attached.spring is not None,
+            viscous=_viscous(body),
             probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
         )
         check_probes(scene.probes, x.shape[-2])
@@ -396,6 +397,12 @@ def _whole(name: str, value: float, dt: float) -> int:
     if steps < 1 or abs(steps * dt - value) > 1e-6 * value:
         raise ValueError(f"{name} = {value:g} s: wanted a whole number of substeps of {dt:g} s")
     return steps
+
+
+def _viscous(body: Body) -> bool:
+    """Whether a solid has a viscosity, or one that is yet to be found."""
+    given = [v for v in (body.viscosity, body.volume_viscosity) if v is not None]
+    return any(v.requires_grad or bool((v[..., body.chamber < 0] != 0).any()) for v in given)
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:

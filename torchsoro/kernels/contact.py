@@ -12,9 +12,6 @@ from torchsoro.kernels.layout import (
     PLANE_STICK,
 )
 
-# Slope below which a point that lands is taken to graze the plane.
-GRAZING = 0.2
-
 
 @ti.func
 def plane_distance(planes: ti.template(), plane_kind: ti.template(), at, k, x, cell):
@@ -49,7 +46,8 @@ def touch(u, n, stick, friction, hold):
     """Velocity of a node after one plane; ``hold`` is the largest pull-off speed that adhesion cancels in this step.
 
     A node that approaches (or is held back by adhesion) sticks: u = 0; or slides: its normal part vanishes and its
-    tangential part shrinks by at most ``friction`` times the normal part. A node torn off keeps the rest of its speed.
+    tangential part shrinks by at most ``friction`` times what presses it on the plane, adhesion included. A node torn
+    off keeps the rest of its speed.
     """
     r = u
     normal = u.dot(n)
@@ -61,7 +59,7 @@ def touch(u, n, stick, friction, hold):
         else:
             tangential = u - normal * n
             speed = tangential.norm()
-            loss = friction * ti.abs(normal)
+            loss = friction * (hold - normal)
             r = u * 0
             if speed > loss:
                 r = tangential * (1 - loss / speed)
@@ -82,15 +80,15 @@ def touch_adjoint(u, n, stick, friction, hold, r_bar):
         if stick == 0:
             tangential = u - normal * n
             speed = tangential.norm()
-            loss = friction * ti.abs(normal)
+            loss = friction * (hold - normal)
             if speed > loss:
                 direction = tangential / speed
                 loss_bar = -direction.dot(r_bar)
                 flat = r_bar - r_bar.dot(n) * n
                 u_bar = flat - loss / speed * (flat - direction.dot(flat) * direction)
-                side = ti.select(normal < 0, friction * 0 - 1, friction * 0 + 1)
-                u_bar += loss_bar * friction * side * n
-                friction_bar = loss_bar * ti.abs(normal)
+                u_bar -= loss_bar * friction * n
+                friction_bar = loss_bar * (hold - normal)
+                hold_bar = loss_bar * friction
     return u_bar, friction_bar, hold_bar
 
 
@@ -130,20 +128,7 @@ def lands(u, n, gap, dt):
 
 
 @ti.func
-def time_to_land(u, n, gap, dt):
-    """Share of a step of dt after which a point arrives at the plane, and whether its normal speed alone sets it.
-
-    A point that grazes the plane counts as arriving at a slope of GRAZING at least: its place on the plane, and so
-    the gradient, would otherwise depend without bound on how high it was.
-    """
-    tangential = u - u.dot(n) * n
-    falling = -u.dot(n) >= GRAZING * tangential.norm()
-    speed = ti.select(falling, -u.dot(n), GRAZING * tangential.norm())
-    return ti.max(gap, gap * 0) / (speed * dt), falling
-
-
-@ti.func
-def land(u, n, gap, dt, stick, friction, hold):
+def land(u, n, gap, dt, friction, hold):
     """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
 
     A point that would end behind the plane ends on it: the second result, which is gone afterwards as the impact takes
@@ -155,38 +140,37 @@ def land(u, n, gap, dt, stick, friction, hold):
     r = u
     onto = u * 0
     if lands(u, n, gap, dt):
-        r = touch(u, n, stick, friction, gap * 0)
-        share, _ = time_to_land(u, n, gap, dt)
-        lost = u - r
-        onto = share * (lost - lost.dot(n) * n) - ti.max(gap, gap * 0) / dt * n
+        r = touch(u, n, 0, friction, ti.max(hold, hold * 0))
+        onto = time_to_land(u, n, gap, dt) * (u - r)
     elif u.dot(n) > 0 and hold >= 0:
-        r = touch(u, n, stick, friction, hold)
+        r = touch(u, n, 0, friction, hold)
     return r, onto
 
 
 @ti.func
-def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, onto_bar):
+def time_to_land(u, n, gap, dt):
+    """Share of a step of dt after which a point that lands arrives at the plane."""
+    return -ti.max(gap, gap * 0) / (u.dot(n) * dt)
+
+
+@ti.func
+def land_adjoint(u, n, gap, dt, friction, hold, r_bar, onto_bar):
     """Adjoint of :func:`land`: gradients by u, gap, friction and hold."""
     u_bar = r_bar
     gap_bar = gap * 0
     friction_bar = gap * 0
     hold_bar = gap * 0
     if lands(u, n, gap, dt):
-        share, falling = time_to_land(u, n, gap, dt)
-        lost = u - touch(u, n, stick, friction, gap * 0)
-        along = onto_bar - onto_bar.dot(n) * n
-        by_u, by_friction, _ = touch_adjoint(u, n, stick, friction, gap * 0, r_bar - share * along)
-        u_bar, friction_bar = by_u + share * along, by_friction
+        share = time_to_land(u, n, gap, dt)
+        pull = ti.max(hold, hold * 0)
+        lost = u - touch(u, n, 0, friction, pull)
+        by_u, by_friction, by_hold = touch_adjoint(u, n, 0, friction, pull, r_bar - share * onto_bar)
+        u_bar, friction_bar, hold_bar = by_u + share * onto_bar, by_friction, by_hold
         if gap > 0:
-            share_bar = lost.dot(along)
-            gap_bar = share_bar * share / gap - onto_bar.dot(n) / dt
-            speed_bar = -share_bar * share * share * dt / gap
-            if falling:
-                u_bar -= speed_bar * n
-            else:
-                tangential = u - u.dot(n) * n
-                u_bar += speed_bar * GRAZING * tangential / tangential.norm()
+            by_share = lost.dot(onto_bar) / u.dot(n)
+            gap_bar = -by_share / dt
+            u_bar -= by_share * share * n
     elif u.dot(n) > 0 and hold >= 0:
-        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, hold, r_bar)
+        by_u, by_friction, by_hold = touch_adjoint(u, n, 0, friction, hold, r_bar)
         u_bar, friction_bar, hold_bar = by_u, by_friction, by_hold
     return u_bar, gap_bar, friction_bar, hold_bar

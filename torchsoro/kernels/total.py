@@ -77,6 +77,7 @@ from torchsoro.kernels.layout import (
     STOP,
     SWEPT,
     VISCOSITY,
+    VISCOUS,
     VOLUME,
     VOLUME_VISCOSITY,
     VOLUMES,
@@ -203,7 +204,7 @@ def total_substep(
                     scratch[swept] = volume * contract(cof, F) / 3
                 if ti.static(loaded):
                     eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                    if kind < 0 and (eta != 0 or zeta != 0):
+                    if kind < 0 and ints[VISCOUS] == 1:
                         P += viscous_piola(F, gather_gradient(ints, fixed, state, at + 3 * nodes, p, n), eta, zeta)
                     push = external_force(ints, fixed, supply, state, at, t, b, p, n)
                     store_vector(scratch, ints[POINT_SUM] + (b * BUNDLE + 9) * points + p, points, -push)

@@ -89,6 +89,7 @@ from torchsoro.kernels.layout import (
     SWEPT,
     TALLIES,
     VISCOSITY,
+    VISCOUS,
     VOLUME,
     VOLUME_BAR,
     VOLUME_VISCOSITY,
@@ -408,7 +409,7 @@ def total_substep_adjoint(
                     if ti.static(loaded):
                         eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
                         rate_bar = F * 0
-                        if kind < 0 and (eta != 0 or zeta != 0):
+                        if kind < 0 and ints[VISCOUS] == 1:
                             rate = gather_gradient(ints, fixed, state, at + 3 * nodes, p, n)
                             by_F, by_rate, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
                             F_bar += by_F

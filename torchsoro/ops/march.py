@@ -39,7 +39,8 @@ class Scene:
         kind: int32 [N], -1 for solid, else the number of the gas chamber.
         share: [groups, N], each particle's share of its group's force.
         plane_kind: int32 [planes, 3]: axis, side (+1 or -1), 1 for stick or 0 for Coulomb.
-        springs: Whether any particle has a spring or drag.
+        springs: Whether any particle has a spring or drag, be it of zero.
+        viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
         probes: int64 [P], particles whose motion is recorded.
         lattice: Of the total-Lagrangian form; None for the updated form.
     """
@@ -53,6 +54,7 @@ class Scene:
     share: Tensor
     plane_kind: Tensor
     springs: bool
+    viscous: bool
     probes: Tensor
     lattice: Lattice | None = None
 

@@ -165,9 +165,7 @@ class TotalMarch:
         self.batch, self.points, self.nodes = like.shape[0], self.lattice.count, self.lattice.nodes
         self.elements, self.chambers = inputs.prony.shape[1], inputs.pressure.shape[2]
         self.planes, self.groups = inputs.planes.shape[1], scene.share.shape[0]
-        viscosity = like[:, layout.VISCOSITY : layout.VOLUME_VISCOSITY + 1, scene.kind == -1]
-        self.viscous, self.springs = bool((viscosity != 0).any()), bool((like[:, layout.SPRING] != 0).any())
-        self.loaded = self.viscous or self.springs or self.groups > 0
+        self.loaded = scene.viscous or scene.springs or self.groups > 0
         nx, ny, _ = self.lattice.points
         _, my, mz = self.lattice.shape
         self.lines, self.sheets = nx * ny * mz, nx * my * mz
@@ -295,7 +293,7 @@ class TotalMarch:
         sizes = {
             **dict(zip(("nx", "ny", "nz"), self.lattice.points, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
-            **{"springs": int(self.springs), "viscous": int(self.viscous), "planes": self.planes},
+            **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
             **{"steps": self.steps, **{name: int(value) for name, value in more.items()}},
         }
         head = [0, 0, 0, _NEVER, *(sizes.get(name, 0) for name in layout.SIZES)]
