@@ -21,8 +21,7 @@ class Plane:
         offset: Where it cuts the axis [m], a number or a tensor [...]; in the updated formulation its gradient
             is that of shifting the grid.
         side: +1 if the body lies on the positive side, else -1.
-        friction: "stick" (no slip while pressed on, the paper's rule; in the total formulation a coefficient of 5, so
-            that what hardly presses is let go gently) or Coulomb coefficient, number or tensor [...].
+        friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
         adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
             [...].
 

@@ -12,6 +12,9 @@ from torchsoro.kernels.layout import (
     PLANE_STICK,
 )
 
+# Slope below which a point that lands is taken to graze the plane.
+GRAZING = 0.2
+
 
 @ti.func
 def plane_distance(planes: ti.template(), plane_kind: ti.template(), at, k, x, cell):
@@ -128,49 +131,73 @@ def lands(u, n, gap, dt):
 
 
 @ti.func
-def land(u, n, gap, dt, friction, hold):
+def carry(u, r, n, gap, dt):
+    """Velocity that carries a point which lands onto the plane: its way until it arrives, in place of that after it.
+
+    Where it grazes the plane, what it loses along the plane may be much more than its normal speed, and its place, so
+    the gradient, would depend on ``gap`` without bound. There it counts as arriving at a slope of GRAZING.
+    """
+    lost = u - r - u.dot(n) * n
+    speed = ti.max(-u.dot(n), GRAZING * lost.norm())
+    return ti.max(gap, gap * 0) / dt * (lost / speed - n)
+
+
+@ti.func
+def carry_adjoint(u, r, n, gap, dt, onto_bar):
+    """Adjoint of :func:`carry`: gradients by u, r and gap."""
+    u_bar = u * 0
+    r_bar = u * 0
+    gap_bar = gap * 0
+    if gap > 0:
+        lost = u - r - u.dot(n) * n
+        along = onto_bar - onto_bar.dot(n) * n
+        size, normal = lost.norm(), -u.dot(n)
+        speed = ti.max(normal, GRAZING * size)
+        gap_bar = (lost / speed - n).dot(onto_bar) / dt
+        lost_bar = gap / (dt * speed) * along
+        speed_bar = -lost_bar.dot(lost) / speed
+        if normal >= GRAZING * size:
+            u_bar -= speed_bar * n
+        else:
+            lost_bar += speed_bar * GRAZING / size * lost
+        u_bar += lost_bar
+        r_bar -= lost_bar
+    return u_bar, r_bar, gap_bar
+
+
+@ti.func
+def land(u, n, gap, dt, stick, friction, hold):
     """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
 
     A point that would end behind the plane ends on it: the second result, which is gone afterwards as the impact takes
-    the velocity, moves it along its way until it arrives, in place of the velocity after the impact. So where a body
-    comes to rest, along the plane too, is a continuous function of where it came from, and has a gradient. To stop the
-    velocity as well only when it arrives would multiply that gradient at every landing. Once there, this is
-    :func:`touch`. ``hold`` is negative where adhesion does not reach.
+    the velocity, moves it there. So where a body comes to rest, along the plane too, is a continuous function of where
+    it came from, and has a gradient. To stop the velocity as well only when it arrives would multiply that gradient at
+    every landing. Once there, this is :func:`touch`. ``hold`` is negative where adhesion does not reach.
     """
     r = u
     onto = u * 0
     if lands(u, n, gap, dt):
-        r = touch(u, n, 0, friction, ti.max(hold, hold * 0))
-        onto = time_to_land(u, n, gap, dt) * (u - r)
+        r = touch(u, n, stick, friction, ti.max(hold, hold * 0))
+        onto = carry(u, r, n, gap, dt)
     elif u.dot(n) > 0 and hold >= 0:
-        r = touch(u, n, 0, friction, hold)
+        r = touch(u, n, stick, friction, hold)
     return r, onto
 
 
 @ti.func
-def time_to_land(u, n, gap, dt):
-    """Share of a step of dt after which a point that lands arrives at the plane."""
-    return -ti.max(gap, gap * 0) / (u.dot(n) * dt)
-
-
-@ti.func
-def land_adjoint(u, n, gap, dt, friction, hold, r_bar, onto_bar):
+def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, onto_bar):
     """Adjoint of :func:`land`: gradients by u, gap, friction and hold."""
     u_bar = r_bar
     gap_bar = gap * 0
     friction_bar = gap * 0
     hold_bar = gap * 0
     if lands(u, n, gap, dt):
-        share = time_to_land(u, n, gap, dt)
         pull = ti.max(hold, hold * 0)
-        lost = u - touch(u, n, 0, friction, pull)
-        by_u, by_friction, by_hold = touch_adjoint(u, n, 0, friction, pull, r_bar - share * onto_bar)
-        u_bar, friction_bar, hold_bar = by_u + share * onto_bar, by_friction, by_hold
-        if gap > 0:
-            by_share = lost.dot(onto_bar) / u.dot(n)
-            gap_bar = -by_share / dt
-            u_bar -= by_share * share * n
+        r = touch(u, n, stick, friction, pull)
+        carried, by_r, by_gap = carry_adjoint(u, r, n, gap, dt, onto_bar)
+        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, pull, r_bar + by_r)
+        u_bar, gap_bar, friction_bar, hold_bar = by_u + carried, by_gap, by_friction, by_hold
     elif u.dot(n) > 0 and hold >= 0:
-        by_u, by_friction, by_hold = touch_adjoint(u, n, 0, friction, hold, r_bar)
+        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, hold, r_bar)
         u_bar, friction_bar, hold_bar = by_u, by_friction, by_hold
     return u_bar, gap_bar, friction_bar, hold_bar

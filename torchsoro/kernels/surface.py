@@ -36,9 +36,6 @@ from torchsoro.kernels.tensor import add, load_vector
 # How far in front of a plane a node is looked at, and how near it is held by adhesion, in cells.
 LOOK = 2.0
 TOUCH = 1e-3
-# Friction where a body sticks. Without a limit a node that hardly presses on the ground would be let go, or caught, all
-# of a sudden, and travel would be a staircase over the design.
-STICK = 5.0
 
 
 @ti.func
@@ -81,12 +78,6 @@ def places(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, 
 
 
 @ti.func
-def friction_of(stick, friction):
-    """Coefficient of a plane."""
-    return ti.select(stick == 1, friction * 0 + STICK, friction)
-
-
-@ti.func
 def adhesive_hold(ints: ti.template(), fixed: ti.template(), plane, gap, mass):
     """Pull-off speed that adhesion cancels in a step; negative where it does not reach."""
     edge = fixed[EDGE]
@@ -111,8 +102,8 @@ def meet(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b,
             gap = sign * (surface - offset)
             hold = adhesive_hold(ints, fixed, plane, gap, mass)
             normal = axis_normal(ints[kind + PLANE_AXIS], sign, u)
-            friction = friction_of(ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION])
-            left, way = land(r, normal, gap, fixed[STEP_SIZE], friction, hold)
+            stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
+            left, way = land(r, normal, gap, fixed[STEP_SIZE], stick, friction, hold)
             r = left
             onto += way
     return r, onto
@@ -154,16 +145,14 @@ def meet_adjoint(
             hold = adhesive_hold(ints, fixed, plane, gap, mass)
             arriving, _ = meet(ints, fixed, state, at, b, i, n, k, mass, u)
             normal = axis_normal(axis, sign, u)
-            stick = ints[kind + PLANE_STICK]
-            friction = friction_of(stick, fixed[plane + PLANE_FRICTION])
+            friction, stick = fixed[plane + PLANE_FRICTION], ints[kind + PLANE_STICK]
             by_u, gap_bar, by_friction, hold_bar = land_adjoint(
-                arriving, normal, gap, dt, friction, hold, u_bar, onto_bar
+                arriving, normal, gap, dt, stick, friction, hold, u_bar, onto_bar
             )
             u_bar = by_u
             bar = ints[PLANE_BAR] + (b * ints[PLANES] + k) * PLANE * nodes + i
             add(False, sums, bar + PLANE_OFFSET * nodes, -sign * gap_bar)
-            if stick == 0:
-                add(False, sums, bar + PLANE_FRICTION * nodes, by_friction)
+            add(False, sums, bar + PLANE_FRICTION * nodes, by_friction)
             if hold >= 0:
                 add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * fixed[EDGE] * fixed[EDGE] * dt / mass)
                 mass_bar -= hold_bar * hold / mass
