@@ -11,7 +11,9 @@ Every number of the settings can be overridden: --help lists them.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import math
 import statistics
 import time
 from pathlib import Path
@@ -48,7 +50,9 @@ DESK = dataclasses.replace(
 
 
 def optimize(robot: Robot, name: str) -> dict[str, float]:
-    """Run the design loop to the stopping rule and write what came out of it.
+    """Run the design loop to the stopping rule and write what came out of it: the best design within the limit on C.
+
+    Travel is rough, so that the last design is seldom the best; without any within the limit the last is taken.
 
     Args:
         robot: What to design.
@@ -69,12 +73,13 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
         previous=0.25 - s.c_max, penalty=s.penalty, window=s.window, tolerance=s.tolerance, growth=s.growth
     )
     stopped = False
+    best = {"worth": -math.inf, "field": field.state_dict()}
     with RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, free=s.free) as run:
         if state := run.load():
             field.load_state_dict(state["field"])
             adam.load_state_dict(state["adam"])
             lagrangian.load_state_dict(state["lagrangian"])
-            stopped = state["stopped"]
+            stopped, best = state["stopped"], state["best"]
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             gamma = field()
@@ -86,7 +91,9 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
             middle = time.perf_counter()
             adam.zero_grad()
             loss.backward()
-            norm = torch.nn.utils.get_total_norm([p.grad for p in field.parameters() if p.grad is not None])
+            norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf, error_if_nonfinite=True)
+            if violation.item() <= 0 and worth.item() > best["worth"]:
+                best = {"worth": worth.item(), "field": copy.deepcopy(field.state_dict())}
             end = time.perf_counter()
             adam.step()
             field.clamp_()
@@ -115,9 +122,11 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
             )
             if k % s.picture_every == 0:
                 show_shape(run, robot, gamma, k)
-            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped)
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best)
             if stopped:
                 break
+        if best["worth"] > -math.inf:
+            field.load_state_dict(best["field"])
         metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name)
     seconds = {key: statistics.median(run.metrics[f"time/{key}"]) for key in ("forward", "backward")}
     return {**metrics, **seconds, "iterations": len(run.metrics["iteration"])}

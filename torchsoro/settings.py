@@ -120,6 +120,8 @@ class Settings:
     """What the centre of gravity may sink before it counts as falling, in heights of the body."""
     learning_rate: float = 0.02
     """Of Adam."""
+    clip: float = 3.0
+    """Largest norm of the gradient; 0 for any. A tumble has one of hundreds, which Adam would remember for long."""
     c_max: float = 0.0125
     """Largest allowed intermediate density C."""
     penalty: float = 1e-3
@@ -141,7 +143,7 @@ class Settings:
 
     def __post_init__(self) -> None:
         """Refuse what no module checks by itself."""
-        for name in ("upright", "sink", "gravity", "slope", "settle", "room", "memory", "offset", "port"):
+        for name in ("upright", "sink", "gravity", "slope", "settle", "room", "memory", "offset", "port", "clip"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} = {value}: wanted finite and at least 0")
