@@ -26,6 +26,7 @@ import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import TINY
 
+from torchsoro.errors import SimulationDiverged
 from torchsoro.robot import climber, walker
 from torchsoro.settings import Settings
 
@@ -249,3 +250,28 @@ def test_the_command_line_refuses_without_a_traceback_and_before_any_work(recipe
     assert message in ended.stderr
     assert "Traceback" not in ended.stderr
     assert not (tmp_path / "run").exists()
+
+
+class Fragile(torch.nn.Module):
+    """A robot whose simulation breaks down where the design goes too far."""
+
+    def __init__(self, limit: float) -> None:
+        super().__init__()
+        self.field = torch.nn.Module()
+        self.field.phi = torch.nn.Parameter(torch.ones(3))
+        self.field.forward = lambda: self.field.phi + 0
+        self.limit = limit
+
+    def forward(self, gamma: torch.Tensor, *, gravity_scale: float) -> float:
+        if float(gamma.detach().max()) > self.limit:
+            raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J", batch=0, remedy="none")
+        return gravity_scale
+
+
+def test_a_design_that_breaks_down_goes_back_towards_the_last_one_that_did_not(recipes):
+    robot, good = Fragile(0.3), torch.zeros(3)
+    gamma, outcome = recipes["walker"].simulate(robot, good, 0.5)
+    torch.testing.assert_close(gamma.detach(), torch.full((3,), 0.25), rtol=0, atol=0)
+    assert outcome == 0.5
+    with pytest.raises(SimulationDiverged):
+        recipes["walker"].simulate(Fragile(0.1), good, 0.5)
