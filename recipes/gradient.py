@@ -1,14 +1,14 @@
 """The gradient of a walker's travel against central differences, along smooth random directions.
 
     python recipes/gradient.py                       # coarse, on a laptop
-    python recipes/gradient.py --preset paper        # 64,000 particles
+    python recipes/gradient.py --preset paper --after 10      # 64,000 particles, of a design that is on its way
 
 From rest on the ground the body is inflated for a while. A central difference is only as good as the motion is smooth
 over the perturbation: where a foot that sticks is caught or let go a substep earlier it has a jump, so here feet slide
-(see ``--friction``); and small perturbations drown in float32's rounding. So the table gives a range of sizes. "spread"
-is how far L strays from a straight line through the two ends and the middle, over the difference of the ends: large
-where the motion is not smooth. "mean" is the gradient's mean over the perturbation by Simpson's rule, which a central
-difference equals also where L is curved.
+(see ``--friction``) and air comes slowly (``--rise``); and small perturbations drown in float32's rounding. So the table
+gives a range of sizes. "spread" is how far L strays from a straight line through the two ends and the middle, over the
+difference of the ends: large where the motion is not smooth. "mean" is the gradient's mean over the perturbation by
+Simpson's rule, which a central difference equals also where L is curved.
 """
 
 from __future__ import annotations
@@ -41,8 +41,10 @@ class Options:
     """Of the ground. Where feet stick, travel has a jump for each that is caught or let go a substep earlier."""
     settle: float = 0.05
     """Time at rest [s]."""
-    duration: float = 0.05
+    duration: float = 0.1
     """Time of actuation [s]."""
+    rise: float = 0.06
+    """Time constant of filling [s]; where it is short, feet chatter on the ground."""
     after: int = 0
     """Design iterations before, on travel alone."""
     directions: int = 3
@@ -124,6 +126,7 @@ def main(options: Options) -> list[dict[str, Any]]:
         friction=options.friction,
         settle=options.settle,
         duration=options.duration,
+        rise=options.rise,
     )
     table = rows(settings, options)
     print("  ".join(table[0]))

@@ -35,18 +35,18 @@ DESK = dataclasses.replace(
     wall=0.035 / 12,
     elements=2,
     dt=1e-4,
-    settle=0.1,
+    settle=0.02,
     duration=0.2,
     sample_every=0.0025,
-    iterations=36,
+    iterations=26,
     filter_radius=0.007,
     # In a single cycle, falling on the nose would be the longest stride.
-    upright=6.0,
-    sink=0.01,
+    upright=4.0,
+    sink=0.05,
     learning_rate=0.04,
-    penalty=1.0,
+    penalty=30.0,
     window=2,
-    tolerance=0.03,
+    tolerance=0.1,
 )
 
 
