@@ -5,7 +5,7 @@
 
 From rest on the ground the body is inflated for a while. A central difference is only as good as the motion is smooth
 over the perturbation: where a foot that sticks is caught or let go a substep earlier it has a jump, so here feet slide
-(see ``--friction``) and air comes slowly (``--rise``); and small perturbations drown in float32's rounding. So the table
+(see ``--friction``) and air comes slowly (``--rise``); small perturbations drown in float32's rounding. So the table
 gives a range of sizes. "spread" is how far L strays from a straight line through the two ends and the middle, over the
 difference of the ends: large where the motion is not smooth. "mean" is the gradient's mean over the perturbation by
 Simpson's rule, which a central difference equals also where L is curved.
