@@ -39,6 +39,7 @@ DESK = dataclasses.replace(
     settle=0.0,
     iterations=40,
     learning_rate=0.05,
+    penalty=1.0,
     upright=0.0,
     # Otherwise a plate that has come off the chamber and is pushed up by it counts as climbing.
     counted="body",
