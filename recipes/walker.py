@@ -38,13 +38,13 @@ DESK = dataclasses.replace(
     settle=0.05,
     duration=0.2,
     sample_every=0.0025,
-    iterations=26,
+    iterations=20,
     filter_radius=0.007,
     # In a single cycle, falling on the nose would be the longest stride.
     upright=8.0,
     sink=0.008,
     learning_rate=0.04,
-    penalty=30.0,
+    penalty=10.0,
     window=2,
     tolerance=0.1,
 )
