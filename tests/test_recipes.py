@@ -275,3 +275,13 @@ def test_a_design_that_breaks_down_goes_back_towards_the_last_one_that_did_not(r
     assert outcome == 0.5
     with pytest.raises(SimulationDiverged):
         recipes["walker"].simulate(Fragile(0.1), good, 0.5)
+
+
+def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
+    settings = tiny(tmp_path / "run", c_max=0.249)  # which every design but the first keeps
+    result = recipes["walker"].main(settings)
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    kept = [float(row["objective/L"]) for row in rows if float(row["constraint/C"]) <= settings.c_max]
+    assert 0 < len(kept) < len(rows)
+    assert result["L"] == pytest.approx(max(kept), rel=1e-5)
