@@ -70,14 +70,21 @@ def sheet_count(n):
 
 
 @ti.func
+def corner_of(ints: ti.template(), at, p):
+    """Lowest node of the cell of point p in a field at ``at``, and where the weights of this point begin along x, y, z.
+
+    Both are looked up: divisions are slow.
+    """
+    code = ints[ints[POINT_CORNER] + p]
+    return at + code // 8, 3 * (code // 4 % 2), 3 * (code // 2 % 2), 3 * (code % 2)
+
+
+@ti.func
 def gather_gradient(ints: ti.template(), fixed: ti.template(), a: ti.template(), at, p, n):
     """Gradient of a nodal vector field by the reference place at point p; component c of node i is at + c I + i."""
     m = nodes_per_axis(n)
     nodes = product(m)
-    # The lowest node, and which point of the cell this is, are looked up: divisions are slow.
-    code = ints[ints[POINT_CORNER] + p]
-    corner = at + code // 8
-    ox, oy, oz = 3 * (code // 4 % 2), 3 * (code // 2 % 2), 3 * (code % 2)
+    corner, ox, oy, oz = corner_of(ints, at, p)
     w = ti.Vector([fixed[WEIGHT + oz + k] for k in ti.static(range(3))])
     s = ti.Vector([fixed[SLOPE + oz + k] for k in ti.static(range(3))])
     zero = w[0] * 0
@@ -101,9 +108,7 @@ def gather_value(ints: ti.template(), fixed: ti.template(), a: ti.template(), at
     """A nodal vector field at point p."""
     m = nodes_per_axis(n)
     nodes = product(m)
-    code = ints[ints[POINT_CORNER] + p]
-    corner = at + code // 8
-    ox, oy, oz = 3 * (code // 4 % 2), 3 * (code // 2 % 2), 3 * (code % 2)
+    corner, ox, oy, oz = corner_of(ints, at, p)
     zero = fixed[WEIGHT] * 0
     u = ti.Vector([zero, zero, zero])
     for i in range(3):

@@ -121,6 +121,15 @@ def particle_place(fixed: ti.template(), p, n):
 
 
 @ti.func
+def spring_stretch(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, p, n):
+    """From point p to its anchor."""
+    points = product(n)
+    anchor = ints[COEFFICIENT] + (b * COEFFICIENTS + ANCHOR) * points + p
+    d = gather_value(ints, fixed, state, at, p, n)
+    return load_vector(fixed, anchor, points) - particle_place(fixed, p, n) - d
+
+
+@ti.func
 def external_force(
     ints: ti.template(), fixed: ti.template(), supply: ti.template(), state: ti.template(), at, t, b, p, n
 ):
@@ -131,10 +140,8 @@ def external_force(
         force = ints[FORCE] + ((t * ints[BATCH] + b) * ints[GROUPS] + g) * 3
         push += fixed[ints[SHARE] + g * points + p] * load_vector(supply, force, 1)
     if ints[SPRINGS] == 1:
-        mat = ints[COEFFICIENT] + b * COEFFICIENTS * points + p
-        d = gather_value(ints, fixed, state, at, p, n)
-        stretch = load_vector(fixed, mat + ANCHOR * points, points) - particle_place(fixed, p, n) - d
-        push += fixed[mat + SPRING * points] * stretch
+        spring = fixed[ints[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
+        push += spring * spring_stretch(ints, fixed, state, at, b, p, n)
     return push
 
 

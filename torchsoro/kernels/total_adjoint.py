@@ -117,7 +117,7 @@ from torchsoro.kernels.tensor import (
     store_symmetric_adjoint,
     store_vector,
 )
-from torchsoro.kernels.total import chamber_pressure, particle_place, state_length
+from torchsoro.kernels.total import chamber_pressure, spring_stretch, state_length
 
 
 @ti.func
@@ -297,9 +297,8 @@ def external_adjoint(
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = ints[COEFFICIENT] + mine, ints[COEFFICIENT_BAR] + mine
     push_bar = gather_value(ints, fixed, back, ints[FORCES] + b * 3 * nodes, p, n)
-    d = gather_value(ints, fixed, state, at, p, n)
     spring = fixed[mat + SPRING * points]
-    stretch = load_vector(fixed, mat + ANCHOR * points, points) - particle_place(fixed, p, n) - d
+    stretch = spring_stretch(ints, fixed, state, at, b, p, n)
     add(False, sums, mat_bar + SPRING * points, push_bar.dot(stretch))
     for c in ti.static(range(3)):
         add(False, sums, mat_bar + (ANCHOR + c) * points, spring * push_bar[c])
