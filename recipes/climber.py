@@ -24,15 +24,21 @@ from torchsoro.settings import Settings, from_command_line, plain_errors
 # The paper's text says 40.25 mm; 83,200 particles and its step times fit 45.5 mm.
 PAPER = dataclasses.replace(
     WALKER_PAPER,
+    robot="climber",
     out=Path("runs/climber"),
     size=(0.035, 0.035, 0.0455),
     particles=(40, 40, 52),
     settle=0.0,
     filter_radius=0.004375,
+    upright=0.0,
+    # Otherwise a plate that has come off the chamber and is pushed up by it counts as climbing.
+    counted="body",
     gravity_steps=10,
+    gravity_every=8,
 )
 DESK = dataclasses.replace(
     WALKER_DESK,
+    robot="climber",
     out=Path("runs/climber"),
     size=(0.035, 0.035, 0.035 / 12 * 16),
     particles=(12, 12, 16),
@@ -44,7 +50,6 @@ DESK = dataclasses.replace(
     upright=0.0,
     # On so coarse a lattice the total form's body, which touches both walls from the first, does not learn to let go.
     formulation="updated",
-    # Otherwise a plate that has come off the chamber and is pushed up by it counts as climbing.
     counted="body",
     gravity_steps=5,
     gravity_every=4,

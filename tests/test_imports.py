@@ -37,6 +37,7 @@ scene
 page
 picture
 settings
+archive
 robot
 results
 sim2real.recording

@@ -108,6 +108,9 @@ class AugmentedLagrangian(nn.Module):
 
     While the constraint holds the loss is -L, so that the stop is the paper's rule on the objective.
 
+    Where the objective is rough its mean may never level off; with ``patience`` the multiplier or the penalty is raised
+    at the latest after so many iterations in which the constraint did not hold. Only a plateau stops.
+
     The objective should be dimensionless and of order one (a distance in cells, not in metres), since the first
     penalties are small numbers without a unit.
 
@@ -118,6 +121,7 @@ class AugmentedLagrangian(nn.Module):
         window: Number of iterations in each mean of the plateau rule.
         tolerance: Relative change of the mean loss that counts as a plateau.
         growth: Factor by which the penalty grows.
+        patience: Iterations after which it grows without a plateau, too; 0 to wait for one.
 
     Raises:
         ValueError: An argument is out of range.
@@ -148,6 +152,7 @@ class AugmentedLagrangian(nn.Module):
         window: int = 4,
         tolerance: float = 1e-3,
         growth: float = 10.0,
+        patience: int = 0,
     ) -> None:
         """Start without multiplier and with the first penalty."""
         super().__init__()
@@ -156,6 +161,9 @@ class AugmentedLagrangian(nn.Module):
                 raise ValueError(f"{name}: got {value!r}, want a finite number > 0")
         if not (math.isfinite(growth) and growth > 1.0):
             raise ValueError(f"growth: got {growth!r}, want a finite number > 1")
+        if isinstance(patience, bool) or not isinstance(patience, int) or patience < 0:
+            raise ValueError(f"patience: got {patience!r}, want a whole number >= 0")
+        self.patience = patience
         self.growth = float(growth)
         self.plateau = Plateau(window=window, tolerance=tolerance)
         self.register_buffer("multiplier", torch.tensor(0.0, dtype=torch.float64))
@@ -185,7 +193,7 @@ class AugmentedLagrangian(nn.Module):
 
     @torch.no_grad()
     def update(self, loss: float, violation: float) -> Event | None:
-        """Take note of one iteration, and raise multiplier or penalty at a plateau.
+        """Take note of one iteration, and raise multiplier or penalty at a plateau, or when patience ends.
 
         Args:
             loss: Value of the loss in this iteration.
@@ -198,7 +206,8 @@ class AugmentedLagrangian(nn.Module):
             ValueError: A value is not finite.
         """
         loss, excess = _finite("loss", loss), max(_finite("violation", violation), 0.0)
-        if not self.plateau.update(loss):
+        late = excess > 0.0 and 0 < self.patience <= int(self.plateau.count) + 1
+        if not self.plateau.update(loss) and not late:
             return None
         self.plateau.reset()
         kind: Literal["multiplier", "penalty", "stop"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import torch
@@ -261,6 +261,22 @@ def fill(
         filler=void,
         drag=None if void is None else VOID_DRAG * torch.where(air, domain.volume * min(gas.density, AIR), mass * void),
     )
+
+
+def without_void(body: Body) -> tuple[Body, Tensor]:
+    """Leave out the particles that follow the law of void alone: they carry next to nothing, but take as long.
+
+    Args:
+        body: As from :func:`fill` with ``filler``, without a batch.
+
+    Returns:
+        The body of the others, and which those are, bool [N].
+    """
+    if body.filler is None:
+        return body, torch.ones_like(body.chamber, dtype=torch.bool)
+    keep = body.filler < 1
+    given = {field.name: value[keep] for field in fields(Body) if (value := getattr(body, field.name)) is not None}
+    return replace(body, **given), keep
 
 
 def _void(gamma: Tensor, low: float, high: float) -> Tensor:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -103,6 +104,25 @@ def stride(cog: Tensor, time: Tensor, *, start: float, period: float, direction:
         raise ValueError(f"period: got {period} s from start = {start} s, want a whole cycle before {latest:.9g} s")
     ends = [_sample(time, start + k * period, f"start + {k} period") for k in range(1, cycles + 1)]
     return cog[..., [first, *ends], :].diff(dim=-2) @ unit
+
+
+def mean_stride(way: np.ndarray, time: np.ndarray, *, start: float, period: float) -> float:
+    """Advance per cycle of a recorded path, over all its whole cycles; the cycles need not end on samples.
+
+    Args:
+        way: Distance along the direction of travel, m, [S].
+        time: Times of the samples, s, [S].
+        start: Begin of the first cycle, s.
+        period: Duration of a cycle, s.
+
+    Returns:
+        The mean, m; NaN if no cycle is complete.
+    """
+    cycles = math.floor((time[-1] - start) / period + 1e-6)
+    if cycles < 1:
+        return math.nan
+    first, last = np.interp([start, start + cycles * period], time, way)
+    return float(last - first) / cycles
 
 
 def intermediate_density(gamma: Tensor, design: Tensor) -> Tensor:

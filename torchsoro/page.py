@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,9 +15,11 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from PIL import Image
 
 from torchsoro.levelset import as_array
 from torchsoro.scene import FAINT, FULL, INK, PRESSURE, Camera, PlaneTuple, Scene, Shape, bounds_of
+from torchsoro.storage import atomic_write
 
 if TYPE_CHECKING:
     from torchsoro.domain import Domain
@@ -103,6 +106,39 @@ def canvas_of(width: int, height: int, dpi: int = 100) -> tuple[Figure, FigureCa
     return figure, FigureCanvasAgg(figure)
 
 
+class Page:
+    """A white page of so many pixels for lettered panels; places are in pixels from its upper left corner."""
+
+    def __init__(self, width: int, height: int, dpi: int = 100) -> None:
+        self.width, self.height, self.dpi = width, height, dpi
+        self.figure, self.canvas = canvas_of(width, height, dpi)
+
+    def axes(self, left: float, top: float, width: float, height: float) -> Axes:
+        """A panel."""
+        place = (left / self.width, 1 - (top + height) / self.height, width / self.width, height / self.height)
+        return self.figure.add_axes(place)
+
+    def write(self, text: str, left: float, top: float, size: float = 9.0, **style: Any) -> None:
+        """Text that begins here."""
+        style = {"va": "top", "color": INK, **style}
+        self.figure.text(left / self.width, 1 - top / self.height, text, fontsize=size, **style)
+
+    def head(self, letter: str, text: str, left: float, top: float) -> None:
+        """Letter and heading of a panel."""
+        self.write(letter, left, top, 13, weight="bold")
+        self.write(text, left + (0.25 * self.dpi if letter else 0), top + 0.03 * self.dpi, 9.5)
+
+    def missing(self, text: str, left: float, top: float) -> None:
+        """A line instead of a panel."""
+        self.write(text, left, top, 8.5, style="italic", color=FAINT)
+
+    def save(self, path: Path) -> Path:
+        """Write a PNG, which is there whole or not at all."""
+        with atomic_write(path) as file:
+            Image.fromarray(pixels(self.canvas)).save(file, format="PNG", dpi=(self.dpi, self.dpi))
+        return path
+
+
 def pixels(canvas: FigureCanvasAgg) -> np.ndarray:
     """Draw, and return the picture as uint8 [height, width, 3]."""
     canvas.draw()
@@ -124,7 +160,7 @@ def pressure_trace(axes: Axes, time: np.ndarray, pressure: np.ndarray) -> Any:
     axes.set_xlim(time[0], time[-1] if len(time) > 1 else time[0] + 1e-3)
     axes.set_ylim(min(0.0, 1.1 * pressure.min()), max(1e-3, 1.15 * pressure.max()))
     axes.set_ylabel("kPa", color=INK, fontsize=9)
-    _plain(axes)
+    plain(axes)
     return axes.plot([], [], "o", ms=7, mfc="white", mec=INK, mew=1.6, zorder=5, clip_on=False)[0]
 
 
@@ -153,7 +189,7 @@ def path_panels(figure: Figure, motion: Motion, cycle: tuple[float, float]) -> N
     over.set_xlim(motion.time[0], motion.time[-1] if len(motion.time) > 1 else motion.time[0] + 1e-3)
     over.set_xlabel("time [s]", color=INK)
     over.set_ylabel("travel [mm]", color=INK)
-    _plain(over)
+    plain(over)
     heading(over, f"centre of gravity: {motion.travel[-1]:+.2f} mm")
     if motion.pressure is not None:
         beside = over.twinx()
@@ -186,7 +222,7 @@ def path_panels(figure: Figure, motion: Motion, cycle: tuple[float, float]) -> N
     path.locator_params(axis="x", nbins=6)
     path.set_xlabel(f"{'xyz'[flat]} [mm]", color=INK)
     path.set_ylabel("z [mm]", color=INK)
-    _plain(path)
+    plain(path)
     heading(path, "path of the centre of gravity")
 
 
@@ -240,7 +276,7 @@ def history_panel(
     axes.plot(iterations[-1], values[-1], "o", color=color, ms=5)
     axes.set_ylabel(label, color=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    _plain(axes)
+    plain(axes)
     heading(axes, f"{head}: {values[-1]:.3g}" + (" mm" if "mm" in label else ""))
     if limit is not None:
         axes.axhline(limit, color=FULL, lw=1.2, ls=(0, (4, 2)))
@@ -249,12 +285,33 @@ def history_panel(
         axes.text(0.02, share + 0.02, f"C_max = {limit:g}", transform=axes.transAxes, color=FULL, fontsize=9)
 
 
+def curve(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, style: Any = "-", text: str | None = None) -> None:
+    """A line for the legend, without the values that are missing."""
+    known = np.isfinite(y)
+    axes.plot(x[known], y[known], color=color, ls=style, lw=1.4, label=text)
+
+
+def curve_axes(axes: Axes, x: str, y: str) -> None:
+    """The axes of curves: their names, and whole numbers for iterations."""
+    plain(axes)
+    axes.set_xlabel(x, color=INK, fontsize=8.5, labelpad=2)
+    axes.set_ylabel(y, color=INK, fontsize=8.5)
+    axes.tick_params(labelsize=8)
+    if x == "iteration":
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def legend(axes: Axes, **style: Any) -> None:
+    """The names of the curves, without a frame."""
+    axes.legend(fontsize=8, frameon=False, labelcolor=INK, **{"handlelength": 2.6, **style})
+
+
 def heading(axes: Axes, text: str) -> None:
     """A bold title at the left."""
     axes.set_title(text, loc="left", fontsize=11, color=INK, weight="bold", pad=6)
 
 
-def _plain(axes: Axes) -> None:
+def plain(axes: Axes) -> None:
     """Few lines: left and bottom only, a faint grid."""
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from torchsoro.archive import save_design
 from torchsoro.fabricate import AirPort, Part, fabricate, surface
+from torchsoro.objective import mean_stride
 from torchsoro.picture import movie, shape_image, summary
 from torchsoro.robot import Robot
-from torchsoro.simulator import Trajectory
 from torchsoro.storage import atomic_write
 from torchsoro.training import RunFolder
 
@@ -33,42 +33,64 @@ def drawn_planes(robot: Robot) -> tuple[tuple[int, float, int], ...]:
     return tuple((plane.axis, float(plane.offset), plane.side) for plane in robot.planes)
 
 
-@torch.no_grad()
 def deliver(
     path: Path, robot: Robot, gamma: torch.Tensor, history: Mapping[str, Sequence[float]], *, name: str
 ) -> dict[str, float]:
-    """Simulate the final gait once more with every particle recorded, and write everything into the run's folder.
-
-    Files: ``design.npz``, ``shape.stl`` with ``shape.json`` (what the part weighs and how thin it gets), ``<name>.mp4``
-    and ``summary.png``.
+    """Write the design of a finished run into its folder, as ``design.npz``, and show it there: see :func:`show`.
 
     Args:
         path: The folder.
         robot: The robot.
-        gamma: Its density [N].
+        gamma: Its density [N]; judged as it is stored, with three decimals.
         history: Metrics of the run, for the summary.
         name: Of the robot: names the movie and the page.
 
     Returns:
-        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg].
+        What :func:`show` measured.
 
     Raises:
         ValueError: if the design has no connected body to print; the design and the movie are written before.
     """
+    gamma = save_design(path / "design.npz", robot.domain, gamma)
+    return show(path, robot, gamma, history=history, name=name)[0]
+
+
+@torch.no_grad()
+def show(
+    path: Path,
+    robot: Robot,
+    gamma: torch.Tensor,
+    *,
+    name: str,
+    history: Mapping[str, Sequence[float]] | None = None,
+    void: bool = True,
+) -> tuple[dict[str, float], Part]:
+    """Simulate a gait with every particle recorded, and write what people look at and print.
+
+    Files: ``<name>.mp4``, with a history ``summary.png``, and ``shape.stl`` with ``shape.json`` (what the part weighs
+    and how thin it gets).
+
+    Args:
+        path: Folder to write to.
+        robot: The robot.
+        gamma: Its density [N].
+        name: Of the robot: names the movie and the page.
+        history: Metrics of its run.
+        void: Simulate void, too.
+
+    Returns:
+        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg]; and the printable part.
+
+    Raises:
+        ValueError: if the design has no connected body to print; the movie is written before.
+    """
     s = robot.settings
-    outcome = robot(gamma, everything=True)
-    density = gamma.detach().cpu().numpy()
+    outcome = robot(gamma, everything=True, void=void)
+    density = gamma.cpu().numpy()
     trajectory = outcome.trajectory
-    with atomic_write(path / "design.npz") as file:
-        np.savez_compressed(
-            file,
-            gamma=density.astype(np.float32),
-            shape=np.array(robot.domain.shape),
-            spacing=robot.domain.spacing,
-            origin=np.array(robot.domain.origin),
-        )
     frames = trajectory.position.cpu().numpy()
-    time = trajectory.time.cpu().numpy()
+    time = trajectory.time.cpu().double().numpy()
+    way = trajectory.center_of_gravity.cpu().double().numpy() @ np.array(robot.direction)
     chosen = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
     shown = {
@@ -86,38 +108,29 @@ def deliver(
         fps=20,
         title=f"{name}, {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
     )
-    summary(
-        path / "summary.png",
-        **shown,
-        frames=frames,
-        time=time,
-        pressure=supply,
-        history=history,
-        limit=s.c_max,
-        period=1 / s.frequency,
-        title=f"{name} ({s.preset}): L = {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
-    )
+    if history is not None:
+        summary(
+            path / "summary.png",
+            **shown,
+            frames=frames,
+            time=time,
+            pressure=supply,
+            history=history,
+            limit=s.c_max,
+            period=1 / s.frequency,
+            title=f"{name} ({s.preset}): L = {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
+        )
     part = print_part(robot, density)
     part.save(path / "shape.stl")
     with atomic_write(path / "shape.json") as file:
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
-    return {
+    found = {
         "L": float(outcome.travel),
-        "stride": _mean_stride(robot, trajectory),
+        "stride": mean_stride(way, time, start=s.settle, period=1 / s.frequency),
         "C": float(outcome.intermediate),
         "mass": float(outcome.mass),
     }
-
-
-def _mean_stride(robot: Robot, trajectory: Trajectory) -> float:
-    """Advance per whole cycle [m], interpolated where a cycle does not end on a sample; NaN without a whole cycle."""
-    s = robot.settings
-    cycles = math.floor(s.duration * s.frequency + 1e-9)
-    if cycles == 0:
-        return math.nan
-    way = trajectory.center_of_gravity.double().cpu() @ torch.tensor(robot.direction, dtype=torch.float64)
-    start, end = np.interp([s.settle, s.settle + cycles / s.frequency], trajectory.time.cpu().numpy(), way.numpy())
-    return float(end - start) / cycles
+    return found, part
 
 
 def print_part(robot: Robot, density: np.ndarray) -> Part:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ from torchsoro.contact import Plane, ground
 from torchsoro.domain import Chamber, Domain
 from torchsoro.errors import SimulationDiverged
 from torchsoro.field import DesignField
-from torchsoro.material import AIR, Body, Gas, Prony, Solid, fill
+from torchsoro.material import AIR, Body, Gas, Prony, Solid, fill, without_void
 from torchsoro.objective import center_of_gravity, intermediate_density, total_mass, travel
 from torchsoro.settings import Settings
 from torchsoro.simulator import Simulator, Trajectory
@@ -91,13 +91,17 @@ class Robot(nn.Module):
         everywhere = self._fill(torch.ones(self.domain.count))
         self._simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
 
-    def forward(self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False) -> Outcome:
+    def forward(
+        self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False, void: bool = True
+    ) -> Outcome:
         """Simulate a design and judge it.
 
         Args:
             gamma: Density [N].
             gravity_scale: Share of gravity.
             everything: Record every particle (for pictures) and not only the centre of gravity.
+            void: Simulate void, too. Without it a finished design takes half the time, and L hardly changes; in what is
+                recorded, void then moves with the centre of gravity.
 
         Returns:
             Travel, intermediate density, mass, centre of gravity, trajectory.
@@ -109,7 +113,7 @@ class Robot(nn.Module):
         body = self._fill(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory = self._simulate(body, weight, gravity_scale, everything)
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void)
         end = s.settle + s.duration
         distance = travel(
             trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
@@ -131,9 +135,13 @@ class Robot(nn.Module):
             self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power, filler=s.filler
         )
 
-    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool) -> Trajectory:
+    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool, void: bool) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
+        rest, keep = body.position, torch.ones_like(self.design)
+        if not void:
+            body, keep = without_void(body)
+            weight = weight[keep]
         for halving in range(s.halvings + 1):
             try:
                 trajectory = self._simulator(2**halving)(
@@ -145,13 +153,21 @@ class Robot(nn.Module):
                     planes=self.planes,
                     sample_every=s.sample_every,
                     weight=weight,
-                    probes=torch.arange(self.domain.count) if everything else None,
+                    probes=torch.arange(len(body.chamber)) if everything else None,
                 )
-                return trajectory
+                return self._with_void(trajectory, rest, keep) if everything and not void else trajectory
             except SimulationDiverged:
                 if halving == s.halvings:
                     raise
         raise AssertionError
+
+    def _with_void(self, trajectory: Trajectory, rest: Tensor, keep: Tensor) -> Trajectory:
+        """Every particle's motion [S, N, 3]: of void, which was left out, that of the centre of gravity."""
+        moved = trajectory.center_of_gravity - trajectory.center_of_gravity[0]
+        position, velocity = rest + moved[:, None], torch.zeros_like(rest).expand(len(moved), -1, -1).clone()
+        position[:, keep], velocity[:, keep] = trajectory.position, trajectory.velocity
+        probes = torch.arange(len(rest), device=rest.device)
+        return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
     def _simulator(self, parts: int) -> Simulator:
         """A simulator that takes a part of the usual step."""
@@ -167,6 +183,11 @@ class Robot(nn.Module):
             formulation=s.formulation,
             memory_budget=int(s.memory * 2**30) or None,
         )
+
+
+def build(settings: Settings) -> Robot:
+    """The robot that the settings name."""
+    return {"walker": walker, "climber": climber}[settings.robot](settings)
 
 
 def walker(settings: Settings) -> Robot:

@@ -6,6 +6,7 @@ the page.
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Iterable, Sequence
@@ -80,22 +81,25 @@ class Skin:
 
 @dataclass(frozen=True)
 class Camera:
-    """Where an orthographic camera looks from; both angles in degrees, as in Matplotlib."""
+    """Where an orthographic camera looks from; all angles in degrees, azimuth and elevation as in Matplotlib."""
 
     azimuth: float
     elevation: float
+    tilt: float = 0.0
+    """By which all is turned so that +x leads uphill: a slope whose ground was kept level. An arrow g points down."""
 
     @property
     def axes(self) -> np.ndarray:
         """Rows: right, up, towards the viewer."""
-        a, e = math.radians(self.azimuth), math.radians(self.elevation)
-        return np.array(
+        a, e, t = math.radians(self.azimuth), math.radians(self.elevation), math.radians(self.tilt)
+        view = np.array(
             [
                 [-math.sin(a), math.cos(a), 0],
                 [-math.sin(e) * math.cos(a), -math.sin(e) * math.sin(a), math.cos(e)],
                 [math.cos(e) * math.cos(a), math.cos(e) * math.sin(a), math.sin(e)],
             ]
         )
+        return view @ np.array([[math.cos(t), 0, -math.sin(t)], [0, 1, 0], [math.sin(t), 0, math.cos(t)]])
 
 
 class Shape:
@@ -124,6 +128,14 @@ class Shape:
         """Vertices [V, 3] and the cavities' quadrilaterals [Q, 4, 3] in a frame [mm]."""
         cavity = None if self.cavity is None else ((self.cavity(frame) - self.origin) * 1e3).reshape(-1, 4, 3)
         return (self.skin(frame) - self.origin) * 1e3, cavity
+
+    def times(self, count: int) -> Shape:
+        """So many copies as one shape, for bodies side by side whose vertices and cavities are strung together."""
+        many = copy.copy(self)
+        many.faces = np.concatenate([self.faces + i * len(self.skin.rest) for i in range(count)])
+        many.around = sparse.csr_matrix(sparse.block_diag([self.around] * count))
+        many.colors = np.tile(self.colors, (count, 1))
+        return many
 
 
 def _box(center: np.ndarray, size: np.ndarray, cuts: int = 5) -> np.ndarray:
@@ -180,6 +192,10 @@ class Scene:
         margin = 0.03 * (high - low).max()
         axes.set_xlim(low[0] - margin, high[0] + margin)
         axes.set_ylim(low[1] - margin - (3.0 if ruler else 0.0), high[1] + margin)
+        if camera.tilt:
+            arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.0}
+            axes.annotate("", (0.06, 0.72), (0.06, 0.98), xycoords="axes fraction", arrowprops=arrow)
+            axes.text(0.08, 0.85, "g", transform=axes.transAxes, va="center", fontsize=8, color=INK, style="italic")
 
     def _plane(
         self, plane: PlaneTuple, bounds: np.ndarray, along: int, start: float | None, ruler: bool

@@ -22,12 +22,16 @@ from torchsoro.errors import SimulationDiverged
 class Settings:
     """Settings of a design run; SI units, z up. The defaults are the paper's walker."""
 
+    robot: Literal["walker", "climber"] = "walker"
+    """On the ground, or between two walls; what the recipe is named after."""
     preset: Literal["desk", "paper"] = "paper"
     """Where the other numbers come from before they are overridden: coarse, or the paper's size."""
     out: Path = Path("runs/walker")
     """Folder of the run."""
     resume: bool = False
     """Continue the run in the folder."""
+    amend: bool = False
+    """Let settings differ from the run's on resume; what changed, and when, is noted in ``amendments.json``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
     iterations: int = 400
@@ -132,8 +136,12 @@ class Settings:
     """Iterations in each mean of the plateau and stopping rule."""
     tolerance: float = 1e-3
     """Relative change of the mean loss that counts as a plateau."""
+    patience: int = 0
+    """Iterations after which the penalty grows without a plateau, too, while C is above its limit; 0: never."""
     picture_every: int = 5
     """Iterations between two pictures in TensorBoard."""
+    shape_every: int = 10
+    """Iterations between two designs that are kept in the folder's shapes."""
     frames: int = 60
     """Pictures in the movie."""
     offset: float = 0.0
@@ -158,10 +166,10 @@ class Settings:
             value, part = getattr(self, name), getattr(self, unit)
             if abs(round(value / part) * part - value) > 1e-6 * value:
                 raise ValueError(f"{name} = {value:g} s: wanted a whole number of {unit} = {part:g} s")
-        for name in ("iterations", "window", "gravity_every", "picture_every", "frames"):
+        for name in ("iterations", "window", "gravity_every", "picture_every", "shape_every", "frames"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 1")
-        for name in ("gravity_steps", "halvings"):
+        for name in ("gravity_steps", "halvings", "patience"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 0")
         if not 0 <= self.filler[0] < self.filler[1] <= 1:
@@ -186,7 +194,8 @@ class Settings:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
-        return ("out", "resume", "iterations", "device", "memory", "picture_every", "frames", "offset", "port")
+        here = ("out", "resume", "amend", "iterations", "device", "memory")
+        return (*here, "picture_every", "shape_every", "frames", "offset", "port")
 
 
 def from_command_line(

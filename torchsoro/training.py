@@ -55,6 +55,8 @@ class RunFolder:
             a checkpoint (killed in the first iteration) it starts again from iteration 0.
         free: Names of settings that may change on resume, such as the number of iterations or the folder itself;
             nested names are joined with dots, and the name of a group frees all of it.
+        amend: Let other settings change on resume, too; each change is noted in ``amendments.json`` with the iteration
+            from which it holds.
 
     Attributes:
         path: The folder.
@@ -67,24 +69,35 @@ class RunFolder:
     """
 
     def __init__(
-        self, path: str | Path, settings: Mapping[str, Any], *, resume: bool = False, free: Collection[str] = ()
+        self,
+        path: str | Path,
+        settings: Mapping[str, Any],
+        *,
+        resume: bool = False,
+        free: Collection[str] = (),
+        amend: bool = False,
     ) -> None:
         self.path = Path(path)
         self.settings: dict[str, Any] = plain_settings(settings)
         self.start = 0
         rows: list[dict[str, float]] = []
         columns: list[str] = []
+        changed: dict[str, tuple[Any, Any]] = {}
         self._refuse_wrong_folder(resume)
         if resume:
-            self._refuse_other_settings(self._read_settings(), free, "settings.json")
+            changed = self._differences(self._read_settings(), free)
+            self._refuse(changed, amend, "settings.json")
             if self._checkpoint.exists():
                 payload = self._read_checkpoint()
-                self._refuse_other_settings(payload["settings"], free, "checkpoint.pt")
+                changed = self._differences(payload["settings"], free)
+                self._refuse(changed, amend, "checkpoint.pt")
                 self.start = payload["iteration"] + 1
             columns, rows = read_metrics(self.path / "metrics.csv", self.start)
         self.path.mkdir(parents=True, exist_ok=True)
         for file in ("checkpoint.pt", "metrics.csv", "settings.json"):
             (self.path / f"{file}.tmp").unlink(missing_ok=True)  # a killed process may have left one
+        if changed:
+            self._note(changed)
         with atomic_write(self.path / "settings.json") as file:
             file.write((json.dumps(self.settings, indent=2, allow_nan=False) + "\n").encode())
         self._metrics = MetricsFile(self.path / "metrics.csv", columns, rows)
@@ -312,19 +325,32 @@ class RunFolder:
             raise ValueError(f"path: {self._checkpoint} lacks {sorted(missing)}, it is not a checkpoint of a run")
         return payload
 
-    def _refuse_other_settings(self, held: Mapping[str, Any], free: Collection[str], file: str) -> None:
+    def _differences(self, held: Mapping[str, Any], free: Collection[str]) -> dict[str, tuple[Any, Any]]:
+        """What the run has and what is wanted now, of each setting that differs and is not free."""
         here, there = _flatten(self.settings), _flatten(held)
-        changed = [
-            f"{name} is {here.get(name, _ABSENT)!r}, the run has {there.get(name, _ABSENT)!r}"
+        return {
+            name: (there.get(name, _ABSENT), here.get(name, _ABSENT))
             for name in dict.fromkeys((*here, *there))
             if here.get(name, _ABSENT) != there.get(name, _ABSENT)
             and not any(name == group or name.startswith(group + ".") for group in free)
-        ]
-        if changed:
+        }
+
+    def _refuse(self, changed: Mapping[str, tuple[Any, Any]], amend: bool, file: str) -> None:
+        if changed and not amend:
+            listed = "; ".join(f"{name} is {now!r}, the run has {was!r}" for name, (was, now) in changed.items())
             raise ValueError(
-                f"settings: these differ from {file} of the run in {self.path}: {'; '.join(changed)}; "
-                "resume with the settings of the run, or start another folder"
+                f"settings: these differ from {file} of the run in {self.path}: {listed}; "
+                "resume with the settings of the run, or amend it, or start another folder"
             )
+
+    def _note(self, changed: Mapping[str, tuple[Any, Any]]) -> None:
+        """Add to the amendments; those from this iteration on were never used."""
+        path = self.path / "amendments.json"
+        noted = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+        noted = [one for one in noted if one["iteration"] < self.start]
+        noted.append({"iteration": self.start, "changes": {name: list(pair) for name, pair in changed.items()}})
+        with atomic_write(path) as file:
+            file.write((json.dumps(noted, indent=2) + "\n").encode())
 
 
 def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

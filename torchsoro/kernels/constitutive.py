@@ -182,7 +182,7 @@ def deform(
         if F_new.determinant() <= 0:
             flags[FLAG_COLLAPSED] = 1
         if elements > 0:
-            change = pull_back(F_new) - pull_back(F)
+            change = pull_back(F_new, 0) - pull_back(F, 0)
             for e in range(elements):
                 place = (HISTORY + 6 * e) * particles
                 a = prony[prony_at + PRONY * e + PRONY_DECAY]
@@ -230,7 +230,7 @@ def deform_adjoint(
                 H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
                 S_bar += prony[prony_at + PRONY * e + PRONY_GAIN] * H_bar
             if want_prony == 1:
-                change = pull_back(F_new) - pull_back(F)
+                change = pull_back(F_new, 0) - pull_back(F, 0)
                 for e in range(elements):
                     H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
                     H = load_symmetric(state, at + (HISTORY + 6 * e) * particles, particles)
@@ -241,8 +241,8 @@ def deform_adjoint(
                 for c in range(6):
                     place = here + (HISTORY + 6 * e + c) * particles
                     bar[place] = a * bar[place]
-            F_bar += pull_back_adjoint(F_new, S_bar)
-            old_bar = pull_back_adjoint(F, -S_bar)
+            F_bar += pull_back_adjoint(F_new, 0, S_bar)
+            old_bar = pull_back_adjoint(F, 0, -S_bar)
         step_bar = F_bar @ F.transpose()
         F_bar = F_bar + step_gradient.transpose() @ F_bar + old_bar
     else:

@@ -9,36 +9,54 @@ import taichi as ti
 
 from torchsoro.kernels.tensor import cofactor, contract, cross, plus_identity
 
+# Least volume ratio that the solid's share of a partly void point feels: a grey point under pressure may be crushed.
+CRUSHED = 0.2
+
 
 @ti.func
-def pull_back(F):
-    """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(C)/3 C^-1) / J with C = F^T F (in Eq. 8)."""
-    J = F.determinant()
+def least_ratio(filler):
+    """Volume ratio below which a solid of which a share ``filler`` is void counts as no further crushed; 0 without."""
+    least = filler * 0
+    if filler > 0:
+        least = filler * 0 + CRUSHED
+    return least
+
+
+@ti.func
+def pull_back(F, least):
+    """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(C)/3 C^-1) / J with C = F^T F (in Eq. 8).
+
+    J counts as at least ``least``, here and in the other laws of the solid.
+    """
+    J = ti.max(F.determinant(), least)
     C = F.transpose() @ F
     return plus_identity(cofactor(C) * (-C.trace() / (3 * J * J * J)), 1 / J)
 
 
 @ti.func
-def pull_back_adjoint(F, S_bar):
+def pull_back_adjoint(F, least, S_bar):
     """Adjoint of :func:`pull_back`: the gradient by F for the symmetric gradient S_bar by S."""
     cof = cofactor(F)
-    J = contract(cof, F) / 3
+    ratio = contract(cof, F) / 3
+    J = ti.max(ratio, least)
     C = F.transpose() @ F
     trace, G = C.trace(), cofactor(C)
     scale = 1 / (3 * J * J * J)
     along = contract(S_bar, G) * scale
     C_bar = plus_identity(cross(C, S_bar) * (-trace * scale), -along)
     J_bar = -S_bar.trace() / (J * J) + 3 * trace * along / J
+    if ratio < least:
+        J_bar = 0 * J
     return 2 * F @ C_bar + J_bar * cof
 
 
 @ti.func
-def solid_piola(F, Q, bulk, shear):
+def solid_piola(F, Q, bulk, shear, least):
     """Eqs. 3-8 as first Piola stress, with Q = sum_i g_i H_i.
 
     The Kirchhoff stress K/2 [(J-1) + ln J / J] J I + mu dev(Fb A Fb^T), A = I + J Q, Fb = J^(-1/3) F, times F^-T.
     """
-    J = F.determinant()
+    J = ti.max(F.determinant(), least)
     shrink = ti.exp(-2 * ti.log(J) / 3)
     FA = F + J * (F @ Q)
     pressure = bulk / 2 * (J * (J - 1) + ti.log(J)) - shear * shrink * contract(F, FA) / 3
@@ -46,10 +64,11 @@ def solid_piola(F, Q, bulk, shear):
 
 
 @ti.func
-def solid_piola_adjoint(F, Q, bulk, shear, P_bar):
+def solid_piola_adjoint(F, Q, bulk, shear, least, P_bar):
     """Adjoint of :func:`solid_piola`: gradients by F, Q, bulk and shear modulus."""
     cof = cofactor(F)
-    J = contract(cof, F) / 3
+    ratio = contract(cof, F) / 3
+    J = ti.max(ratio, least)
     log = ti.log(J)
     shrink = ti.exp(-2 * log / 3)
     FQ = F @ Q
@@ -65,6 +84,8 @@ def solid_piola_adjoint(F, Q, bulk, shear, P_bar):
     FA_bar = alpha * P_bar - (alpha * pressure_bar / 3) * F
     J_bar = pressure_bar * (bulk * (J - 0.5 + 0.5 / J) - beta) - 2 * alpha * alpha_bar / (3 * J)
     J_bar += contract(FA_bar, FQ)
+    if ratio < least:
+        J_bar = 0 * J
     F_bar = FA_bar + J * (FA_bar @ Q) - (alpha * pressure_bar / 3) * FA + beta * cross(F, P_bar) + J_bar * cof
     half = (J / 2) * (F.transpose() @ FA_bar)
     return F_bar, half + half.transpose(), pressure_bar * volumetric, alpha_bar * shrink
@@ -103,7 +124,7 @@ def piola(F, Q, bulk, shear, filler):
     """First Piola stress of a solid of which a share ``filler`` (0 to 1) is void."""
     P = F * 0
     if filler < 1:
-        P = (1 - filler) * solid_piola(F, Q, bulk, shear)
+        P = (1 - filler) * solid_piola(F, Q, bulk, shear, least_ratio(filler))
     if filler > 0:
         P += filler * filler_piola(F, shear)
     return P
@@ -118,7 +139,7 @@ def piola_adjoint(F, Q, bulk, shear, filler, P_bar):
     shear_bar = shear * 0
     filler_bar = shear * 0
     if filler < 1:
-        by_F, by_Q, by_bulk, by_shear = solid_piola_adjoint(F, Q, bulk, shear, P_bar)
+        by_F, by_Q, by_bulk, by_shear = solid_piola_adjoint(F, Q, bulk, shear, least_ratio(filler), P_bar)
         F_bar, Q_bar = (1 - filler) * by_F, (1 - filler) * by_Q
         bulk_bar, shear_bar = (1 - filler) * by_bulk, (1 - filler) * by_shear
         if filler > 0:

@@ -82,7 +82,7 @@ from torchsoro.kernels.layout import (
     VOLUME_VISCOSITY,
     VOLUMES,
 )
-from torchsoro.kernels.stress import filler_piola, piola, pull_back, viscous_piola
+from torchsoro.kernels.stress import filler_piola, least_ratio, piola, pull_back, viscous_piola
 from torchsoro.kernels.surface import meet
 from torchsoro.kernels.tensor import (
     cofactor,
@@ -184,7 +184,7 @@ def total_substep(
                     Q = F * 0
                     if filler < 1:
                         if elements > 0:
-                            S = pull_back(F)
+                            S = pull_back(F, least_ratio(filler))
                             for e in range(elements):
                                 place = history + 6 * e * points
                                 number = ints[ELEMENT] + (b * elements + e) * PRONY
@@ -192,7 +192,7 @@ def total_substep(
                                 Z = load_symmetric(state, at + place, points)
                                 Q += fixed[number + PRONY_MODULUS] * (Z + gain * S)
                                 store_symmetric(state, out + place, points, a * Z - gain * (1 - a) * S)
-                        if not F.determinant() > 0:
+                        if filler == 0 and not F.determinant() > 0:
                             ti.atomic_min(ints[COLLAPSED], t)
                     else:
                         for c in range(6 * elements):

@@ -98,6 +98,7 @@ from torchsoro.kernels.layout import (
 )
 from torchsoro.kernels.stress import (
     filler_piola_adjoint,
+    least_ratio,
     piola_adjoint,
     pull_back,
     pull_back_adjoint,
@@ -366,7 +367,7 @@ def total_substep_adjoint(
                         Q = F * 0
                         S = F * 0
                         if elements > 0 and filler < 1:
-                            S = pull_back(F)
+                            S = pull_back(F, least_ratio(filler))
                             for e in range(elements):
                                 number = ints[ELEMENT] + (b * elements + e) * PRONY
                                 Z = load_symmetric(state, at + 6 * nodes + p + 6 * e * points, points)
@@ -381,6 +382,7 @@ def total_substep_adjoint(
                             maxwell = at + 6 * nodes + p
                             F_bar += pull_back_adjoint(
                                 F,
+                                least_ratio(filler),
                                 maxwell_adjoint(
                                     ints, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar
                                 ),

@@ -338,7 +338,7 @@ class TotalMarch:
         """Say which point is wrong after so many substeps of the segment, and how."""
         F = self.lattice.gradient(self._nodes(state)).permute(0, 3, 1, 2) + torch.eye(3).to(state)
         J = torch.linalg.det(F)
-        solid = (self.scene.kind == -1) & (self.inputs.coefficients[:, layout.FILLER] < 1)
+        solid = (self.scene.kind == -1) & (self.inputs.coefficients[:, layout.FILLER] == 0)
         x = self._places(state)
         there = self.scene.kind != layout.ABSENT
         smaller = "a smaller time step, a lower pressure or more filler"

@@ -1,0 +1,237 @@
+"""The paper's checks on a finished robot: slopes, modulus, pressure, frequency, early designs, elements, cell, method.
+
+    python recipes/compare.py walker --out runs/compare            # an archived robot, see recipes/designs
+    python recipes/compare.py runs/walker --out runs/compare       # one of your own
+    python recipes/compare.py walker --out runs/compare --only design half_cell
+
+A row for each check goes to ``compare.json``, and the motion of some to ``motion_<check>.npz``, from which
+``recipes/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a check of a
+design at the paper's size takes five to fifteen minutes, one at half the cell size hours.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from replay import find
+
+from torchsoro.archive import load_design, load_shape, read_settings
+from torchsoro.errors import SimulationDiverged
+from torchsoro.objective import mean_stride
+from torchsoro.robot import Outcome, Robot, build
+from torchsoro.settings import Settings, plain_errors
+from torchsoro.storage import atomic_write
+
+LONG = 2.0  # s of actuation, where a robot is watched for an extended time
+PHASES = 8  # of a cycle, kept for pictures
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Check:
+    """One simulation.
+
+    Attributes:
+        title: For the table.
+        changes: Settings that differ from the design run's.
+        long: Actuate for ``LONG`` instead of the run's duration.
+        finer: Particles along an edge, as a multiple of the design's.
+        iteration: Design of this iteration instead of the final one.
+        motion: Keep the motion for pictures.
+    """
+
+    title: str
+    changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    long: bool = False
+    finer: int = 1
+    iteration: int | None = None
+    motion: bool = False
+
+
+def checks(s: Settings, iterations: tuple[int, ...] = (0, 5, 10, 20, 50, 100)) -> dict[str, Check]:
+    """The checks of a robot, by name.
+
+    Args:
+        s: Its settings.
+        iterations: Early designs to look at.
+    """
+    updated = {"formulation": "updated", "transfer": "apic", "air_density": "auto"}
+    found = {"design": Check(title="as designed", long=True, motion=True)}
+    if s.robot == "walker" and s.slope == 0:
+        found |= {
+            f"uphill_{p}": Check(title=f"uphill {p} %", changes={"slope": p / 100}, long=True, motion=True)
+            for p in (10, 20, 30)
+        }
+    found |= {
+        "double_modulus": Check(title="double modulus", changes={"youngs_modulus": 2 * s.youngs_modulus}),
+        "double_modulus_and_pressure": Check(
+            title="double modulus, double pressure",
+            changes={"youngs_modulus": 2 * s.youngs_modulus, "pressure": 2 * s.pressure},
+        ),
+        "50_kPa": Check(title="50 kPa", changes={"pressure": 50e3}, long=True),
+        "3_Hz": Check(title="3 Hz", changes={"frequency": 3.0}, long=True),
+        "five_elements": Check(title="five Maxwell elements", changes={"elements": 5}),
+        "half_cell": Check(title="half the cell size", finer=2),
+        "updated": Check(title="updated formulation (MLS-MPM)", changes=updated),
+        "updated_half_cell": Check(title="updated formulation, half the cell size", changes=updated, finer=2),
+    }
+    return found | {f"iteration_{k}": Check(title=f"iteration {k}", iteration=k, motion=True) for k in iterations}
+
+
+def finer(gamma: torch.Tensor, shape: tuple[int, int, int], times: int) -> torch.Tensor:
+    """A density on a lattice with so many times the particles along each edge, by trilinear interpolation [N]."""
+    if times == 1:
+        return gamma
+    volume = gamma.view(1, 1, *shape)
+    return torch.nn.functional.interpolate(volume, scale_factor=times, mode="trilinear").flatten()
+
+
+def perform(folder: Path, base: Settings, check: Check) -> tuple[Robot, torch.Tensor, Outcome]:
+    """Simulate one check.
+
+    Args:
+        folder: The robot's folder.
+        base: Its settings.
+        check: The check.
+
+    Raises:
+        ValueError: if the folder lacks the design of the check's iteration.
+        SimulationDiverged: if the simulation breaks down.
+    """
+    # A long walk leaves the box of the design run.
+    long = {"duration": LONG, "room": 0.5} if check.long else {}
+    particles = tuple(check.finer * n for n in base.particles)
+    # What is stiffer or finer needs a smaller step.
+    step = {"dt": "auto"} if check.changes or check.finer > 1 else {}
+    s = dataclasses.replace(base, **{"particles": particles, **long, **step, **check.changes})
+    robot, coarse = build(s), build(dataclasses.replace(base, device="cpu")).domain
+    at = check.iteration
+    gamma = load_design(folder / "design.npz", coarse) if at is None else load_shape(folder, coarse, at)
+    gamma = finer(gamma, base.particles, check.finer).to(s.target)
+    with torch.no_grad():
+        return robot, gamma, robot(gamma, everything=check.motion)
+
+
+def row(robot: Robot, outcome: Outcome, base: Settings, check: Check, seconds: float) -> dict[str, Any]:
+    """What a check says, in SI units; L is over the design run's duration, stride and speed over all whole cycles."""
+    s, trajectory = robot.settings, outcome.trajectory
+    instants = trajectory.time.cpu().double().numpy()
+    course = trajectory.center_of_gravity.cpu().double().numpy()
+    way = course @ np.array(robot.direction)
+    begin, end = np.interp([s.settle, s.settle + base.duration], instants, way)
+    stride = mean_stride(way, instants, start=s.settle, period=1 / s.frequency)
+    return {
+        "title": check.title,
+        "L": float(end - begin),
+        "stride": stride,
+        "speed": stride * s.frequency,
+        "fall": float(outcome.fall),
+        "dt": outcome.dt,
+        "seconds": seconds,
+        "time": [round(t, 7) for t in instants.tolist()],
+        "cog": np.round(course, 7).tolist(),
+    }
+
+
+def keep_motion(path: Path, robot: Robot, gamma: torch.Tensor, outcome: Outcome, base: Settings, check: Check) -> None:
+    """Write what pictures need: start, phases of the last whole cycle of the design's duration, ends of all cycles."""
+    s, trajectory = robot.settings, outcome.trajectory
+    instants = trajectory.time.cpu().double().numpy()
+    period = 1 / s.frequency
+    wanted = [s.settle + base.duration]
+    if check.iteration is None:
+        cycles = math.floor(base.duration / period + 1e-9)
+        first = s.settle + max(cycles - 1, 0) * period
+        wanted += [first + k * period / PHASES for k in range(PHASES + 1)]
+        wanted += list(np.arange(s.settle, instants[-1] + 1e-9, period))
+    chosen = sorted({int(np.abs(instants - t).argmin()) for t in wanted})
+    rest = robot.domain.positions.to(trajectory.position)
+    moved = 1e3 * (trajectory.position[chosen] - rest)
+    supply = robot.pressure.at(trajectory.time[chosen].cpu().to(robot.pressure.time)).numpy().reshape(-1)
+    with atomic_write(path) as file:
+        np.savez_compressed(
+            file,
+            time=instants[chosen],
+            pressure=supply,
+            displacement=moved.half().cpu().numpy(),
+            gamma=gamma.half().cpu().numpy(),
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to check."""
+
+    robot: tyro.conf.Positional[str]
+    """Name of an archived robot, or a run's folder."""
+    out: Path
+    """Folder for the results; one for each robot."""
+    only: tuple[str, ...] = ()
+    """Checks to do; all if none are named."""
+    iterations: tuple[int, ...] = (0, 5, 10, 20, 50, 100)
+    """Early designs to look at."""
+    device: str = "auto"
+    """"cpu" or "cuda"."""
+
+
+def main(options: Options) -> dict[str, dict[str, Any]]:
+    """Perform the checks of one robot.
+
+    Returns:
+        The rows by name, those of earlier calls included.
+
+    Raises:
+        ValueError: for a robot or a check that does not exist.
+    """
+    folder = find(options.robot)
+    base = read_settings(folder / "settings.json", device=options.device, resume=False)
+    known = checks(base, options.iterations)
+    if unknown := sorted(set(options.only) - set(known)):
+        raise ValueError(f"only = {', '.join(unknown)}: wanted some of {', '.join(known)}")
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name in ("settings.json", "metrics.csv", "design.npz"):  # for the pages
+        with atomic_write(options.out / name) as copy:
+            copy.write((folder / name).read_bytes())
+    file = options.out / "compare.json"
+    rows: dict[str, dict[str, Any]] = {}
+    if file.exists():
+        rows = {r.pop("check"): r for r in json.loads(file.read_text(encoding="utf-8"))["rows"]}
+    for name in options.only or known:
+        if name in rows:
+            continue
+        check, begin = known[name], time.perf_counter()
+        try:
+            robot, gamma, outcome = perform(folder, base, check)
+            rows[name] = row(robot, outcome, base, check, time.perf_counter() - begin)
+            if check.motion:
+                keep_motion(options.out / f"motion_{name}.npz", robot, gamma, outcome, base, check)
+        except SimulationDiverged as error:
+            rows[name] = {"title": check.title, "error": str(error)}
+        with atomic_write(file) as target:
+            listed = [{"check": key, **value} for key, value in rows.items()]
+            target.write(json.dumps({"robot": base.robot, "rows": listed}).encode())
+        print(line(name, rows[name]), flush=True)
+    return rows
+
+
+def line(name: str, found: Mapping[str, Any]) -> str:
+    """A row in one line."""
+    if "error" in found:
+        return f"{name:28s} {found['error']}"
+    return (
+        f"{name:28s} L = {1e3 * found['L']:6.2f} mm, stride {1e3 * found['stride']:6.2f} mm, "
+        f"{1e3 * found['speed']:6.1f} mm/s, fall {1e3 * found['fall']:.2f} mm, {found['seconds']:.1f} s"
+    )
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__))
