@@ -58,7 +58,7 @@ DESK = dataclasses.replace(
 
 def main(settings: Settings) -> dict[str, float]:
     """Design a climber."""
-    return optimize(climber(settings), "climber")
+    return optimize(climber(dataclasses.replace(settings, robot="climber")), "climber")
 
 
 if __name__ == "__main__":

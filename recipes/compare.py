@@ -15,7 +15,7 @@ import dataclasses
 import json
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ import torch
 import tyro
 from replay import find
 
-from torchsoro.archive import load_design, load_shape, read_settings
+from torchsoro.archive import kept_iterations, load_design, load_shape, read_settings
 from torchsoro.errors import SimulationDiverged
 from torchsoro.objective import mean_stride
 from torchsoro.robot import Outcome, Robot, build
@@ -32,6 +32,7 @@ from torchsoro.settings import Settings, plain_errors
 from torchsoro.storage import atomic_write
 
 LONG = 2.0  # s of actuation, where a robot is watched for an extended time
+EARLY = (0, 5, 10, 20, 50, 100)
 PHASES = 8  # of a cycle, kept for pictures
 
 
@@ -56,7 +57,7 @@ class Check:
     motion: bool = False
 
 
-def checks(s: Settings, iterations: tuple[int, ...] = (0, 5, 10, 20, 50, 100)) -> dict[str, Check]:
+def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
     """The checks of a robot, by name.
 
     Args:
@@ -131,14 +132,19 @@ def row(robot: Robot, outcome: Outcome, base: Settings, check: Check, seconds: f
     return {
         "title": check.title,
         "L": float(end - begin),
-        "stride": stride,
-        "speed": stride * s.frequency,
+        "stride": number(stride),
+        "speed": number(stride * s.frequency),
         "fall": float(outcome.fall),
         "dt": outcome.dt,
         "seconds": seconds,
         "time": [round(t, 7) for t in instants.tolist()],
         "cog": np.round(course, 7).tolist(),
     }
+
+
+def number(value: float) -> float | None:
+    """A number that JSON has: not NaN, which a stride is without a whole cycle."""
+    return None if math.isnan(value) else value
 
 
 def keep_motion(path: Path, robot: Robot, gamma: torch.Tensor, outcome: Outcome, base: Settings, check: Check) -> None:
@@ -176,8 +182,8 @@ class Options:
     """Folder for the results; one for each robot."""
     only: tuple[str, ...] = ()
     """Checks to do; all if none are named."""
-    iterations: tuple[int, ...] = (0, 5, 10, 20, 50, 100)
-    """Early designs to look at."""
+    iterations: tuple[int, ...] = ()
+    """Early designs to look at; of 0, 5, 10, 20, 50 and 100 those that were kept if none are named."""
     device: str = "auto"
     """"cpu" or "cuda"."""
 
@@ -193,7 +199,7 @@ def main(options: Options) -> dict[str, dict[str, Any]]:
     """
     folder = find(options.robot)
     base = read_settings(folder / "settings.json", device=options.device, resume=False)
-    known = checks(base, options.iterations)
+    known = checks(base, options.iterations or [k for k in EARLY if k in kept_iterations(folder)])
     if unknown := sorted(set(options.only) - set(known)):
         raise ValueError(f"only = {', '.join(unknown)}: wanted some of {', '.join(known)}")
     options.out.mkdir(parents=True, exist_ok=True)
@@ -226,10 +232,11 @@ def line(name: str, found: Mapping[str, Any]) -> str:
     """A row in one line."""
     if "error" in found:
         return f"{name:28s} {found['error']}"
-    return (
-        f"{name:28s} L = {1e3 * found['L']:6.2f} mm, stride {1e3 * found['stride']:6.2f} mm, "
-        f"{1e3 * found['speed']:6.1f} mm/s, fall {1e3 * found['fall']:.2f} mm, {found['seconds']:.1f} s"
-    )
+    stride = "no whole cycle"
+    if found["stride"] is not None:
+        stride = f"stride {1e3 * found['stride']:6.2f} mm, {1e3 * found['speed']:6.1f} mm/s"
+    seconds = found["seconds"]
+    return f"{name:28s} L = {1e3 * found['L']:6.2f} mm, {stride}, fall {1e3 * found['fall']:.2f} mm, {seconds:.1f} s"
 
 
 if __name__ == "__main__":

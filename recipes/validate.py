@@ -5,6 +5,7 @@
     python recipes/validate.py sphere        # pressurised thick sphere against Lame's solution
     python recipes/validate.py rheology      # Maxwell elements against Eq. 17, and in the kernel against a shear ramp
     python recipes/validate.py restitution   # rebound of a dropped block with 0, 3 and 5 Maxwell elements
+    python recipes/validate.py ball          # the paper's ball drop (Fig. S9) with 0 to 5 Maxwell elements
     python recipes/validate.py contact       # height of a block at rest, and how far it slides, against Coulomb's law
     python recipes/validate.py stability     # the time step at which noise grows or an impact fails, by bisection
     python recipes/validate.py fall          # free flight: path, momentum, angular momentum
@@ -27,7 +28,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import torch
 import tyro
-from contact_checks import Curve, restitution, sliding, standing
+from contact_checks import Curve, ball_drop, restitution, sliding, standing
 from motion_checks import PAPER_STEP, fall, ramp, rheology, stability
 from structures import EXACT, FORMS, Row, bar, damping, shifted, sphere
 from walking_checks import orders, walking
@@ -65,6 +66,18 @@ def draw_restitution(path: Path, curves: Sequence[Curve]) -> None:
             axis.plot(t, velocity, styles[form], color=colors[count], label=label)
         axis.axhline(0, color="k", lw=0.6)
         axis.legend(title=f"{edge:.3g} mm cube, restitution", loc="lower right", fontsize="small")
+    save()
+
+
+def draw_ball(path: Path, curves: Sequence[Curve]) -> None:
+    """Height of the ball's centre over time, a panel for each form."""
+    forms = sorted({c[0] for c in curves}, reverse=True)
+    save, axes = _figure(path, [("time [s]", "height of the centre [mm]")] * len(forms))
+    for form, count, _, instants, height, _ in curves:
+        axis = axes[forms.index(form)]
+        axis.plot(instants / 1e3, height, label=f"{count} elements" if count else "elastic")
+        axis.set_title({"total": "total-Lagrangian", "apic": "updated, 10 us"}.get(form, form), fontsize=10)
+    axes[0].legend(fontsize="small")
     save()
 
 
@@ -123,7 +136,9 @@ def draw_walking(path: Path, rows: Sequence[Row], courses: Mapping[tuple[int, st
     save()
 
 
-Check = Literal["damping", "bar", "sphere", "rheology", "restitution", "contact", "stability", "fall", "walking", "all"]
+Check = Literal[
+    "damping", "bar", "sphere", "rheology", "restitution", "ball", "contact", "stability", "fall", "walking", "all"
+]
 
 
 def main(check: tyro.conf.Positional[Check], out: Path | None = None) -> None:
@@ -153,6 +168,11 @@ def main(check: tyro.conf.Positional[Check], out: Path | None = None) -> None:
         show("Cube dropped at 4 m/s, cell 1.75 mm, dt = 10 us", rows)
         if out is not None:
             draw_restitution(out / "restitution.png", curves)
+    if wanted("ball"):
+        drops = [ball_drop(), ball_drop((0, 3, 5), ("apic",))]
+        show("Ball of 15 mm dropped from 50 mm", [row for rows, _ in drops for row in rows])
+        if out is not None:
+            draw_ball(out / "ball.png", [curve for _, curves in drops for curve in curves])
     if wanted("contact"):
         show("Centre of a viscous 30 mm block at rest on smooth ground, against H/2 - rho g H^2 / (3 E)", standing())
         show("30 mm block, three Maxwell elements, slides to rest from 1 m/s, against v^2 / (2 mu g)", sliding())

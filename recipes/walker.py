@@ -196,7 +196,8 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
         "seconds": sum(run.metrics["time/iteration"]),
     }
     with atomic_write(s.out / "result.json") as file:
-        file.write((json.dumps(found, indent=2) + "\n").encode())
+        plain = {name: None if math.isnan(value) else value for name, value in found.items()}
+        file.write((json.dumps(plain, indent=2) + "\n").encode())
     return found
 
 
@@ -212,7 +213,7 @@ def report(result: dict[str, float], settings: Settings) -> str:
 
 def main(settings: Settings) -> dict[str, float]:
     """Design a walker."""
-    return optimize(walker(settings), "walker")
+    return optimize(walker(dataclasses.replace(settings, robot="walker")), "walker")
 
 
 if __name__ == "__main__":

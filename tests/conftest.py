@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
 
 import hypothesis
 import matplotlib
 import pytest
 import torch
+from tiny import tiny
 
 os.environ["MPLBACKEND"] = "Agg"  # also for the processes that tests start
 matplotlib.use("Agg")
@@ -38,3 +44,21 @@ def cuda() -> torch.device:
     if not torch.cuda.is_available():
         pytest.skip("needs a CUDA device")
     return torch.device("cuda")
+
+
+@pytest.fixture(scope="session")
+def recipes() -> Iterator[dict[str, ModuleType]]:
+    """The recipes around a run, as modules."""
+    path = str(Path(__file__).parents[1] / "recipes")
+    sys.path.insert(0, path)
+    try:
+        yield {name: importlib.import_module(name) for name in ("walker", "climber", "replay", "compare")}
+    finally:
+        sys.path.remove(path)
+
+
+@pytest.fixture(scope="session")
+def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
+    """The folder of an uninterrupted run of a tiny walker, to be left as it is, and what it returned."""
+    path = tmp_path_factory.mktemp("runs") / "straight"
+    return path, recipes["walker"].main(tiny(path))

@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 from problems import DT, WAYS, H, block, simulator, vector, ways
+from torch import Tensor
 
-from torchsoro import Force, SimulationDiverged
+from torchsoro import Body, Force, Prony, SimulationDiverged
 
 FREE = (0.0, 0.0, 0.0)
 COUNT = 64
@@ -110,3 +111,27 @@ def test_a_chamber_that_is_turned_inside_out_is_reported_but_void_is_not(segment
     (by_mass,) = torch.autograd.grad(run.position.square().sum(), void.mass)
     assert bool(torch.isfinite(by_mass).all())
     assert bool(by_mass.any())
+
+
+def test_what_is_partly_void_may_be_turned_inside_out_but_a_solid_may_not():
+    _, body = block()
+    body = replace(body, velocity=-0.3 / DT * (body.position - body.position.mean(0)))
+    grey = replace(body, filler=torch.full_like(body.mass, 0.3))
+    weight = torch.rand(21, COUNT, 3, generator=torch.Generator().manual_seed(1)).double()
+    change = body.mass * torch.rand(COUNT, generator=torch.Generator().manual_seed(2)).double()
+
+    def run(body: Body) -> Tensor:
+        settings = {"duration": 20 * DT, "gravity": FREE, "prony": Prony.paper(1), "sample_every": DT}
+        return simulator(formulation="total")(body, probes=torch.arange(COUNT), **settings).position
+
+    for filler in (None, torch.zeros_like(body.mass)):
+        with pytest.raises(SimulationDiverged, match=r"the volume ratio is not positive \(J = -"):
+            run(replace(body, filler=filler))
+    mass = body.mass.clone().requires_grad_()
+    position = run(replace(grey, mass=mass))
+    corner = (position[:, 0] - position.mean(1)) @ (body.position[0] - body.position.mean(0))
+    assert bool((corner < 0).any())  # on the other side: all of the body was inside out
+    (by_mass,) = torch.autograd.grad((weight * position).sum(), mass)
+    with torch.no_grad():
+        ends = [(weight * run(replace(grey, mass=body.mass + e * change))).sum() for e in (1e-5, -1e-5)]
+    torch.testing.assert_close(by_mass @ change, (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=0)

@@ -19,15 +19,17 @@ PACKAGE = ROOT / "torchsoro"
 # that is listed as a whole ("kernels") may import each other, as long as that makes no circle.
 ORDER = """
 errors storage
+document
 runtime
 domain
-field actuation contact rheology selfcontact
+field actuation contact selfcontact
 material
-loads
+materialfile loads
 kernels
 ops
 assembly
 simulator
+rheology
 objective
 lagrangian
 training
@@ -48,7 +50,7 @@ sim2real.fit
 sim2real.report
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}
-FOLDERS = {"kernels", "ops"}
+FOLDERS = {"kernels", "ops", "rheology"}
 
 KNOWS_TORCH_AND_TAICHI = {"ops", "runtime"}
 TOP_LEVEL = {

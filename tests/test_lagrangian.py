@@ -167,6 +167,41 @@ def test_nothing_happens_while_the_loss_still_changes():
     assert (problem.multiplier.item(), problem.penalty.item()) == (0.0, 1e-3)
 
 
+def events_of(problem, iterations, violation):
+    """Feed a loss that is never level; returns the iterations, from 1, at which something happened, and what."""
+    seen = ((k, problem.update(-(1.01**k), violation)) for k in range(1, iterations + 1))
+    return [(k, event.kind) for k, event in seen if event is not None]
+
+
+def test_patience_raises_the_penalty_without_a_plateau_and_counts_anew():
+    problem = new_problem(patience=6)
+    assert events_of(problem, 20, violation=1.0) == [(6, "penalty"), (12, "penalty"), (18, "penalty")]
+    assert problem.penalty.item() == pytest.approx(1.0)
+    assert events_of(new_problem(patience=6), 6, violation=0.4) == [(6, "multiplier")]
+    assert events_of(new_problem(patience=1), 3, violation=1.0) == [(k, "penalty") for k in (1, 2, 3)]
+
+
+def test_a_plateau_comes_before_patience_ends_and_restarts_it():
+    problem = new_problem(patience=20)
+    assert at_plateau(problem)[0] == 9
+    assert events_of(problem, 21, violation=1.0) == [(20, "penalty")]
+
+
+@pytest.mark.parametrize("margin", [0.0, -0.1])
+def test_patience_neither_acts_nor_stops_while_the_constraint_holds(margin):
+    problem = new_problem(patience=6)
+    assert events_of(problem, 40, violation=margin) == []
+    assert problem.penalty.item() == 1e-3
+    assert at_plateau(problem, violation=margin)[1].kind == "stop"  # which only a plateau brings
+
+
+def test_patience_goes_on_from_a_checkpoint():
+    first, second = new_problem(patience=6), new_problem(patience=6)
+    assert events_of(first, 4, violation=1.0) == []
+    second.load_state_dict(first.state_dict())
+    assert events_of(second, 3, violation=1.0) == [(2, "penalty")]
+
+
 # Convergence ----------------------------------------------------------------------------------------------------------
 
 
@@ -278,6 +313,9 @@ def test_everything_is_in_the_checkpoint_in_double_precision():
         ({"window": 0}, "window: got 0"),
         ({"window": 4.0}, "window: got 4.0"),
         ({"tolerance": 0.0}, "tolerance: got 0.0"),
+        ({"patience": -1}, "patience: got -1"),
+        ({"patience": 2.0}, "patience: got 2.0"),
+        ({"patience": True}, "patience: got True"),
     ],
 )
 def test_bad_settings_are_refused(changes, message):

@@ -1,7 +1,7 @@
 """Interpolation, filling, the Prony series and its discrete update, and the stable step."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import taichi as ti
@@ -13,7 +13,7 @@ from problems import DT, H, block, simulator
 import torchsoro
 from torchsoro import Body, Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
 from torchsoro.kernels import constitutive, layout
-from torchsoro.material import STABLE_COURANT, courant
+from torchsoro.material import STABLE_COURANT, courant, without_void
 from torchsoro.ops.rollout import initial_state
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
@@ -191,6 +191,24 @@ def test_fill_is_differentiable():
     assert not by[domain.region == Region.GAS].any()
     wanted = 1070 * H**3 * (1 - 1e-5) * 3 * gamma.detach() ** 2
     torch.testing.assert_close(by[domain.region != Region.GAS], wanted[domain.region != Region.GAS])
+
+
+def test_without_void_every_other_particle_is_left_as_it_was():
+    domain = chambers()
+    gamma = torch.linspace(0, 0.4, domain.count, dtype=torch.float64)
+    whole = fill(domain, gamma, solid=Solid(), filler=(0.1, 0.3))
+    body, keep = without_void(whole)
+    assert torch.equal(keep, (gamma > 0.1) | (domain.region == Region.GAS))
+    assert 0 < int(keep.sum()) < domain.count
+    for field in fields(Body):
+        value, seen = getattr(whole, field.name), getattr(body, field.name)
+        assert (seen is None) == (value is None), field.name
+        if value is not None:
+            assert torch.equal(seen, value[keep]), field.name
+    assert body.filler is not None and bool((body.filler[body.chamber < 0] > 0).any())  # grey stays
+    plain = fill(domain, gamma, solid=Solid())
+    body, keep = without_void(plain)
+    assert body is plain and bool(keep.all()) and len(keep) == domain.count
 
 
 # --------------------------------------------------------------------------------------------------------- stable step

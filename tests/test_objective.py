@@ -2,12 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.objective import center_of_gravity, intermediate_density, stride, total_mass, travel
+from torchsoro.objective import center_of_gravity, intermediate_density, mean_stride, stride, total_mass, travel
 
 torch.set_num_threads(1)
 
@@ -154,6 +155,36 @@ def test_bad_cycles_are_refused(start, period, message):
     cog, time = history()
     with pytest.raises(ValueError, match=message):
         stride(cog, time, start=start, period=period, direction=X)
+
+
+START = 0.01
+
+
+def speeding(duration):
+    """A way that speeds up, 2 t + 30 t^2 metres after the start, and its times, 1 ms apart."""
+    time = np.arange(round((START + duration) / 1e-3) + 1) * 1e-3
+    after = (time - START).clip(min=0)
+    return 2 * after + 30 * after**2, time
+
+
+def test_the_mean_stride_is_that_of_the_whole_cycles():
+    way, time = speeding(0.05)  # two cycles and a half
+    cog = torch.from_numpy(way)[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    each = stride(cog, torch.from_numpy(time), start=START, period=0.02, direction=(0, 0, 1))
+    assert len(each) == 2
+    assert mean_stride(way, time, start=START, period=0.02) == pytest.approx(float(each.mean()))
+
+
+def test_a_cycle_may_end_between_two_samples():
+    seen = mean_stride(*speeding(0.1), start=START, period=1 / 30)  # three cycles of 33.3 ms
+    assert seen == pytest.approx((2 * 0.1 + 30 * 0.01) / 3)
+    seen = mean_stride(*speeding(0.05), start=START, period=1 / 30)
+    assert seen == pytest.approx(2 / 30 + 30 / 30**2, rel=1e-3)
+
+
+def test_without_a_whole_cycle_there_is_no_mean_stride():
+    assert math.isnan(mean_stride(*speeding(0.1), start=START, period=0.2))
+    assert mean_stride(*speeding(0.1), start=START, period=0.1) == pytest.approx(2 * 0.1 + 30 * 0.01)
 
 
 # Intermediate density -------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib
 import json
 import math
 import os
@@ -12,9 +11,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import SimpleNamespace
 from typing import Any
 
 import imageio.v3 as iio
@@ -24,8 +22,9 @@ import pytest
 import torch
 import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import TINY
+from tiny import TINY, tiny
 
+from torchsoro.archive import load_design, load_shape
 from torchsoro.errors import SimulationDiverged
 from torchsoro.robot import climber, walker
 from torchsoro.settings import Settings
@@ -43,26 +42,6 @@ TAGS = (
     "grad_norm/phi",
     "time/iteration",
 )
-
-
-@pytest.fixture(scope="module")
-def recipes() -> Iterator[dict[str, ModuleType]]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield {name: importlib.import_module(name) for name in ("walker", "climber")}
-    finally:
-        sys.path.remove(str(RECIPES))
-
-
-def tiny(out: Path, **changes: Any) -> Settings:
-    return dataclasses.replace(TINY, out=out, **changes)
-
-
-@pytest.fixture(scope="module")
-def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
-    """The folder of an uninterrupted run of the walker, and what it returned."""
-    path = tmp_path_factory.mktemp("runs") / "straight"
-    return path, recipes["walker"].main(tiny(path))
 
 
 def metrics(path: Path) -> list[dict[str, str]]:
@@ -101,6 +80,17 @@ def test_the_settings_and_the_metrics_are_all_there(straight):
     assert result["C"] < float(rows[2]["constraint/C"])
     assert result["stride"] == pytest.approx(result["L"])  # a single cycle
     assert 0.004 < result["mass"] < 0.05
+    assert json.loads((path / "result.json").read_text()) == result
+    with (path / "metrics.csv").open(newline="") as file:
+        assert result["seconds"] == pytest.approx(sum(float(row["time/iteration"]) for row in csv.DictReader(file)))
+
+
+def test_the_first_design_is_kept_and_is_grey_around_the_chamber(straight):
+    path, _ = straight
+    assert [file.name for file in (path / "shapes").iterdir()] == ["00000.npz"]
+    robot = walker(TINY)
+    gamma = load_shape(path, robot.domain, 0)
+    assert torch.equal(gamma[robot.design], torch.full_like(gamma[robot.design], 0.5))
 
 
 def test_tensorboard_shows_every_scalar_and_the_shape_every_few_iterations(straight):
@@ -147,7 +137,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(recipes, straight,
     recipes["walker"].main(tiny(tmp_path / "run", iterations=1))
     again = recipes["walker"].main(tiny(tmp_path / "run", resume=True, picture_every=1, frames=2))
     assert_same_run(tmp_path / "run", straight[0])
-    seconds = ("forward", "backward")
+    seconds = ("forward", "backward", "seconds")
     assert {k: v for k, v in again.items() if k not in seconds} == {
         k: v for k, v in straight[1].items() if k not in seconds
     }
@@ -160,7 +150,7 @@ def command(settings: Settings) -> list[str]:
     flags = ["--resume"] if settings.resume else []
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        if field.name not in ("resume", "pressure_file"):
+        if field.name not in ("resume", "amend") and value is not None:
             flags.append("--" + field.name.replace("_", "-"))
             flags += map(str, value) if isinstance(value, tuple) else [str(value)]
     return [sys.executable, str(RECIPES / "walker.py"), *flags]
@@ -187,12 +177,12 @@ def test_a_run_killed_within_an_iteration_resumes_to_the_same_numbers(recipes, s
 
 def test_a_checkpoint_of_other_settings_is_refused_and_stays_whole(recipes, straight):
     path, _ = straight
-    held = {file.name: file.read_bytes() for file in path.iterdir()}
+    held = {file: file.read_bytes() for file in path.rglob("*.*")}
     with pytest.raises(ValueError, match=r"slope is 0\.3, the run has 0\.0"):
         recipes["walker"].main(tiny(path, resume=True, slope=0.3))
     with pytest.raises(ValueError, match="already holds a run; resume it"):
         recipes["walker"].main(tiny(path))
-    assert {file.name: file.read_bytes() for file in path.iterdir()} == held
+    assert {file: file.read_bytes() for file in path.rglob("*.*")} == held
 
 
 def test_a_bad_schedule_is_refused_before_the_folder_is_made(recipes, tmp_path):
@@ -212,8 +202,10 @@ def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_p
         "metrics.csv",
         "checkpoint.pt",
         "design.npz",
+        "shapes",
         "shape.stl",
         "shape.json",
+        "result.json",
         "climber.mp4",
         "summary.png",
     }
@@ -252,29 +244,89 @@ def test_the_command_line_refuses_without_a_traceback_and_before_any_work(recipe
     assert not (tmp_path / "run").exists()
 
 
-class Fragile(torch.nn.Module):
-    """A robot whose simulation breaks down where the design goes too far."""
+class Shaky(torch.nn.Module):
+    """A robot that falls over where its design goes beyond one limit, and whose simulation breaks down beyond another.
 
-    def __init__(self, limit: float) -> None:
+    Designs come nearer to 0 by halves: 1, 0.5, 0.25, 0.125.
+    """
+
+    def __init__(self, *, falls: float = math.inf, breaks: float = math.inf, upright: float = 1.0) -> None:
         super().__init__()
-        self.field = torch.nn.Module()
+        self.settings = SimpleNamespace(upright=upright, size=(1.0, 1.0, 2.0))
+        self.field: Any = torch.nn.Module()
         self.field.phi = torch.nn.Parameter(torch.ones(3))
         self.field.forward = lambda: self.field.phi + 0
-        self.limit = limit
+        self.falls, self.breaks = falls, breaks
+        self.tried: list[float] = []
 
-    def forward(self, gamma: torch.Tensor, *, gravity_scale: float) -> float:
-        if float(gamma.detach().max()) > self.limit:
+    def forward(self, gamma: torch.Tensor, *, gravity_scale: float) -> SimpleNamespace:
+        assert gravity_scale == 0.5
+        self.tried.append(gamma.max().item())
+        if self.tried[-1] > self.breaks:
             raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J", batch=0, remedy="none")
-        return gravity_scale
+        return SimpleNamespace(fall=torch.tensor(0.3 if self.tried[-1] > self.falls else 0.1), tried=self.tried[-1])
 
 
-def test_a_design_that_breaks_down_goes_back_towards_the_last_one_that_did_not(recipes):
-    robot, good = Fragile(0.3), torch.zeros(3)
+@pytest.mark.parametrize(
+    ("limits", "tried"),
+    [
+        ({}, [1]),
+        ({"breaks": 0.3}, [1, 0.5, 0.25]),
+        ({"falls": 0.3}, [1, 0.5, 0.25]),
+        ({"breaks": 0.6, "falls": 0.2}, [1, 0.5, 0.25, 0.125]),
+        ({"falls": 0.0}, [1, 0.5, 0.25, 0.125]),  # it still falls, and that is accepted
+        ({"falls": 0.0, "upright": 0.0}, [1]),  # where falling is not punished it is no failure
+    ],
+)
+def test_a_design_that_falls_over_or_breaks_down_goes_back_towards_the_last_good_one(recipes, limits, tried):
+    robot, good = Shaky(**limits), torch.zeros(3)
     gamma, outcome = recipes["walker"].simulate(robot, good, 0.5)
-    torch.testing.assert_close(gamma.detach(), torch.full((3,), 0.25), rtol=0, atol=0)
-    assert outcome == 0.5
+    assert robot.tried == tried
+    assert outcome.tried == tried[-1]
+    assert gamma.requires_grad
+    assert gamma.tolist() == robot.field.phi.tolist() == [tried[-1]] * 3
+    assert not good.any()
+
+
+@pytest.mark.parametrize("falls", [math.inf, 0.3])
+def test_a_simulation_that_breaks_down_on_the_last_try_as_well_ends_the_run(recipes, falls):
+    robot = Shaky(breaks=0.1, falls=falls)
     with pytest.raises(SimulationDiverged):
-        recipes["walker"].simulate(Fragile(0.1), good, 0.5)
+        recipes["walker"].simulate(robot, torch.zeros(3), 0.5)
+    assert robot.tried == [1, 0.5, 0.25, 0.125]
+
+
+def test_a_robot_has_fallen_when_it_sank_by_more_than_a_tenth_of_its_height(recipes):
+    for upright, fall, fell in ((1.0, 0.21, True), (1.0, 0.19, False), (0.01, 0.21, True), (0.0, 1.0, False)):
+        outcome = SimpleNamespace(fall=torch.tensor(fall))
+        assert recipes["walker"].fell(Shaky(upright=upright), outcome) == fell
+
+
+def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, monkeypatch):
+    recipe = recipes["walker"]
+    monkeypatch.setattr(recipe, "fell", lambda robot, outcome: True)
+    monkeypatch.setattr(recipe, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field())))
+    monkeypatch.setattr(recipe, "deliver", lambda *_, **__: {})
+    recipe.main(tiny(tmp_path / "run", iterations=2))
+    start = walker(TINY).field.phi
+    assert torch.equal(items(tmp_path / "run")["good"], start)
+    assert not torch.equal(items(tmp_path / "run")["field"]["phi"], start)
+
+
+def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path, monkeypatch):
+    recipe = recipes["walker"]
+    delivered = []
+    monkeypatch.setattr(recipe, "deliver", lambda path, robot, gamma, *_, **__: delivered.append(gamma) or {})
+    # Every design but the first is within the limit on C.
+    settings = tiny(tmp_path / "run", c_max=0.249, gravity_steps=1, gravity_every=2, iterations=2)
+    recipe.main(settings)
+    assert items(settings.out)["best"]["worth"] == -math.inf
+    robot = walker(settings)
+    robot.field.load_state_dict(items(settings.out)["field"])
+    assert torch.equal(delivered[0], robot.field())  # without a best one the last is delivered
+    recipe.main(dataclasses.replace(settings, iterations=3, resume=True))
+    last = float(metrics(settings.out)[2]["objective/L"])
+    assert items(settings.out)["best"]["worth"] == pytest.approx(last / robot.domain.cell, rel=1e-6)
 
 
 def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
@@ -284,4 +336,10 @@ def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
         rows = list(csv.DictReader(file))
     kept = [float(row["objective/L"]) for row in rows if float(row["constraint/C"]) <= settings.c_max]
     assert 0 < len(kept) < len(rows)
-    assert result["L"] == pytest.approx(max(kept), rel=1e-5)
+    robot = walker(settings)
+    with torch.no_grad():
+        robot.field.phi.copy_(items(settings.out)["best"]["phi"])
+        best = robot.field().half().float()  # as it is stored
+        assert torch.equal(load_design(settings.out / "design.npz", robot.domain), best)
+        assert items(settings.out)["best"]["worth"] == pytest.approx(max(kept) / robot.domain.cell, rel=1e-6)
+        assert result["L"] == pytest.approx(robot(best).travel.item(), rel=1e-6)

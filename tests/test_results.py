@@ -1,10 +1,9 @@
-"""What a finished run leaves: the mean stride, the planes in pictures, the part with its port, the shape on screen."""
+"""What a finished run leaves: the planes in pictures, the part with its port, the shape on screen."""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-from types import SimpleNamespace
+import json
 from typing import Any
 
 import numpy as np
@@ -13,39 +12,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import TINY
 
-from torchsoro.objective import stride
-from torchsoro.results import _mean_stride, drawn_planes, print_part, show_shape
+from torchsoro.results import drawn_planes, print_part, show, show_shape
 from torchsoro.robot import climber, walker
 from torchsoro.training import RunFolder
-
-
-def moving(*, frequency: float, duration: float) -> Any:
-    """A robot and a motion that speeds up: 2 t + 30 t^2 metres after settling, sampled each 1 ms."""
-    robot = SimpleNamespace(
-        settings=dataclasses.replace(TINY, frequency=frequency, duration=duration), direction=(0.0, 0.0, 1.0)
-    )
-    time = torch.arange(round((TINY.settle + duration) / 1e-3) + 1, dtype=torch.float64) * 1e-3
-    after = (time - TINY.settle).clamp(min=0)
-    way = torch.stack([torch.zeros_like(time), 9 * time, 2 * after + 30 * after**2], -1)
-    return robot, SimpleNamespace(time=time, center_of_gravity=way)
-
-
-def test_the_mean_stride_is_that_of_the_whole_cycles():
-    robot, motion = moving(frequency=50.0, duration=0.05)  # two cycles and a half
-    each = stride(motion.center_of_gravity, motion.time, start=TINY.settle, period=0.02, direction=(0, 0, 1))
-    assert len(each) == 2
-    assert _mean_stride(robot, motion) == pytest.approx(float(each.mean()))
-
-
-def test_a_cycle_may_end_between_two_samples():
-    robot, motion = moving(frequency=30.0, duration=0.1)  # three cycles of 33.3 ms
-    assert _mean_stride(robot, motion) == pytest.approx((2 * 0.1 + 30 * 0.01) / 3)
-    robot, motion = moving(frequency=30.0, duration=0.05)
-    assert _mean_stride(robot, motion) == pytest.approx(2 / 30 + 30 / 30**2, rel=1e-3)
-
-
-def test_without_a_whole_cycle_there_is_no_stride():
-    assert math.isnan(_mean_stride(*moving(frequency=5.0, duration=0.1)))
 
 
 def test_pictures_get_the_planes_of_the_robot():
@@ -83,3 +52,20 @@ def test_the_shape_goes_to_tensorboard_as_picture_and_mesh(tmp_path):
     assert [event.step for event in seen.Images("shape/picture")] == [0, 4]
     assert seen.Images("shape/picture")[0].encoded_image_string.startswith(b"\x89PNG")
     assert [event.step for event in seen.Tensors("shape/mesh_VERTEX")] == [0, 4]
+
+
+@pytest.mark.parametrize("void", [True, False])
+def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run(void, tmp_path, monkeypatch):
+    robot = walker(dataclasses.replace(TINY, frames=2))
+    gamma = (robot.domain.positions[:, 0] < 0.008).float()  # void in front
+    asked: list[dict[str, Any]] = []
+    forward = robot.forward
+    monkeypatch.setattr(robot, "forward", lambda gamma, **how: asked.append(how) or forward(gamma, **how))
+    found, part = show(tmp_path, robot, gamma, name="stump", void=void)
+    assert asked == [{"everything": True, "void": void}]
+    assert {file.name for file in tmp_path.iterdir()} == {"stump.mp4", "shape.stl", "shape.json"}
+    assert json.loads((tmp_path / "shape.json").read_text())["mass_g"] == part.report.mass_g
+    assert found["C"] == 0
+    # Body and wall, without air; of grey there is none.
+    solid = (robot.design & (gamma == 1) | robot.wall).sum() * robot.domain.volume * TINY.density
+    assert found["mass"] == pytest.approx(float(solid), rel=1e-3)

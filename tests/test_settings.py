@@ -38,7 +38,6 @@ def test_every_setting_can_be_overridden():
     text = {Path: "elsewhere", bool: None, int: "7", float: "0.125"}
     special = {
         "friction": ("0.4",),
-        "pressure_file": ("measured.csv",),
         # Times are whole numbers of these.
         "dt": ("0.0000125",),
         "sample_every": ("0.005",),
@@ -62,7 +61,7 @@ def test_every_setting_can_be_overridden():
         elif isinstance(held, tuple):
             values = (text[type(held[0])],) * len(held)
         else:
-            values = (text[type(held)] if not isinstance(held, Path) else "elsewhere",)
+            values = ("elsewhere" if held is None or isinstance(held, Path) else text[type(held)],)
         preset = () if field.name == "preset" else ("--preset", "paper")
         seen = getattr(parse(*preset, flag, *values), field.name)
         if field.name != "settle":
@@ -120,8 +119,8 @@ def test_the_help_names_every_setting_with_its_words_and_keeps_commands_on_their
     [
         *[(name, bad) for name in ("gravity", "slope", "room", "upright") for bad in (-0.1, math.inf, math.nan)],
         *[(name, bad) for name in ("duration", "frequency", "learning_rate", "dt") for bad in (0.0, -1.0, math.nan)],
-        *[(name, 0) for name in ("iterations", "window", "gravity_every", "picture_every", "frames")],
-        *[(name, -1) for name in ("gravity_steps", "halvings")],
+        *[(name, 0) for name in ("iterations", "window", "gravity_every", "picture_every", "shape_every", "frames")],
+        *[(name, -1) for name in ("gravity_steps", "halvings", "patience")],
         *[("c_max", bad) for bad in (0.0, 0.25, math.nan)],
         ("settle", 0.0100625),  # half a substep too long
         ("duration", 0.0200625),

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -202,6 +203,59 @@ def test_free_settings_may_change_on_resume(tmp_path):
     other = {"seed": 1, "chamber": {"wall": 0.1}, "iterations": 9}
     RunFolder(tmp_path, other, resume=True, free=("chamber", "iterations")).close()
     assert json.loads((tmp_path / "settings.json").read_text()) == other
+
+
+@pytest.fixture
+def at_once(monkeypatch) -> None:
+    """No waiting between two event files, for tests that look at none."""
+    monkeypatch.setattr(RunFolder, "_wait_for_next_second", lambda self: None)
+
+
+def notes(path: Path) -> list[tuple[int, dict[str, list[Any]]]]:
+    """The amendments of a run."""
+    return [(one["iteration"], one["changes"]) for one in json.loads((path / "amendments.json").read_text())]
+
+
+def go_on(path: Path, until: int, **changes: Any) -> None:
+    """Resume a run with amended settings, and save an iteration."""
+    with RunFolder(path, {**SETTINGS, **changes}, resume=True, free=("iterations",), amend=True) as run:
+        run.save(until)
+
+
+def test_an_amendment_has_to_be_asked_for_and_is_noted_with_its_iteration(tmp_path, at_once):
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.save(4)
+    with pytest.raises(ValueError, match=r"seed is 2, the run has 1; resume .* or amend it"):
+        RunFolder(tmp_path, {**SETTINGS, "seed": 2}, resume=True)
+    assert not (tmp_path / "amendments.json").exists()
+    go_on(tmp_path, 4, iterations=9)
+    assert not (tmp_path / "amendments.json").exists()  # what may change by itself needs no note
+    go_on(tmp_path, 7, seed=2, iterations=10)
+    first = (5, {"seed": [1, 2]})
+    assert notes(tmp_path) == [first]
+    go_on(tmp_path, 8, seed=2)
+    RunFolder(tmp_path, {**SETTINGS, "seed": 2}, resume=True).close()  # the amended settings are the run's from now on
+    assert notes(tmp_path) == [first]
+    go_on(tmp_path, 9, seed=2, chamber={"wall": 0.002, "size": (0.1, 0.2)}, extra=True)
+    second = {"chamber.wall": [0.00175, 0.002], "extra": ["absent", True]}
+    assert notes(tmp_path) == [first, (9, second)]
+    assert json.loads((tmp_path / "settings.json").read_text())["chamber"]["wall"] == 0.002
+
+
+def test_amendments_that_no_iteration_used_are_dropped(tmp_path, at_once):
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.save(4)
+    early = (tmp_path / "checkpoint.pt").read_bytes()
+    RunFolder(tmp_path, {**SETTINGS, "seed": 2}, resume=True, amend=True).close()  # killed in its first iteration
+    go_on(tmp_path, 9, seed=3)
+    go_on(tmp_path, 12, seed=4)
+    assert notes(tmp_path) == [(5, {"seed": [1, 3]}), (10, {"seed": [3, 4]})]
+    (tmp_path / "checkpoint.pt").write_bytes(early)
+    go_on(tmp_path, 6, seed=7)
+    assert notes(tmp_path) == [(5, {"seed": [1, 7]})]
+    (tmp_path / "checkpoint.pt").write_bytes(early)
+    go_on(tmp_path, 6)  # as it was at first
+    assert notes(tmp_path) == []
 
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path):

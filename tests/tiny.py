@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 from torchsoro.settings import Settings
 
@@ -27,3 +29,8 @@ TINY = Settings(
     picture_every=2,
     frames=6,
 )
+
+
+def tiny(out: Path, **changes: Any) -> Settings:
+    """The same in a folder of its own, with changes."""
+    return dataclasses.replace(TINY, out=out, **changes)

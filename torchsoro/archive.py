@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import typing
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -63,10 +63,12 @@ def load_design(path: Path, domain: Domain) -> Tensor:
     if not path.is_file():
         raise ValueError(f"path: there is no file {path}, wanted a design (.npz)")
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             gamma, shape = stored["gamma"], tuple(int(n) for n in stored["shape"])
             spacing = float(stored["spacing"])
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        if gamma.shape != (math.prod(shape),):
+            raise ValueError(f"densities of shape {gamma.shape} for {shape} particles")
+    except Exception as error:  # a damaged archive can fail in any way
         raise ValueError(
             f"path: {path} is no design ({error}), wanted an .npz with gamma, shape and spacing"
         ) from error
@@ -75,6 +77,15 @@ def load_design(path: Path, domain: Domain) -> Tensor:
             f"path: {path} is on {shape} particles {spacing:g} m apart, wanted {domain.shape} at {domain.spacing:g} m"
         )
     return torch.from_numpy(gamma.astype(np.float32))
+
+
+def kept_iterations(folder: Path) -> list[int]:
+    """Iterations whose designs a run or an archived robot has kept."""
+    packed = folder / "shapes.npz"
+    if packed.is_file():
+        with np.load(packed, allow_pickle=False) as stored:
+            return stored["iteration"].tolist()
+    return sorted(int(path.stem) for path in (folder / "shapes").glob("*.npz") if path.stem.isdigit())
 
 
 def load_shape(folder: Path, domain: Domain, iteration: int) -> Tensor:
@@ -89,20 +100,23 @@ def load_shape(folder: Path, domain: Domain, iteration: int) -> Tensor:
         Density [N], float32; of an archived robot to 1/255.
 
     Raises:
-        ValueError: if the iteration was not kept; names those that were.
+        ValueError: if the iteration was not kept (names those that were), or is on another lattice.
     """
-    packed = folder / "shapes.npz"
+    packed, kept = folder / "shapes.npz", kept_iterations(folder)
+    if iteration not in kept:
+        raise ValueError(f"iteration: got {iteration}, {folder} holds {', '.join(map(str, kept)) or 'none'}")
     if not packed.is_file():
         return load_design(folder / "shapes" / f"{iteration:05d}.npz", domain)
     with np.load(packed, allow_pickle=False) as stored:
-        kept = stored["iteration"].tolist()
-        if iteration not in kept:
-            raise ValueError(f"iteration: got {iteration}, {packed} holds {', '.join(map(str, kept))}")
-        return torch.from_numpy(stored["gamma"][kept.index(iteration)].astype(np.float32) / 255)
+        gamma = stored["gamma"]
+    found = torch.from_numpy(gamma[kept.index(iteration)].astype(np.float32) / 255)
+    if found.shape != (domain.count,):
+        raise ValueError(f"folder: {packed} holds {len(found)} particles, wanted {domain.count}")
+    return found
 
 
 def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) -> None:
-    """Copy what is worth keeping of a finished run: design, some early designs, settings, metrics, summary.
+    """Copy what is worth keeping of a finished run: design, some early designs, settings, metrics, result, summary.
 
     Args:
         run: The run's folder.
@@ -111,12 +125,17 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
         iterations: Early designs to keep; those the run does not have are left out.
 
     Raises:
-        ValueError: if the run is not finished (it has no design or no summary).
+        ValueError: if the run is not finished (it has no design or no summary), or its pressure or material is in a
+            file elsewhere.
     """
     files = ("design.npz", "metrics.csv", "summary.png", "settings.json", "result.json")
     if missing := [name for name in files if not (run / name).is_file()]:
         raise ValueError(f"run: {run} has no {', '.join(missing)}, wanted a finished run")
+    held = read_settings(run / "settings.json")
+    if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
+        raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
     folder.mkdir(parents=True, exist_ok=True)
+    files += ("amendments.json",) if (run / "amendments.json").is_file() else ()
     for name in files:
         with atomic_write(folder / name) as file:
             file.write((run / name).read_bytes())
@@ -138,7 +157,7 @@ def read_settings(path: Path, **changes: object) -> Settings:
         The settings; names that the file does not have keep their defaults.
 
     Raises:
-        ValueError: if there is no such file, it is damaged, or a name or value in it is none of the settings.
+        ValueError: if there is no such file, it is damaged, or a name in it is none of the settings.
     """
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

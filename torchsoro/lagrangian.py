@@ -109,7 +109,7 @@ class AugmentedLagrangian(nn.Module):
     While the constraint holds the loss is -L, so that the stop is the paper's rule on the objective.
 
     Where the objective is rough its mean may never level off; with ``patience`` the multiplier or the penalty is raised
-    at the latest after so many iterations in which the constraint did not hold. Only a plateau stops.
+    in any case when the constraint does not hold so many iterations after the last time. Only a plateau stops.
 
     The objective should be dimensionless and of order one (a distance in cells, not in metres), since the first
     penalties are small numbers without a unit.

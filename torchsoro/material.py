@@ -275,8 +275,13 @@ def without_void(body: Body) -> tuple[Body, Tensor]:
     if body.filler is None:
         return body, torch.ones_like(body.chamber, dtype=torch.bool)
     keep = body.filler < 1
+    return part(body, keep), keep
+
+
+def part(body: Body, keep: Tensor) -> Body:
+    """The particles of a body, without a batch, that are to be kept, bool [N]."""
     given = {field.name: value[keep] for field in fields(Body) if (value := getattr(body, field.name)) is not None}
-    return replace(body, **given), keep
+    return replace(body, **given)
 
 
 def _void(gamma: Tensor, low: float, high: float) -> Tensor:

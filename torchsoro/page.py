@@ -235,9 +235,8 @@ def gait_panels(
     bounds = bounds_of([motion.placed[i][0] for i in picked])
     width = 0.965 / count
     # Seen more from the side than the other views: the panels are small and the travel lies in the page.
-    camera = Camera(
-        camera.azimuth + (0.5 * (-90 - camera.azimuth) if -90 < camera.azimuth < 0 else 0), 0.75 * camera.elevation
-    )
+    azimuth = camera.azimuth + (0.5 * (-90 - camera.azimuth) if -90 < camera.azimuth < 0 else 0)
+    camera = Camera(azimuth, 0.75 * camera.elevation, camera.tilt)
     start = float(motion.cog[picked[0], motion.along])
     for column, i in enumerate(picked):
         view = figure.add_axes((0.018 + column * width, 0.125, width * 0.985, 0.245))

@@ -128,6 +128,7 @@ def movie(
     title: str | None = None,
     azimuth: float = -65.0,
     elevation: float = 16.0,
+    tilt: float = 0.0,
     width: int = 960,
     height: int = 640,
     level: float = 0.5,
@@ -147,6 +148,7 @@ def movie(
         title: written above.
         azimuth: of the camera [degrees].
         elevation: of the camera [degrees].
+        tilt: by which all is turned, so that a slope whose ground was kept level rises along +x [degrees].
         width: in pixels; a multiple of 16 for .mp4.
         height: in pixels; a multiple of 16 for .mp4.
         level: density at the surface.
@@ -163,7 +165,7 @@ def movie(
     if target.suffix.lower() == ".mp4" and (width % 16 or height % 16):
         raise ValueError(f"width, height: got {width} x {height}, want multiples of 16 for .mp4")
     motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level)
-    pictures = _pictures(motion, planes, Camera(azimuth, elevation), title, fps, width, height)
+    pictures = _pictures(motion, planes, Camera(azimuth, elevation, tilt), title, fps, width, height)
     # ffmpeg writes to a path of its own, so a movie moves to its place when it is complete.
     with tempfile.TemporaryDirectory() as folder:
         temporary = Path(folder) / target.name
@@ -257,6 +259,7 @@ def summary(
     title: str | None = None,
     azimuth: float = -65.0,
     elevation: float = 16.0,
+    tilt: float = 0.0,
     level: float = 0.5,
 ) -> Path:
     """Write the page of a run: shape, histories of L and C, one cycle of the gait, path of the centre of gravity.
@@ -276,6 +279,7 @@ def summary(
         title: written above.
         azimuth: of the camera [degrees].
         elevation: of the camera [degrees].
+        tilt: as for a movie [degrees].
         level: density at the surface.
 
     Returns:
@@ -292,7 +296,7 @@ def summary(
     figure, canvas = canvas_of(1760, 1120, 110)
     if title:
         figure.text(0.03, 0.975, title, va="top", fontsize=17, weight="bold", color=INK)
-    camera = Camera(azimuth, elevation)
+    camera = Camera(azimuth, elevation, tilt)
     view = figure.add_axes((0.02, 0.46, 0.34, 0.46))
     vertices, cavity = motion.shape.place(as_array(domain.positions))
     Scene(view, motion.shape, camera, planes, bounds_of([vertices]), along=motion.along).show(vertices, cavity, None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -98,6 +99,7 @@ def show(
         "gamma": density,
         "planes": drawn_planes(robot),
         "direction": robot.direction,
+        "tilt": math.degrees(math.atan(s.slope)),
     }
     movie(
         path / f"{name}.mp4",

@@ -14,6 +14,7 @@ from torchsoro.domain import Chamber, Domain
 from torchsoro.errors import SimulationDiverged
 from torchsoro.field import DesignField
 from torchsoro.material import AIR, Body, Gas, Prony, Solid, fill, without_void
+from torchsoro.materialfile import read_material
 from torchsoro.objective import center_of_gravity, intermediate_density, total_mass, travel
 from torchsoro.settings import Settings
 from torchsoro.simulator import Simulator, Trajectory
@@ -81,6 +82,9 @@ class Robot(nn.Module):
             air = AIR if s.formulation == "total" else Gas().density
         self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=air)
         self.prony = Prony.paper(s.elements)
+        if s.material is not None:
+            found = read_material(s.material)
+            self.solid, self.prony = found.solid, found.prony
         self.pressure = _pressure(s)
         angle = math.atan(s.slope)
         # Uphill along +x, with the ground kept level: gravity leans back instead.
@@ -100,8 +104,8 @@ class Robot(nn.Module):
             gamma: Density [N].
             gravity_scale: Share of gravity.
             everything: Record every particle (for pictures) and not only the centre of gravity.
-            void: Simulate void, too. Without it a finished design takes half the time, and L hardly changes; in what is
-                recorded, void then moves with the centre of gravity.
+            void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
+                in what is recorded, void then moves with the centre of gravity.
 
         Returns:
             Travel, intermediate density, mass, centre of gravity, trajectory.

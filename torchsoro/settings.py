@@ -56,6 +56,8 @@ class Settings:
     """Density of the solid [kg/m3]."""
     elements: int = 3
     """Maxwell elements of the paper's Table S1, 0 to 5."""
+    material: Path | None = None
+    """Another solid instead, Maxwell elements and all: a material.toml, as recipes/material.py writes."""
     epsilon: float = 1e-5
     """What the void keeps of the solid's mass and stiffness."""
     power: float = 3.0

@@ -94,10 +94,9 @@ class RunFolder:
                 self.start = payload["iteration"] + 1
             columns, rows = read_metrics(self.path / "metrics.csv", self.start)
         self.path.mkdir(parents=True, exist_ok=True)
-        for file in ("checkpoint.pt", "metrics.csv", "settings.json"):
+        for file in ("checkpoint.pt", "metrics.csv", "settings.json", "amendments.json"):
             (self.path / f"{file}.tmp").unlink(missing_ok=True)  # a killed process may have left one
-        if changed:
-            self._note(changed)
+        self._note(changed)
         with atomic_write(self.path / "settings.json") as file:
             file.write((json.dumps(self.settings, indent=2, allow_nan=False) + "\n").encode())
         self._metrics = MetricsFile(self.path / "metrics.csv", columns, rows)
@@ -344,13 +343,15 @@ class RunFolder:
             )
 
     def _note(self, changed: Mapping[str, tuple[Any, Any]]) -> None:
-        """Add to the amendments; those from this iteration on were never used."""
+        """Add to the amendments, and drop those from this iteration on, which were never used."""
         path = self.path / "amendments.json"
-        noted = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
-        noted = [one for one in noted if one["iteration"] < self.start]
-        noted.append({"iteration": self.start, "changes": {name: list(pair) for name, pair in changed.items()}})
-        with atomic_write(path) as file:
-            file.write((json.dumps(noted, indent=2) + "\n").encode())
+        held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+        noted = [one for one in held if one["iteration"] < self.start]
+        if changed:
+            noted.append({"iteration": self.start, "changes": {name: list(pair) for name, pair in changed.items()}})
+        if noted != held:
+            with atomic_write(path) as file:
+                file.write((json.dumps(noted, indent=2) + "\n").encode())
 
 
 def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -23,14 +23,27 @@ def least_ratio(filler):
 
 
 @ti.func
+def fade(ratio, least):
+    """Smooth step from 0 where a solid is turned inside out to 1 at the least volume ratio, and its slope."""
+    share, slope = ratio * 0 + 1, ratio * 0
+    if ratio < least:
+        t = ti.max(ratio, 0) / least
+        share, slope = t * t * (3 - 2 * t), 6 * t * (1 - t) / least
+    return share, slope
+
+
+@ti.func
 def pull_back(F, least):
     """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(C)/3 C^-1) / J with C = F^T F (in Eq. 8).
 
-    J counts as at least ``least``, here and in the other laws of the solid.
+    J counts as at least ``least``, here and in the other laws of the solid. Below that S fades out, since turned inside
+    out it would push the wrong way.
     """
-    J = ti.max(F.determinant(), least)
+    ratio = F.determinant()
+    J = ti.max(ratio, least)
     C = F.transpose() @ F
-    return plus_identity(cofactor(C) * (-C.trace() / (3 * J * J * J)), 1 / J)
+    share, _ = fade(ratio, least)
+    return share * plus_identity(cofactor(C) * (-C.trace() / (3 * J * J * J)), 1 / J)
 
 
 @ti.func
@@ -39,6 +52,7 @@ def pull_back_adjoint(F, least, S_bar):
     cof = cofactor(F)
     ratio = contract(cof, F) / 3
     J = ti.max(ratio, least)
+    share, slope = fade(ratio, least)
     C = F.transpose() @ F
     trace, G = C.trace(), cofactor(C)
     scale = 1 / (3 * J * J * J)
@@ -46,8 +60,8 @@ def pull_back_adjoint(F, least, S_bar):
     C_bar = plus_identity(cross(C, S_bar) * (-trace * scale), -along)
     J_bar = -S_bar.trace() / (J * J) + 3 * trace * along / J
     if ratio < least:
-        J_bar = 0 * J
-    return 2 * F @ C_bar + J_bar * cof
+        J_bar = slope * (S_bar.trace() / J - trace * along)
+    return share * (2 * F @ C_bar) + J_bar * cof
 
 
 @ti.func
