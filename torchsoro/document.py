@@ -58,17 +58,17 @@ class Document:
         self._parts.append(f"<pre>{html.escape(lines)}</pre>")
 
     def table(self, rows: Sequence[Mapping[str, Any]], caption: str = "") -> None:
-        """Rows with the same keys, which become the head; numbers with four digits, NaN and None as a dash.
+        """Rows; their keys become the head. Numbers with four digits; what is missing, NaN or None as a dash.
 
         Raises:
-            ValueError: without rows, or with rows of different keys.
+            ValueError: without rows.
         """
-        if not rows or any(list(row) != list(rows[0]) for row in rows):
-            raise ValueError("rows: wanted at least one, and the same keys in all")
-        head = "".join(f"<th>{html.escape(str(key))}</th>" for key in rows[0])
+        if not rows:
+            raise ValueError("rows: wanted at least one")
+        keys = list(dict.fromkeys(key for row in rows for key in row))
+        head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
         body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(shown(value))}</td>" for value in row.values()) + "</tr>"
-            for row in rows
+            "<tr>" + "".join(f"<td>{html.escape(shown(row.get(key)))}</td>" for key in keys) + "</tr>" for row in rows
         )
         title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         self._parts.append(f"<table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")

@@ -1,0 +1,103 @@
+"""From a file of sweeps to a material that a robot is made of, on sweeps whose material is known; and the shaker."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+import torch
+from tiny import TINY
+
+from torchsoro.material import Prony, Solid
+from torchsoro.materialfile import read_material
+from torchsoro.robot import walker
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+MODULUS = 0.44e6  # Pa
+TEMPERATURES = (5.0, 20.0, 30.0, 40.0)
+
+
+@pytest.fixture(scope="module")
+def modules() -> Iterator[dict[str, ModuleType]]:
+    sys.path.insert(0, str(RECIPES))
+    try:
+        yield {name: importlib.import_module(name) for name in ("material", "shaker")}
+    finally:
+        sys.path.remove(str(RECIPES))
+
+
+def moduli(prony: Prony, omega: np.ndarray) -> np.ndarray:
+    return np.stack([part.numpy() for part in prony.storage_loss(torch.from_numpy(omega))])
+
+
+def sweeps(path: Path, prony: Prony, permanent: float = 1.0) -> Path:
+    """Sweeps at four temperatures of the paper's resin, WLF with C1 = 5 and C2 = 100 K at 20 C; 1 % of noise."""
+    rng = np.random.default_rng(5)
+    frequency = np.geomspace(0.01, 100, 25)
+    lines = ["T_C,f_Hz,E_storage_MPa,E_loss_MPa"]
+    for t in TEMPERATURES:
+        shift = 10 ** (-5 * (t - 20) / (100 + t - 20))
+        storage, loss = moduli(prony, 2 * np.pi * frequency * shift)
+        storage = storage - 1 + permanent
+        noise = np.exp(0.01 * rng.standard_normal((2, len(frequency))))
+        rows = zip(frequency, noise[0] * storage * MODULUS / 1e6, noise[1] * loss * MODULUS / 1e6, strict=True)
+        lines += [f"{t},{f!r},{e!r},{g!r}" for f, e, g in (map(float, row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_file_of_sweeps_becomes_the_material_that_made_it(modules, tmp_path):
+    recipe = modules["material"]
+    truth = Prony.paper(3)
+    file = sweeps(tmp_path / "resin.csv", truth)
+    options = recipe.Options(file=file, out=tmp_path / "out", reference=20.0, band=(1.0, 50.0))
+    found = recipe.main(options)
+    assert abs(found.shift.log_a - [5 * 15 / 85, 0, -5 * 10 / 110, -5 * 20 / 120]).max() < 0.02
+    read = read_material(tmp_path / "out" / "material.toml")
+    assert read.solid.youngs_modulus == pytest.approx(MODULUS, rel=0.02)
+    omega = 2 * np.pi * np.geomspace(1, 50, 20)
+    scale = read.solid.youngs_modulus / MODULUS
+    np.testing.assert_allclose(scale * moduli(read.prony, omega), moduli(truth, omega), rtol=0.03)
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Time-temperature superposition" in page and page.count("<img") == 3
+    assert read.left_out in page.replace("&#x27;", "'")
+    robot = walker(dataclasses.replace(TINY, material=tmp_path / "out" / "material.toml", dt="auto"))
+    assert robot.prony.elements == read.prony.elements
+    again = recipe.main(dataclasses.replace(options, file=tmp_path / "out" / "master.csv", out=tmp_path / "again"))
+    assert again.shift is None
+    assert again.spectrum.error == pytest.approx(found.spectrum.error, rel=1e-6)
+
+
+def test_what_relaxes_after_the_horizon_counts_as_permanent_and_the_report_says_so(modules, tmp_path):
+    file = sweeps(tmp_path / "slow.csv", Prony(moduli=torch.tensor([1.0, 1.0]), times=torch.tensor([3.0, 0.01])))
+    options = modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0, horizon=0.3)
+    found = modules["material"].main(options)
+    assert found.material.solid.youngs_modulus == pytest.approx(2 * MODULUS, rel=0.05)
+    assert found.material.left_out.startswith("What is left after 0.3 s, 0.8")
+
+
+def test_a_melt_is_refused_and_the_way_out_is_named(modules, tmp_path):
+    file = sweeps(tmp_path / "melt.csv", Prony(moduli=torch.ones(1), times=torch.full((1,), 1e-3)), permanent=0.0)
+    with pytest.raises(ValueError, match=r"melt\.csv shows a material that flows, .*--equilibrium"):
+        modules["material"].main(modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0))
+
+
+def test_the_shaker_has_the_resonance_of_a_spring_and_its_simulation_agrees(modules):
+    shaker = modules["shaker"]
+    solid = Solid(youngs_modulus=1.2e7, poisson_ratio=0.4, density=1200.0)
+    prony = Prony(moduli=torch.tensor([0.6]).double(), times=torch.tensor([5e-4]).double())
+    frequency, mass = np.linspace(200, 900, 200), 0.3
+    storage, loss = solid.shear * moduli(prony, 2 * np.pi * frequency)
+    exact = shaker.closed_form(storage, loss, frequency, mass)
+    top = int(exact.argmax())
+    stiffness = 2 * storage[top] * shaker.AREA / shaker.THICKNESS
+    assert frequency[top] == pytest.approx(np.sqrt(stiffness / (mass + shaker.RUBBER / 3)) / (2 * np.pi), rel=0.05)
+    (seen,) = shaker.simulated(solid, prony, frequency, [mass], across=2, width=0.018, duration=0.03)
+    assert frequency[seen.argmax()] == pytest.approx(frequency[top], rel=0.06)
+    assert seen.max() == pytest.approx(exact[top], rel=0.05)

@@ -1,0 +1,98 @@
+"""From creep to relaxation: the same linear viscoelastic solid or liquid in its two spectra, exactly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchsoro.rheology.leastsquares import Found, Problem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Relaxing:
+    """A relaxation spectrum: equilibrium modulus and moduli [1 + M] Pa, relaxation times [M] s, the shortest first."""
+
+    values: np.ndarray
+    times: np.ndarray
+
+
+def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarray, times: np.ndarray) -> Relaxing:
+    """The relaxation spectrum of J(t) = J_0 + t / eta + sum_k J_k (1 - exp(-t / lambda_k)).
+
+    In the Laplace domain s J(s) and s E(s) are each other's inverse (Ferry, Viscoelastic Properties of Polymers, 3rd
+    ed., ch. 3). So relaxation rates are where s J(s) is zero, one above each retardation rate (and above zero, with
+    flow), and the moduli are the residues there.
+
+    Args:
+        instantaneous: J_0 [1/Pa], positive.
+        fluidity: 1 / eta [1/(Pa s)]; 0 for a solid.
+        compliances: J_k [K] 1/Pa, positive.
+        times: Retardation times lambda_k [K] s.
+    """
+    rates, weights = 1 / times, compliances / times / instantaneous
+    if fluidity > 0:
+        rates, weights = np.append(rates, 0.0), np.append(weights, fluidity / instantaneous)
+    rates, same = np.unique(rates, return_inverse=True)
+    weights = np.bincount(same, weights)
+    # Zeros of 1 - sum_j w_j / (rho - r_j), one in each gap; their distances from the lower end, lest digits cancel.
+    gaps = np.append(np.diff(rates), weights.sum())
+    low, high = np.log(gaps) - 80.0, np.log(gaps)
+    behind = rates[:, None] - rates
+    for _ in range(80):
+        middle = (low + high) / 2
+        above = (weights / (behind + np.exp(middle)[:, None])).sum(1) < 1
+        low, high = np.where(above, low, middle), np.where(above, middle, high)
+    distance = np.exp((low + high) / 2)
+    found = rates + distance
+    moduli = 1 / (instantaneous * found * (weights / (behind + distance[:, None]) ** 2).sum(1))
+    equilibrium = 0.0 if fluidity > 0 else 1 / (instantaneous + compliances.sum())
+    return Relaxing(values=np.append(equilibrium, moduli[::-1]), times=1 / found[::-1])
+
+
+def relaxing(problem: Problem, found: Found, *, optimised: bool) -> tuple[Relaxing, np.ndarray]:
+    """The relaxation spectrum of a fitted retardation spectrum, and how well it is known.
+
+    Without instantaneous compliance that of the fastest term stands for it. Terms with zero compliance fall out.
+
+    Args:
+        problem: Creep: columns of the instantaneous compliance, of the flow unless there is an equilibrium, of terms.
+        found: Compliances and retardation times.
+        optimised: Whether those times were fitted.
+
+    Returns:
+        The spectrum, and the standard errors of the logarithms of its values [1 + M] for residuals of variance one
+        (Laplace's approximation; 0 for an equilibrium modulus that is not there).
+    """
+    constant, times, first = found.values[: problem.first], found.times, problem.first
+    used = np.flatnonzero(found.values[first:] > 0)
+    if constant[0] == 0:
+        constant = np.append(found.values[first + used[0]], constant[1:])
+        used = used[1:]
+    matrix, slope = problem.matrix(times)
+    there = np.flatnonzero(constant > 0)
+    values = np.concatenate([constant[there], found.values[first + used]])
+    columns = [matrix[:, there] * values[: len(there)], matrix[:, first + used] * values[len(there) :]]
+    if optimised:
+        columns.append(slope[:, used] * found.values[first + used])
+    jacobian = np.column_stack(columns)  # by the logarithms of compliances and times
+
+    def spectrum(logs: np.ndarray) -> Relaxing:
+        spread = np.exp(logs[: len(values)]) * values
+        fixed = np.zeros(2)
+        fixed[there] = spread[: len(there)]
+        moved = times[used] * np.exp(logs[len(values) :]) if optimised else times[used]
+        return interconverted(fixed[0], fixed[1], spread[len(there) :], moved)
+
+    step = 1e-5
+    turn = [
+        (_logs(spectrum(step * unit)) - _logs(spectrum(-step * unit))) / (2 * step)
+        for unit in np.eye(jacobian.shape[1])
+    ]
+    covariance = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-14)
+    errors = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", turn, covariance, turn), 0))
+    return spectrum(np.zeros(jacobian.shape[1])), errors
+
+
+def _logs(spectrum: Relaxing) -> np.ndarray:
+    return np.log(np.where(spectrum.values > 0, spectrum.values, 1.0))
