@@ -33,6 +33,8 @@ from torchsoro.rheology.superposition import Shift, arrhenius, master, superpose
 from torchsoro.settings import plain_errors
 from torchsoro.storage import atomic_write
 
+WORST = 5.0  # quality of an overlap above which two curves do not superpose
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
@@ -54,6 +56,8 @@ class Options:
     """Temperature of the robot [deg C], to which all is shifted; 20 if left out, or the nearest that was measured."""
     vertical: bool = False
     """Shift moduli, too, and not only frequencies."""
+    moduli: Literal["both", "storage", "loss"] = "both"
+    """Which of a sweep's moduli tell the shifts; an instrument's loss modulus is often off at high stiffness."""
     elements: int | Literal["auto"] = "auto"
     """Maxwell elements of the master curve; auto lets the data decide."""
     equilibrium: float | None = None
@@ -108,7 +112,7 @@ def main(options: Options) -> Found:
         if reference is None:
             measured = [c.temperature for c in curves]
             reference = min(max(20.0, min(measured)), max(measured))
-        shift = superpose(curves, reference=reference, vertical=options.vertical)
+        shift = superpose(curves, reference=reference, vertical=options.vertical, moduli=options.moduli)
         curve = master(curves, shift)
     spectrum, remark = permanent(curve, options)
     solid = spectrum.solid(options.poisson_ratio, options.density)
@@ -123,7 +127,7 @@ def main(options: Options) -> Found:
     material = Material(
         solid=solid,
         prony=kept.prony(),
-        left_out=f"{remark}{priced.sentence} {kept.sentence}",
+        left_out=f"{doubts(shift) if shift else ''}{remark}{priced.sentence} {kept.sentence}",
         source={
             "file": options.file.name,
             "temperature_C": f"{curve.temperature:g}",
@@ -191,6 +195,7 @@ def report(found: Found, options: Options) -> Document:
         page.section("Time-temperature superposition")
         page.figure(draw_shift(found.curves, found.shift, found.curve), "Measured, and shifted to one temperature.")
         page.table(shift_rows(found.shift), "Shift factors and their standard errors, in decades")
+        page.text(doubts(found.shift) or "All neighbours superpose within their noise.")
         page.text(laws(found.shift) if enough(found.shift) else "Too few temperatures for a law of the shift factors.")
     page.section("Maxwell elements")
     page.figure(draw_spectrum(found.curve, spectrum), "The master curve and its Maxwell elements.")
@@ -208,6 +213,18 @@ def shift_rows(shift: Shift) -> list[dict[str, float]]:
     columns = (shift.temperatures, shift.log_a, shift.log_a_error, shift.log_b)
     names = ("temperature [C]", "log10 a_T", "standard error", "log10 b_T")
     return [dict(zip(names, map(float, row), strict=True)) for row in zip(*columns, strict=True)]
+
+
+def doubts(shift: Shift) -> str:
+    """Where neighbouring curves do not superpose; empty if they all do."""
+    bad = [o for o in shift.overlap if o.quality > WORST or o.common < 0]
+    if not bad:
+        return ""
+    where = ", ".join(f"{o.cold:.3g} and {o.hot:.3g} C" for o in bad)
+    return (
+        f"Neighbours that do not superpose (they differ by more than {WORST:g} times their noise, or do not overlap): "
+        f"{where}. See whether the storage modulus alone (--moduli storage) or vertical shifts (--vertical) do better. "
+    )
 
 
 def enough(shift: Shift) -> bool:
