@@ -47,6 +47,7 @@ class Check:
         finer: Particles along an edge, as a multiple of the design's.
         iteration: Design of this iteration instead of the final one.
         motion: Keep the motion for pictures.
+        void: Simulate void, too.
     """
 
     title: str
@@ -55,6 +56,7 @@ class Check:
     finer: int = 1
     iteration: int | None = None
     motion: bool = False
+    void: bool = True
 
 
 def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
@@ -81,7 +83,8 @@ def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
         "3_Hz": Check(title="3 Hz", changes={"frequency": 3.0}, long=True),
         "five_elements": Check(title="five Maxwell elements", changes={"elements": 5}),
         "half_cell": Check(title="half the cell size", finer=2),
-        "updated": Check(title="updated formulation (MLS-MPM)", changes=updated),
+        "half_cell_without_void": Check(title="half the cell size, void left out", finer=2, void=False),
+        "updated": Check(title="updated formulation (MLS-MPM), void left out", changes=updated, void=False),
         "updated_half_cell": Check(title="updated formulation, half the cell size", changes=updated, finer=2),
     }
     return found | {f"iteration_{k}": Check(title=f"iteration {k}", iteration=k, motion=True) for k in iterations}
@@ -118,7 +121,7 @@ def perform(folder: Path, base: Settings, check: Check) -> tuple[Robot, torch.Te
     gamma = load_design(folder / "design.npz", coarse) if at is None else load_shape(folder, coarse, at)
     gamma = finer(gamma, base.particles, check.finer).to(s.target)
     with torch.no_grad():
-        return robot, gamma, robot(gamma, everything=check.motion)
+        return robot, gamma, robot(gamma, everything=check.motion, void=check.void)
 
 
 def row(robot: Robot, outcome: Outcome, base: Settings, check: Check, seconds: float) -> dict[str, Any]:
