@@ -167,8 +167,8 @@ def problem(
     filler[:, ::4], filler[:, 1::7] = 0, 1
     coefficients[:, layout.FILLER] = filler
     # The stretches here are small: numbers that they bring to bear.
-    coefficients[:, layout.STIFFENING] *= 3
-    coefficients[:, layout.STIFFENING + 1] *= 30
+    coefficients[:, layout.STIFFENING] *= 30
+    coefficients[:, layout.STIFFENING + 1] *= 300
     coefficients[..., kind == layout.ABSENT] = 0
     gravity = 0.3 * randn(steps, batch, 3)
     gravity[..., 2] -= 1

@@ -205,18 +205,24 @@ def travelled(body, way, *, prony=None, dt=DT / 4, steps=80):
 
 @ways("apic", "total")
 @pytest.mark.parametrize("size", [1.0, 0.0])
-def test_gradient_by_stiffening(way, size):
+def test_gradients_of_a_body_that_stiffens(way, size):
     body, prony = stretched(a=0.8 * size, b=0.5 * size), Prony.paper(2)
-    assert body.stiffening is not None
-    leaf = body.stiffening.clone().requires_grad_()
-    (by,) = torch.autograd.grad(travelled(replace(body, stiffening=leaf), way, prony=prony)[0], leaf)
-    for k in range(2):
-        change = torch.rand(96, generator=torch.Generator().manual_seed(k)).double()[:, None] * vector(1 - k, k)
-        ends = [
-            travelled(replace(body, stiffening=leaf.detach() + e * change), way, prony=prony)[0] for e in (-1e-4, 1e-4)
-        ]
-        assert float((by * change).sum()) == pytest.approx(float(ends[1] - ends[0]) / 2e-4, rel=1e-5)
-    # It matters: half as stiff again goes elsewhere.
+
+    def end(leaves):
+        moved = replace(body, **{name: leaves[name] for name in ("stiffening", "shear", "velocity")})
+        return travelled(moved, way, prony=Prony(moduli=leaves["moduli"], times=prony.times))[0]
+
+    given = {name: getattr(body, name) for name in ("stiffening", "shear", "velocity")} | {"moduli": prony.moduli}
+    leaves = {name: t.clone().requires_grad_() for name, t in given.items()}
+    found = dict(zip(leaves, torch.autograd.grad(end(leaves), list(leaves.values())), strict=True))
+    for seed, (name, scale) in enumerate({"stiffening": 1e-4, "shear": 1e1, "velocity": 1e-4, "moduli": 1e-4}.items()):
+        for column in range(2 if name == "stiffening" else 1):
+            change = torch.rand(given[name].shape, generator=torch.Generator().manual_seed(seed)).double() * scale
+            if name == "stiffening":
+                change = change * vector(1 - column, column)
+            ends = [end({**given, name: given[name] + sign * change}) for sign in (-1, 1)]
+            assert float((found[name] * change).sum()) == pytest.approx(float(ends[1] - ends[0]) / 2, rel=2e-5), name
+    # It matters: without, the body goes elsewhere.
     plain = travelled(replace(body, stiffening=None), way, prony=prony)[1]
     assert bool((travelled(body, way, prony=prony)[1] - plain).abs().max() > 1e-4 * H) == (size > 0)
 
