@@ -13,7 +13,7 @@ from problems import DT, H, block, rotations, simulator, vector, ways
 import torchsoro
 from torchsoro import Chamber, Domain, Gas, Prony, Region, Solid, fill
 from torchsoro.kernels import stress, tensor
-from torchsoro.material import courant
+from torchsoro.material import SOFTEST, courant
 from torchsoro.ops.lattice import Lattice
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
@@ -281,13 +281,25 @@ def test_stiffening_does_not_change_the_limit_at_rest(formulation):
     assert courant(body, Prony.paper(3), **settings) == courant(plain, Prony.paper(3), **settings)
 
 
-@pytest.mark.parametrize(("a", "b"), [(math.nan, 0.0), (0.0, -0.1), (-0.1, 0.0), (-1.0, 0.25), (0.0, math.inf)])
-def test_a_law_that_some_stretch_softens_to_nothing_is_refused(a, b):
-    with pytest.raises(
-        ValueError, match=r"^linear_stiffening, quadratic_stiffening = .*: wanted 1 \+ a x \+ b x\^2 pos"
-    ):
+@pytest.mark.parametrize(("a", "b"), [(math.nan, 0.0), (0.0, -0.1), (-0.1, 0.0), (-0.7, 0.25), (0.0, math.inf)])
+def test_a_law_whose_stress_falls_is_refused(a, b):
+    with pytest.raises(ValueError, match=r"^linear_stiffening, quadratic_stiffening = .*: wanted a, b with b >= 0 and"):
         Solid(linear_stiffening=a, quadratic_stiffening=b)
-    Solid(linear_stiffening=-0.9, quadratic_stiffening=0.25)
+
+
+@given(log_b=st.floats(-12, 6), over=st.floats(0, 5))
+def test_the_stress_of_a_solid_that_is_accepted_falls_nowhere(log_b, over):
+    b = math.exp(log_b)
+    a = (over - SOFTEST) * math.sqrt(b)
+    Solid(linear_stiffening=a, quadratic_stiffening=b)
+    for invariant, stress_of, low in (
+        (lambda v: v**2, lambda v: v, 0.0),
+        (lambda v: v**2 + 2 / v - 3, lambda v: v - v**-2, 0.05),
+        (lambda v: 2 * v**2 + v**-4 - 3, lambda v: v - v**-5, 0.2),
+    ):
+        v = torch.linspace(low, 40, 20_001, dtype=torch.float64)
+        x = invariant(v)
+        assert bool(((1 + a * x + b * x**2) * stress_of(v)).diff().gt(0).all())
 
 
 @pytest.mark.parametrize(

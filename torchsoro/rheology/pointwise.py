@@ -157,16 +157,27 @@ def _with_free(stretch: Tensor, dt: Tensor, law: Law, sides: int) -> tuple[Tenso
         raise ValueError(f"dt: shape {tuple(dt.shape)}, wanted a length for each of {tuple(stretch.shape)} samples")
     _check("stretch", stretch)
     _check("dt", dt)
+    isochoric = (sides - 3) / sides * torch.log(stretch)
+    if not law.times.shape[-1]:  # without a memory all samples at once
+        each = replace(
+            law, shear=law.shear.unsqueeze(-1), bulk=law.bulk.unsqueeze(-1), stiffening=law.stiffening.unsqueeze(-2)
+        )
+        none = torch.zeros(2, dtype=stretch.dtype)
+        step = _Step(given=stretch, Q=none, felt=none[0], law=each, sides=sides)
+        log_free = step.solve(isochoric)
+        stress = step.balance(log_free)[3]
+        return stress, torch.exp(log_free).expand(stress.shape)
     decay, gain = law.discrete(dt)
     felt = (law.moduli.unsqueeze(-2) * gain).sum(-1)
     H = S = torch.zeros(2, dtype=gain.dtype)  # along what is given, and what is free
-    log_free = torch.zeros((), dtype=stretch.dtype)
+    log_free, last = torch.zeros((), dtype=stretch.dtype), 0
     stresses, frees = [], []
     for n in range(stretch.shape[-1]):
         kept = decay[..., n, :, None] * H - gain[..., n, :, None] * S.unsqueeze(-2)
         Q = (law.moduli.unsqueeze(-1) * kept).sum(-2)
         step = _Step(given=stretch[..., n], Q=Q, felt=felt[..., n], law=law, sides=sides)
-        log_free = step.solve(log_free)
+        log_free = step.solve(log_free + isochoric[..., n] - last)
+        last = isochoric[..., n]
         S, stress = step.balance(log_free)[2:]
         H = kept + gain[..., n, :, None] * S.unsqueeze(-2)
         stresses.append(stress)
