@@ -299,7 +299,7 @@ class _Problem:
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """Derivatives of the scaled stress [n, K]."""
-        return (self.stress(x + 1j * _STEP * np.eye(len(x))).imag / _STEP).T
+        return (np.imag(self.stress(x + 1j * _STEP * np.eye(len(x)))) / _STEP).T
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -395,7 +395,7 @@ class _Problem:
             named |= {f"g{row}": numbers[:, 3 + at], f"tau{row}": numbers[:, 3 + self.elements + at]}
         found = {}
         for name, value in named.items():
-            slope, middle = value.imag / _STEP, float(value.real[0])
+            slope, middle = np.imag(value) / _STEP, float(np.real(value[0]))
             half = wide * math.sqrt(max(float(slope @ covariance @ slope), 0.0))
             if name in ("a", "C20", "b", "C30"):
                 least = 0.0 if stable and (name in ("b", "C30") or self.order == 1) else -math.inf

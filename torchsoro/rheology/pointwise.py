@@ -93,12 +93,31 @@ def history(S: Tensor, dt: Tensor, law: Law) -> Tensor:
     if not law.times.shape[-1]:
         return torch.zeros_like(S)
     decay, gain = law.discrete(dt)
-    change = torch.cat([S[..., :1, :, :], S.diff(dim=-3)], -3).flatten(-2)
-    H, found = torch.zeros((), dtype=S.dtype), []
-    for n in range(S.shape[-3]):
-        H = decay[..., n, :, None] * H + gain[..., n, :, None] * change[..., n, None, :]
-        found.append((law.moduli.unsqueeze(-1) * H).sum(-2))
-    return torch.stack(found, -2).unflatten(-1, (3, 3))
+    H = _recurrence(decay.unsqueeze(-1), gain.unsqueeze(-1) * _change(S.flatten(-2)).unsqueeze(-2))
+    return (law.moduli[..., None, :, None] * H).sum(-2).unflatten(-1, (3, 3))
+
+
+def _change(S: Tensor) -> Tensor:
+    """From step to step [..., T, k], at rest before the first."""
+    return torch.cat([S[..., :1, :], S.diff(dim=-2)], -2)
+
+
+def _recurrence(decay: Tensor, drive: Tensor) -> Tensor:
+    """All H_n = decay_n H_(n-1) + drive_n [..., T, M, k] at once, from 0 on: spans of steps that double are joined.
+
+    Args:
+        decay: [..., T, M, 1].
+        drive: [..., T, M, k].
+    """
+    span, count = 1, drive.shape[-3]
+    while span < count:
+        late, early = slice(span, None), slice(None, count - span)
+        joined = drive[..., late, :, :] + decay[..., late, :, :] * drive[..., early, :, :]
+        drive = torch.cat([drive[..., :span, :, :], joined], -3)
+        joined = decay[..., late, :, :] * decay[..., early, :, :]
+        decay = torch.cat([decay[..., :span, :, :], joined], -3)
+        span *= 2
+    return drive
 
 
 def stress(F: Tensor, dt: Tensor, law: Law) -> Tensor:
@@ -157,89 +176,87 @@ def _with_free(stretch: Tensor, dt: Tensor, law: Law, sides: int) -> tuple[Tenso
         raise ValueError(f"dt: shape {tuple(dt.shape)}, wanted a length for each of {tuple(stretch.shape)} samples")
     _check("stretch", stretch)
     _check("dt", dt)
-    isochoric = (sides - 3) / sides * torch.log(stretch)
-    if not law.times.shape[-1]:  # without a memory all samples at once
-        each = replace(
-            law, shear=law.shear.unsqueeze(-1), bulk=law.bulk.unsqueeze(-1), stiffening=law.stiffening.unsqueeze(-2)
-        )
-        none = torch.zeros(2, dtype=stretch.dtype)
-        step = _Step(given=stretch, Q=none, felt=none[0], law=each, sides=sides)
-        log_free = step.solve(isochoric)
-        stress = step.balance(log_free)[3]
-        return stress, torch.exp(log_free).expand(stress.shape)
-    decay, gain = law.discrete(dt)
-    felt = (law.moduli.unsqueeze(-2) * gain).sum(-1)
-    H = S = torch.zeros(2, dtype=gain.dtype)  # along what is given, and what is free
-    log_free, last = torch.zeros((), dtype=stretch.dtype), 0
-    stresses, frees = [], []
-    for n in range(stretch.shape[-1]):
-        kept = decay[..., n, :, None] * H - gain[..., n, :, None] * S.unsqueeze(-2)
-        Q = (law.moduli.unsqueeze(-1) * kept).sum(-2)
-        step = _Step(given=stretch[..., n], Q=Q, felt=felt[..., n], law=law, sides=sides)
-        log_free = step.solve(log_free + isochoric[..., n] - last)
-        last = isochoric[..., n]
-        S, stress = step.balance(log_free)[2:]
-        H = kept + gain[..., n, :, None] * S.unsqueeze(-2)
-        stresses.append(stress)
-        frees.append(torch.exp(log_free).expand(stress.shape))
-    return torch.stack(stresses, -1), torch.stack(frees, -1)
+    law = replace(law, shear=law.shear.unsqueeze(-1), bulk=law.bulk.unsqueeze(-1))
+    free = _Free(given=stretch, dt=dt, law=law, sides=sides)
+    log_free = free.solve((sides - 3) / sides * torch.log(stretch))
+    stress = free.balance(log_free)[2]
+    return stress, torch.exp(log_free).expand(stress.shape)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Step:
-    """One step with free sides, in the principal stretches l_1 (given) and l_2 (free).
+class _Free:
+    """A path with free sides, in the principal stretches l_1 (given) and l_2 (free).
 
     Attributes:
-        given: l_1 [...].
-        Q: What the elements keep, but for what S of this step adds: sum_i g_i (a H - b S_before) [..., 2].
-        felt: sum_i g_i b_i, by which S of this step adds [...].
-        law: The material.
+        given: l_1 [..., T].
+        dt: [..., T] s.
+        law: The material, its moduli mu and K with an axis for the steps.
         sides: How many of the three stretches are free.
     """
 
     given: Tensor
-    Q: Tensor
-    felt: Tensor
+    dt: Tensor
     law: Law
     sides: int
 
-    def solve(self, guess: Tensor) -> Tensor:
-        """The ln l_2 that frees the sides, with its first derivatives."""
-        law = replace(self.law, **{name: _plain(getattr(self.law, name)) for name in ("shear", "bulk", "stiffening")})
-        plain = replace(self, given=_plain(self.given), Q=_plain(self.Q), felt=_plain(self.felt), law=law)
-        u = _plain(guess)
-        for _ in range(_NEWTON):
-            value, slope, *_ = plain.balance(u)
+    def solve(self, u: Tensor) -> Tensor:
+        """The ln l_2 [..., T] that free the sides, with their first derivatives, from a guess.
+
+        Newton's steps for all steps of the path at once, in which what the elements remember of the steps before
+        follows a round later. Nearly incompressible it is little; else the steps become right one after the other.
+        """
+        real = {k: _plain(getattr(self.law, k)) for k in ("shear", "bulk", "stiffening", "moduli", "times")}
+        plain = replace(self, given=_plain(self.given), dt=_plain(self.dt), law=Law(**real))
+        u = _plain(u)
+        for rounds in range(1, _NEWTON + u.shape[-1]):  # noqa: B007
+            value, slope, _ = plain.balance(u)
             change = (value / slope).clamp(-0.5, 0.5)
             u = u - change
             if bool((change.abs() < 1e-13).all()):
                 break
         else:
             raise ValueError("no lateral stretch frees the sides: the law loses its stiffness, or bulk is not positive")
-        # One more step changes nothing, but brings the derivatives of the implicit function.
-        value, slope, *_ = self.balance(u)
-        return u - value / _plain(slope)
+        # As many rounds more change nothing, but bring the derivatives of the implicit function.
+        for _ in range(rounds if self.moving else 0):
+            value, slope, _ = self.balance(u)
+            u = u - value / _plain(slope)
+        return u
 
-    def balance(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """At u = ln l_2: Kirchhoff stress along l_2 and its slope by u, S along both, nominal stress along l_1."""
+    @property
+    def moving(self) -> bool:
+        """Whether a derivative is asked for."""
+        numbers = (self.given, *(getattr(self.law, k) for k in ("shear", "bulk", "stiffening", "moduli", "times")))
+        return any(t.is_complex() or t.requires_grad for t in numbers)
+
+    def balance(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """At u = ln l_2: Kirchhoff stress along l_2, its slope by u within a step, and nominal stress along l_1."""
         law, m = self.law, self.sides
         c = (3 - m) / 3
-        (a, b), (q_1, q_2) = law.stiffening.unbind(-1), self.Q.unbind(-1)
+        a, b = law.stiffening.unsqueeze(-2).unbind(-1)
         first, second = self.given**2, torch.exp(2 * u)
         J = self.given ** (3 - m) * torch.exp(m * u)
         shrink = J ** (-2 / 3)
         trace = (3 - m) * first + m * second
         x = shrink * trace - 3
         factor, gap = 1 + x * (a + b * x), second - first
+        Q, felt = torch.zeros(2, dtype=u.dtype), torch.zeros((), dtype=u.dtype)
+        if law.times.shape[-1]:
+            S = torch.stack([factor / J * (1 - trace / (3 * square)) for square in (first, second)], -1)
+            decay, gain = law.discrete(self.dt)
+            H = _recurrence(decay.unsqueeze(-1), gain.unsqueeze(-1) * _change(S).unsqueeze(-2))
+            Q = (law.moduli[..., None, :, None] * H).sum(-2)
+            felt = (law.moduli.unsqueeze(-2) * gain).sum(-1)  # how much of S of a step it feels itself
         # The deviatoric parts of Fb A Fb^T along l_2 and l_1 differ by ``spread``, and their sum is zero.
-        at_once, kept = factor * (1 + self.felt) * gap, J * (second * q_2 - first * q_1)
-        spread = shrink * (at_once + kept)
+        q_1, q_2 = Q.unbind(-1)
+        spread = shrink * (factor * gap + J * (second * q_2 - first * q_1))
         mean = law.bulk / 2 * (J * (J - 1) + torch.log(J))
-        slope = (a + 2 * b * x) * 2 * m * c * shrink * gap * (1 + self.felt) * gap
-        slope = slope + 2 * factor * (1 + self.felt) * second + m * kept + 2 * J * second * q_2
+        # For the slope, what they keep from the steps before is told from what they feel of this one.
+        kept = J * (second * q_2 - first * q_1) - factor * felt * gap
+        kept_2 = J * second * q_2 - felt * factor * (second - trace / 3)
+        slope = (a + 2 * b * x) * 2 * m * c * shrink * gap * (1 + felt) * gap
+        slope = slope + 2 * factor * (1 + felt) * second + m * kept + 2 * kept_2
         slope = c * law.shear * (shrink * slope - 2 * m / 3 * spread) + law.bulk / 2 * m * (J * (2 * J - 1) + 1)
-        S = torch.stack([factor / J * (1 - trace / (3 * square)) for square in (first, second)], -1)
-        return mean + c * law.shear * spread, slope, S, (mean - m / 3 * law.shear * spread) / self.given
+        return mean + c * law.shear * spread, slope, (mean - m / 3 * law.shear * spread) / self.given
 
 
 def _plain(t: Tensor) -> Tensor:
