@@ -82,7 +82,9 @@ class Experiment:
     def invariant(self) -> np.ndarray:
         """I1 - 3 of an incompressible solid at each sample [n]."""
         s = self.deformation
-        return {"shear": s**2, "uniaxial": s**2 + 2 / s - 3, "equibiaxial": 2 * s**2 + s**-4 - 3}[self.mode]
+        if self.mode == "shear":
+            return s**2
+        return s**2 + 2 / s - 3 if self.mode == "uniaxial" else 2 * s**2 + s**-4 - 3
 
     def rms(self) -> float:
         """Root mean square of the stress [Pa]."""
