@@ -11,7 +11,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 import torch
@@ -125,7 +124,6 @@ def fit(
     *,
     order: int = 2,
     elements: int = 0,
-    spectrum: Literal["free", "power"] = "free",
     poisson_ratio: float = 0.495,
     stable: bool = True,
     specimens: bool = False,
@@ -140,14 +138,10 @@ def fit(
         experiments: Tests of one material, of any modes.
         order: Stiffening terms: 0 for neo-Hooke, 1 for a, 2 for a and b.
         elements: Number of Maxwell elements, 0 to 5.
-        spectrum: "free" for moduli and times of each element; "power" for times in equal ratios between two fitted
-            ends and moduli that go with a power of the time, four numbers for three elements or more, which tests at
-            a few rates far apart determine better.
         poisson_ratio: Of the law, 0 to below 0.5.
         stable: Keep to laws whose stress grows with every stretch, also beyond the tests, which ``Solid`` asks for.
         specimens: Let the specimens differ by a factor of their stress, whose geometric mean is 1.
-        start: A fit with one element less and a free spectrum, else alike, to begin with; the new one is added where
-            it helps most.
+        start: A fit with one element less, else alike, to begin with; the new one is added where it helps most.
 
     Raises:
         ValueError: for no tests, tests without stress, or numbers outside their range.
@@ -159,15 +153,13 @@ def fit(
             f"order, elements, poisson_ratio = {order}, {elements}, {poisson_ratio}: wanted 0 to 2, 0 to 5, and 0 to "
             "below 0.5"
         )
-    if spectrum not in ("free", "power") or (spectrum == "power" and elements < 3):
-        raise ValueError(f'spectrum = {spectrum!r} of {elements}: wanted "free", or "power" of 3 elements or more')
-    problem = _Problem(experiments, order, elements, spectrum == "power", poisson_ratio, stable, specimens)
+    problem = _Problem(experiments, order, elements, poisson_ratio, stable, specimens)
     found = [problem.solve(guess) for guess in problem.guesses(start)]
     return problem.report(min(found, key=lambda f: f.cost))
 
 
 def ladder(experiments: Sequence[Experiment], *, most: int, **settings) -> list[Fit]:
-    """Fits with 0, 1, ... up to ``most`` Maxwell elements of a free spectrum, each begun from the one before."""
+    """Fits with 0, 1, ... up to ``most`` Maxwell elements, each begun from the one before."""
     fits: list[Fit] = []
     for elements in range(most + 1):
         fits.append(fit(experiments, elements=elements, start=fits[-1] if fits else None, **settings))
@@ -214,14 +206,12 @@ class _Problem:
     """Residuals of a fit in its unknowns.
 
     These are ln mu; what a exceeds its least by and sqrt(b), or a and b themselves, in units of the tests; then ln of
-    the elements' moduli [Pa] and ln of their times [s], or of a power law ln of its modulus in the middle, its slope,
-    and ln of its ends; then ln of the factors of all specimens but the first.
+    the elements' moduli [Pa] and ln of their times [s]; then ln of the factors of all specimens but the first.
     """
 
     experiments: Sequence[Experiment]
     order: int
     elements: int
-    power: bool
     poisson_ratio: float
     stable: bool
     specimens: bool
@@ -271,12 +261,7 @@ class _Problem:
         elif self.order == 2:
             a, b = x[..., 1:2] / self.largest, x[..., 2:3] / self.largest**2
         rest = x[..., 1 + self.order : x.shape[-1] - self.others]
-        if self.power:
-            at = np.linspace(0, 1, self.elements)
-            log_times = rest[..., 2:3] * at + rest[..., 3:4] * (1 - at)
-            log_moduli = rest[..., :1] + rest[..., 1:2] * (log_times - rest[..., 2:].mean(-1, keepdims=True))
-        else:
-            log_moduli, log_times = rest[..., : self.elements], rest[..., self.elements :]
+        log_moduli, log_times = rest[..., : self.elements], rest[..., self.elements :]
         return np.concatenate([mu, a, b, np.exp(log_moduli) / mu, np.exp(log_times)], -1)
 
     @property
@@ -307,24 +292,19 @@ class _Problem:
         middle, (fast, slow), m = math.log(self.secant), self.window, self.elements
         small, large = middle - math.log(1e4), middle + math.log(1e4)
         least = 0.0 if self.stable else -np.inf
-        moduli, times = ([small], [fast, fast]) if self.power else ([small] * m, [fast] * m)
-        low = [small, *[least] * self.order, *moduli, *[-2.0] * self.power, *times, *[-3.0] * self.others]
-        moduli, times = ([large], [slow, slow]) if self.power else ([large] * m, [slow] * m)
-        high = [large, *[np.inf] * self.order, *moduli, *[2.0] * self.power, *times, *[3.0] * self.others]
+        low = [small, *[least] * self.order, *[small] * m, *[fast] * m, *[-3.0] * self.others]
+        high = [large, *[np.inf] * self.order, *[large] * m, *[slow] * m, *[3.0] * self.others]
         return np.array(low), np.array(high)
 
     def guesses(self, start: Fit | None) -> list[np.ndarray]:
         """Where to begin."""
         middle, (fast, slow), m = math.log(self.secant), self.window, self.elements
-        if start is not None and m == len(start.moduli) + 1 and not self.power:
+        if start is not None and m == len(start.moduli) + 1:
             elastic, rest, factors = np.split(start.unknowns, [1 + self.order, 2 * m - 1 + self.order])
             places = np.linspace(fast, slow, 7)[1:-1]
             before = [*elastic, *rest[: m - 1], middle - 1, *rest[m - 1 :]]
             return [np.array([*before, place, *factors]) for place in places]
         elastic, factors = [middle, *[0.1] * self.order], [0.0] * self.others
-        if self.power:
-            third = (slow - fast) / 3
-            return [np.array([*elastic, middle - 1, -0.2, slow - third, fast + third, *factors])]
         return [np.array([*elastic, *[middle - 1] * m, *np.linspace(slow, fast, m + 2)[1:-1], *factors])]
 
     def solve(self, guess: np.ndarray) -> OptimizeResult:
@@ -337,8 +317,8 @@ class _Problem:
             jac=self.jacobian,  # pyright: ignore[reportArgumentType]
             bounds=(low, high),
             x_scale="jac",
-            ftol=1e-9,
-            xtol=1e-9,
+            ftol=1e-8,
+            xtol=1e-8,
             max_nfev=150,
         )
 
