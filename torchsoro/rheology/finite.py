@@ -132,7 +132,8 @@ def read(path: str | Path, *, name: str | None = None, rate: float | None = None
             follow from the way.
 
     Raises:
-        ValueError: if a column is missing or a cell is no number, with the file and line; or as of `Experiment`.
+        ValueError: if a column is missing or a cell is no number, with the file and line; for a rate that is not
+            positive; or as of `Experiment`.
         OSError: if the file cannot be read.
     """
     path = Path(path)
@@ -146,6 +147,8 @@ def read(path: str | Path, *, name: str | None = None, rate: float | None = None
     if columns[1][0] in _STRAINS:
         deformation = deformation + 1
     if rate is not None:
+        if not 0 < rate < math.inf:
+            raise ValueError(f"rate = {rate}: wanted finite and positive, in 1/s")
         way = np.abs(np.diff(deformation, prepend=0.0 if mode == "shear" else 1.0))
         time = np.cumsum(way) / rate
     return Experiment(name=name or path.stem, mode=mode, time=time, deformation=deformation, stress=stress)
