@@ -166,6 +166,9 @@ def problem(
     filler = rand(batch, count)
     filler[:, ::4], filler[:, 1::7] = 0, 1
     coefficients[:, layout.FILLER] = filler
+    # The stretches here are small: numbers that they bring to bear.
+    coefficients[:, layout.STIFFENING] *= 30
+    coefficients[:, layout.STIFFENING + 1] *= 300
     coefficients[..., kind == layout.ABSENT] = 0
     gravity = 0.3 * randn(steps, batch, 3)
     gravity[..., 2] -= 1
@@ -206,6 +209,7 @@ def problem(
         plane_kind=torch.tensor([[2, 1, int(stick)], [0, -1, 0], [1, 1, 0]], dtype=torch.int32),
         springs=True,
         viscous=True,
+        stiffens=True,
         probes=torch.tensor([0, 7, int((kind == -1).nonzero()[-1])]),
         lattice=lattice,
     )

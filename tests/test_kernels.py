@@ -55,7 +55,7 @@ def run_tensor(a: Reals, b: Reals, cof: Reals, dev: Reals, dot: Reals, back: Rea
 @ti.kernel
 def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, filler: ti.f64, P: Reals, S: Reals, n: ti.i32):
     for i in range(n):
-        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, filler))
+        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, 1, filler))
         if filler < 1:
             put(S, i, stress.pull_back(matrix(F, i), stress.least_ratio(filler)))
 
@@ -73,8 +73,8 @@ def run_solid_adjoint(
     n: ti.i32,
 ):
     for i in range(n):
-        f, q, bulk, shear, filler = stress.piola_adjoint(
-            matrix(F, i), matrix(Q, i), moduli[3 * i], moduli[3 * i + 1], moduli[3 * i + 2], matrix(bar, i)
+        f, q, bulk, shear, _, filler = stress.piola_adjoint(
+            matrix(F, i), matrix(Q, i), moduli[3 * i], moduli[3 * i + 1], 1, moduli[3 * i + 2], matrix(bar, i)
         )
         put(F_bar, i, f)
         put(Q_bar, i, q)

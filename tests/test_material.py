@@ -33,8 +33,8 @@ def shear_particle(
         for n in range(cycles * per_cycle):
             after = amplitude * ti.sin(omega * dt * (n + 1))
             gradient = ti.Matrix([[0.0, after - before, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]], dt=ti.f64)
-            constitutive.deform(state, 0, 0, 1, prony, 0, elements, -1, gradient, flags)
-            tau = constitutive.stress(state, 0, coefficients, 0, 1, prony, 0, elements, -1, none, 0)
+            constitutive.deform(False, state, 0, 0, coefficients, 0, 1, prony, 0, elements, -1, gradient, flags)
+            tau = constitutive.stress(False, state, 0, coefficients, 0, 1, prony, 0, elements, -1, none, 0)
             before = after
             if n >= (cycles - 1) * per_cycle:
                 answer[0] += 2 * tau[0, 1] * ti.sin(omega * dt * (n + 1)) / (amplitude * per_cycle)

@@ -99,11 +99,12 @@ def test_gradcheck_of_a_bare_body(form):
         p.scene,
         springs=False,
         viscous=False,
+        stiffens=False,
         share=p.scene.share[:0],
         plane_kind=p.scene.plane_kind[:0],
         kind=p.scene.kind.clamp(max=-1),
     )
-    for row in (layout.SPRING, layout.VISCOSITY, layout.VOLUME_VISCOSITY):
+    for row in (layout.SPRING, layout.VISCOSITY, layout.VOLUME_VISCOSITY, layout.STIFFENING, layout.STIFFENING + 1):
         p.tensors["coefficients"][:, row] = 0
     p.tensors["force"], p.tensors["planes"] = p.tensors["force"][:, :, :0], p.tensors["planes"][:, :0]
     p.tensors["pressure"] = p.tensors["pressure"][..., :0]

@@ -52,7 +52,7 @@ def body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
     body = attached.body
     flat = (body.mass, body.volume, body.bulk, body.shear, body.viscosity, body.volume_viscosity, body.filler)
     pairs = [(t, 1) for t in (*flat, attached.spring, attached.drag) if t is not None]
-    return pairs + [(t, 2) for t in (body.velocity, attached.anchor) if t is not None]
+    return pairs + [(t, 2) for t in (body.velocity, body.stiffening, attached.anchor) if t is not None]
 
 
 def coefficients(attached: Attached, wide) -> Tensor:
@@ -60,6 +60,7 @@ def coefficients(attached: Attached, wide) -> Tensor:
     body = attached.body
     zero = torch.zeros_like(body.volume)
     anchor = torch.zeros_like(body.position) if attached.anchor is None else attached.anchor
+    stiffening = (zero, zero) if body.stiffening is None else body.stiffening.unbind(-1)
     rows: list[Tensor] = [torch.empty(0)] * layout.COEFFICIENTS
     for place, values in (
         (layout.MASS, body.mass),
@@ -71,6 +72,8 @@ def coefficients(attached: Attached, wide) -> Tensor:
         (layout.SPRING, attached.spring),
         (layout.DRAG, attached.drag),
         (layout.FILLER, body.filler),
+        (layout.STIFFENING, stiffening[0]),
+        (layout.STIFFENING + 1, stiffening[1]),
     ):
         rows[place] = wide(zero if values is None else values, 1)
     for c in range(3):
@@ -133,14 +136,15 @@ def check_body(body: Body) -> None:
         "volume_viscosity",
         "filler",
         "drag",
+        "stiffening",
     ):
         value = getattr(body, name)
         if value is None:
             continue
         if value.dtype != x.dtype or value.device != x.device:
             raise ValueError(f"body.{name}: {value.dtype} on {value.device}, wanted {x.dtype} on {x.device}")
-        vector = name in ("position", "velocity")
-        tail = (count, 3) if vector else (count,)
+        vector = name in ("position", "velocity", "stiffening")
+        tail = (count, 2 if name == "stiffening" else 3) if vector else (count,)
         if tuple(value.shape[-len(tail) :]) != tail:
             raise ValueError(f"body.{name}: shape {tuple(value.shape)}, wanted [..., {', '.join(map(str, tail))}]")
         finite = torch.isfinite(value.detach())

@@ -272,7 +272,8 @@ class Simulator(nn.Module):
                 [[p.axis, p.side, int(p.sticks)] for p in planes], dtype=torch.int32, device=x.device
             ).reshape(-1, 3),
             springs=attached.spring is not None,
-            viscous=_viscous(body),
+            viscous=_present(body, body.viscosity, body.volume_viscosity),
+            stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
             probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
         )
         check_probes(scene.probes, x.shape[-2])
@@ -399,9 +400,9 @@ def _whole(name: str, value: float, dt: float) -> int:
     return steps
 
 
-def _viscous(body: Body) -> bool:
-    """Whether a solid has a viscosity, or one that is yet to be found."""
-    given = [v for v in (body.viscosity, body.volume_viscosity) if v is not None]
+def _present(body: Body, *coefficients: Tensor | None) -> bool:
+    """Whether a solid has any of these coefficients [..., N], or one that is yet to be found."""
+    given = [v for v in coefficients if v is not None]
     return any(v.requires_grad or bool((v[..., body.chamber < 0] != 0).any()) for v in given)
 
 

@@ -58,6 +58,7 @@ BLOCK = 256  # as in ``forward``; here some registers go to memory for it
 def substep_adjoint(
     gpu: ti.template(),
     serial_nodes: ti.template(),
+    stiffens: ti.template(),
     clock: Integers,
     numbers: Reals,
     state: Reals,
@@ -198,7 +199,7 @@ def substep_adjoint(
                     mass = coefficients[mat + MASS * particles]
                     volume = coefficients[mat + VOLUME * particles]
                     tau = stress(
-                        *(state, slot, coefficients, mat, particles),
+                        *(stiffens, state, slot, coefficients, mat, particles),
                         *(prony, prony_at, elements, phase, pressure, pressure_at),
                     )
                     push = external_force(
@@ -243,7 +244,7 @@ def substep_adjoint(
                         for c in ti.static(range(3)):
                             add(gpu, force_bar, force_bar_at + c, share[g * particles + p] * push_bar[c])
                     C_bar += stress_adjoint(
-                        *(gpu, state, slot, bar, here, coefficients, coefficients_bar, mat, particles),
+                        *(stiffens, gpu, state, slot, bar, here, coefficients, coefficients_bar, mat, particles),
                         *(prony, prony_at, prony_bar, prony_row, want_prony, elements, phase),
                         *(pressure, pressure_at, pressure_bar, ((time * rows + row) * batch + b) * chambers),
                         tau_bar,
@@ -265,7 +266,19 @@ def substep_adjoint(
                         v_bar = load_vector(bar, here + VELOCITY * particles, particles)
                         L_bar = load_matrix(bar, here + AFFINE * particles, particles)
                         L_bar += dt * deform_adjoint(
-                            *(gpu, state, at, slot, bar, here, particles),
+                            *(
+                                stiffens,
+                                gpu,
+                                state,
+                                at,
+                                slot,
+                                bar,
+                                here,
+                                coefficients,
+                                coefficients_bar,
+                                mat,
+                                particles,
+                            ),
                             *(prony, prony_at, prony_bar, prony_row, want_prony, elements, phase, dt * L),
                         )
                         f, node0 = place(x, low, inverse_cell, box_low, b, size, flags)

@@ -17,15 +17,19 @@ from torchsoro.kernels.layout import (
     PRONY_GAIN,
     PRONY_MODULUS,
     SHEAR,
+    STIFFENING,
     VISCOSITY,
     VOLUME_VISCOSITY,
 )
 from torchsoro.kernels.stress import (
     gas_pressure,
+    least_ratio,
     piola,
     piola_adjoint,
     pull_back,
     pull_back_adjoint,
+    stiffening,
+    stiffening_adjoint,
     viscous_stress,
     viscous_stress_adjoint,
 )
@@ -54,7 +58,30 @@ def history_sum(state: ti.template(), at, stride, prony: ti.template(), prony_at
 
 
 @ti.func
+def stiffness(stiffens: ti.template(), F, least, coefficients: ti.template(), mat, particles):
+    """The factor of ``stress.stiffening`` of a particle; 1 in kernels without."""
+    factor = F[0, 0] * 0 + 1
+    if ti.static(stiffens):
+        a, b = coefficients[mat + STIFFENING * particles], coefficients[mat + (STIFFENING + 1) * particles]
+        factor = stiffening(F, least, a, b)
+    return factor
+
+
+@ti.func
+def stiffness_adjoint(
+    F, least, coefficients: ti.template(), coefficients_bar: ti.template(), mat, particles, factor_bar
+):
+    """Adjoint of :func:`stiffness`, in kernels with it: adds to the coefficients' gradient, returns the one by F."""
+    a, b = coefficients[mat + STIFFENING * particles], coefficients[mat + (STIFFENING + 1) * particles]
+    F_bar, a_bar, b_bar = stiffening_adjoint(F, least, a, b, factor_bar)
+    add(False, coefficients_bar, mat + STIFFENING * particles, a_bar)
+    add(False, coefficients_bar, mat + (STIFFENING + 1) * particles, b_bar)
+    return F_bar
+
+
+@ti.func
 def stress(
+    stiffens: ti.template(),
     state: ti.template(),
     at,
     coefficients: ti.template(),
@@ -79,7 +106,8 @@ def stress(
         if elements > 0:
             Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
         shear, filler = coefficients[mat + SHEAR * particles], coefficients[mat + FILLER * particles]
-        tau = piola(F, Q, bulk, shear, filler) @ F.transpose()
+        factor = stiffness(stiffens, F, least_ratio(filler), coefficients, mat, particles)
+        tau = piola(F, Q, bulk, shear, factor, filler) @ F.transpose()
     else:
         tau = plus_identity(tau, -J * gas_pressure(J, bulk, pressure[pressure_at + kind]))
     eta = coefficients[mat + VISCOSITY * particles]
@@ -91,6 +119,7 @@ def stress(
 
 @ti.func
 def stress_adjoint(
+    stiffens: ti.template(),
     atomic: ti.template(),
     state: ti.template(),
     at,
@@ -128,8 +157,15 @@ def stress_adjoint(
             Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
         shear = coefficients[mat + SHEAR * particles]
         filler = coefficients[mat + FILLER * particles]
-        by_F, Q_bar, bulk_bar, shear_bar, filler_bar = piola_adjoint(F, Q, bulk, shear, filler, tau_bar @ F)
-        F_bar += by_F + tau_bar.transpose() @ piola(F, Q, bulk, shear, filler)
+        factor = stiffness(stiffens, F, least_ratio(filler), coefficients, mat, particles)
+        by_F, Q_bar, bulk_bar, shear_bar, factor_bar, filler_bar = piola_adjoint(
+            F, Q, bulk, shear, factor, filler, tau_bar @ F
+        )
+        F_bar += by_F + tau_bar.transpose() @ piola(F, Q, bulk, shear, factor, filler)
+        if ti.static(stiffens):
+            F_bar += stiffness_adjoint(
+                F, least_ratio(filler), coefficients, coefficients_bar, mat, particles, factor_bar
+            )
         add(False, coefficients_bar, mat + FILLER * particles, filler_bar)
         add(False, coefficients_bar, mat + BULK * particles, bulk_bar)
         add(False, coefficients_bar, mat + SHEAR * particles, shear_bar)
@@ -163,9 +199,12 @@ def stress_adjoint(
 
 @ti.func
 def deform(
+    stiffens: ti.template(),
     state: ti.template(),
     at,
     out,
+    coefficients: ti.template(),
+    mat,
     particles,
     prony: ti.template(),
     prony_at,
@@ -182,13 +221,15 @@ def deform(
         if F_new.determinant() <= 0:
             flags[FLAG_COLLAPSED] = 1
         if elements > 0:
-            change = pull_back(F_new, 0) - pull_back(F, 0)
+            before = stiffness(stiffens, F, 0, coefficients, mat, particles)
+            after = stiffness(stiffens, F_new, 0, coefficients, mat, particles)
+            change = after * pull_back(F_new, 0) - before * pull_back(F, 0)
             for e in range(elements):
                 place = (HISTORY + 6 * e) * particles
-                a = prony[prony_at + PRONY * e + PRONY_DECAY]
-                b = prony[prony_at + PRONY * e + PRONY_GAIN]
+                decay = prony[prony_at + PRONY * e + PRONY_DECAY]
+                gain = prony[prony_at + PRONY * e + PRONY_GAIN]
                 H = load_symmetric(state, at + place, particles)
-                store_symmetric(state, out + place, particles, a * H + b * change)
+                store_symmetric(state, out + place, particles, decay * H + gain * change)
     else:
         J = F[0, 0] * (1 + step_gradient.trace())
         F[0, 0] = J
@@ -201,12 +242,16 @@ def deform(
 
 @ti.func
 def deform_adjoint(
+    stiffens: ti.template(),
     atomic: ti.template(),
     state: ti.template(),
     at,
     out,
     bar: ti.template(),
     here,
+    coefficients: ti.template(),
+    coefficients_bar: ti.template(),
+    mat,
     particles,
     prony: ti.template(),
     prony_at,
@@ -225,24 +270,30 @@ def deform_adjoint(
         old_bar = F * 0
         if elements > 0:
             F_new = load_matrix(state, out + DEFORMATION * particles, particles)
+            before = stiffness(stiffens, F, 0, coefficients, mat, particles)
+            after = stiffness(stiffens, F_new, 0, coefficients, mat, particles)
             S_bar = F * 0
             for e in range(elements):
                 H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
                 S_bar += prony[prony_at + PRONY * e + PRONY_GAIN] * H_bar
             if want_prony == 1:
-                change = pull_back(F_new, 0) - pull_back(F, 0)
+                change = after * pull_back(F_new, 0) - before * pull_back(F, 0)
                 for e in range(elements):
                     H_bar = load_symmetric_adjoint(bar, here + (HISTORY + 6 * e) * particles, particles)
                     H = load_symmetric(state, at + (HISTORY + 6 * e) * particles, particles)
                     add(atomic, prony_bar, prony_row + PRONY * e + PRONY_DECAY, contract(H_bar, H))
                     add(atomic, prony_bar, prony_row + PRONY * e + PRONY_GAIN, contract(H_bar, change))
             for e in range(elements):
-                a = prony[prony_at + PRONY * e + PRONY_DECAY]
+                decay = prony[prony_at + PRONY * e + PRONY_DECAY]
                 for c in range(6):
                     place = here + (HISTORY + 6 * e + c) * particles
-                    bar[place] = a * bar[place]
-            F_bar += pull_back_adjoint(F_new, 0, S_bar)
-            old_bar = pull_back_adjoint(F, 0, -S_bar)
+                    bar[place] = decay * bar[place]
+            F_bar += pull_back_adjoint(F_new, 0, after * S_bar)
+            old_bar = pull_back_adjoint(F, 0, -before * S_bar)
+            if ti.static(stiffens):
+                by_after, by_before = contract(S_bar, pull_back(F_new, 0)), -contract(S_bar, pull_back(F, 0))
+                F_bar += stiffness_adjoint(F_new, 0, coefficients, coefficients_bar, mat, particles, by_after)
+                old_bar += stiffness_adjoint(F, 0, coefficients, coefficients_bar, mat, particles, by_before)
         step_bar = F_bar @ F.transpose()
         F_bar = F_bar + step_gradient.transpose() @ F_bar + old_bar
     else:

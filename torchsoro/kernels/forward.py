@@ -103,6 +103,7 @@ def external_force(
 def substep(
     gpu: ti.template(),
     serial_nodes: ti.template(),
+    stiffens: ti.template(),
     clock: Integers,
     numbers: Reals,
     state: Reals,
@@ -217,7 +218,10 @@ def substep(
                     store_vector(state, out + POSITION * particles, particles, x + dt * u)
                     store_vector(state, out + VELOCITY * particles, particles, blend * v + r)
                     store_matrix(state, out + AFFINE * particles, particles, L)
-                    deform(state, at, out, particles, prony, prony_at, elements, phase, dt * L, flags)
+                    deform(
+                        *(stiffens, state, at, out, coefficients, mat + p, particles),
+                        *(prony, prony_at, elements, phase, dt * L, flags),
+                    )
                 if s + 1 < steps:
                     # A thread without a particle adds nothing, but takes part in its warp's sums.
                     mass = dt * 0
@@ -232,7 +236,7 @@ def substep(
                         mass = coefficients[mat + MASS * particles + p]
                         volume = coefficients[mat + VOLUME * particles + p]
                         tau = stress(
-                            *(state, out, coefficients, mat + p, particles),
+                            *(stiffens, state, out, coefficients, mat + p, particles),
                             *(prony, prony_at, elements, phase, pressure, (step * batch + b) * chambers),
                         )
                         push = external_force(

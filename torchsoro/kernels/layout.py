@@ -16,7 +16,8 @@ def state_components(elements: int) -> int:
 
 # Per-particle coefficients.
 MASS, VOLUME, BULK, SHEAR, VISCOSITY, VOLUME_VISCOSITY, SPRING, ANCHOR, DRAG, FILLER = 0, 1, 2, 3, 4, 5, 6, 7, 10, 11
-COEFFICIENTS = 12
+STIFFENING = 12  # two of them: by I1b - 3 and by its square
+COEFFICIENTS = 14
 
 # Per-element numbers of the exact-exponential history update: decay a, gain b, modulus g relative to equilibrium.
 PRONY_DECAY, PRONY_GAIN, PRONY_MODULUS = 0, 1, 2

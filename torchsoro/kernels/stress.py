@@ -1,8 +1,14 @@
-"""Stress laws of the particles and their adjoints: neo-Hookean solid with Maxwell elements, filler, gas, viscosity.
+"""Stress laws of the particles and their adjoints: Yeoh's solid with Maxwell elements, filler, gas, viscosity.
 
 Solids give their first Piola stress P by the deformation gradient F; the Kirchhoff stress is ``tau = P F^T = J sigma``.
 Equation numbers are those of Kobayashi et al., "Computational synthesis of locomotive soft robots by topology
-optimization".
+optimization". Their solid is neo-Hookean; here its modulus may grow with the stretch, as in Yeoh's law (1993) with the
+isochoric invariant I1b = tr(Cb), Cb = J^(-2/3) F^T F:
+
+    W = mu/2 (I1b - 3) + C20 (I1b - 3)^2 + C30 (I1b - 3)^3, so that mu becomes mu (1 + a (I1b - 3) + b (I1b - 3)^2)
+
+in the deviatoric stress, with a = 4 C20 / mu and b = 6 C30 / mu. The Maxwell elements follow this whole deviatoric
+stress, stiffening included, as in Simo's finite linear viscoelasticity (1987).
 """
 
 import taichi as ti
@@ -33,11 +39,40 @@ def fade(ratio, least):
 
 
 @ti.func
+def stiffening(F, least, a, b):
+    """Factor 1 + a x + b x^2 of the shear modulus at x = I1b - 3.
+
+    J counts as at least ``least``, here and in the other laws of the solid, and x as at least 0: only a crushed point
+    has less. Kernels without stiffening leave this out and take 1, which the compiler then leaves out, too.
+    """
+    J = ti.max(F.determinant(), least)
+    x = ti.max(ti.exp(-2 * ti.log(J) / 3) * contract(F, F) - 3, 0)
+    return 1 + x * (a + b * x)
+
+
+@ti.func
+def stiffening_adjoint(F, least, a, b, factor_bar):
+    """Adjoint of :func:`stiffening`: gradients by F, a and b."""
+    cof = cofactor(F)
+    ratio = contract(cof, F) / 3
+    J = ti.max(ratio, least)
+    shrink = ti.exp(-2 * ti.log(J) / 3)
+    x = ti.max(shrink * contract(F, F) - 3, 0)
+    x_bar = factor_bar * (a + 2 * b * x)
+    if x == 0:  # cut off
+        x_bar = 0 * J
+    J_bar = -2 * (x + 3) * x_bar / (3 * J)
+    if ratio < least:
+        J_bar = 0 * J
+    return (2 * shrink * x_bar) * F + J_bar * cof, factor_bar * x, factor_bar * x * x
+
+
+@ti.func
 def pull_back(F, least):
     """Pull-back S of the deviatoric neo-Hookean stress over mu: (I - tr(C)/3 C^-1) / J with C = F^T F (in Eq. 8).
 
     J counts as at least ``least``, here and in the other laws of the solid. Below that S fades out, since turned inside
-    out it would push the wrong way.
+    out it would push the wrong way. What the Maxwell elements follow is this times :func:`stiffening`.
     """
     ratio = F.determinant()
     J = ti.max(ratio, least)
@@ -65,28 +100,29 @@ def pull_back_adjoint(F, least, S_bar):
 
 
 @ti.func
-def solid_piola(F, Q, bulk, shear, least):
-    """Eqs. 3-8 as first Piola stress, with Q = sum_i g_i H_i.
+def solid_piola(F, Q, bulk, shear, factor, least):
+    """Eqs. 3-8 as first Piola stress, with Q = sum_i g_i H_i and a factor from :func:`stiffening`.
 
-    The Kirchhoff stress K/2 [(J-1) + ln J / J] J I + mu dev(Fb A Fb^T), A = I + J Q, Fb = J^(-1/3) F, times F^-T.
+    The Kirchhoff stress K/2 [(J-1) + ln J / J] J I + mu dev(Fb A Fb^T) times F^-T, with A = factor I + J Q and
+    Fb = J^(-1/3) F.
     """
     J = ti.max(F.determinant(), least)
     shrink = ti.exp(-2 * ti.log(J) / 3)
-    FA = F + J * (F @ Q)
+    FA = factor * F + J * (F @ Q)
     pressure = bulk / 2 * (J * (J - 1) + ti.log(J)) - shear * shrink * contract(F, FA) / 3
     return shear * shrink * FA + pressure / J * cofactor(F)
 
 
 @ti.func
-def solid_piola_adjoint(F, Q, bulk, shear, least, P_bar):
-    """Adjoint of :func:`solid_piola`: gradients by F, Q, bulk and shear modulus."""
+def solid_piola_adjoint(F, Q, bulk, shear, factor, least, P_bar):
+    """Adjoint of :func:`solid_piola`: gradients by F, Q, bulk and shear modulus, and factor."""
     cof = cofactor(F)
     ratio = contract(cof, F) / 3
     J = ti.max(ratio, least)
     log = ti.log(J)
     shrink = ti.exp(-2 * log / 3)
     FQ = F @ Q
-    FA = F + J * FQ
+    FA = factor * F + J * FQ
     spread = contract(F, FA) / 3
     volumetric = (J * (J - 1) + log) / 2
     beta = (bulk * volumetric - shear * shrink * spread) / J
@@ -100,9 +136,9 @@ def solid_piola_adjoint(F, Q, bulk, shear, least, P_bar):
     J_bar += contract(FA_bar, FQ)
     if ratio < least:
         J_bar = 0 * J
-    F_bar = FA_bar + J * (FA_bar @ Q) - (alpha * pressure_bar / 3) * FA + beta * cross(F, P_bar) + J_bar * cof
+    F_bar = factor * FA_bar + J * (FA_bar @ Q) - (alpha * pressure_bar / 3) * FA + beta * cross(F, P_bar) + J_bar * cof
     half = (J / 2) * (F.transpose() @ FA_bar)
-    return F_bar, half + half.transpose(), pressure_bar * volumetric, alpha_bar * shrink
+    return F_bar, half + half.transpose(), pressure_bar * volumetric, alpha_bar * shrink, contract(FA_bar, F)
 
 
 @ti.func
@@ -134,28 +170,32 @@ def filler_piola_adjoint(F, shear, P_bar):
 
 
 @ti.func
-def piola(F, Q, bulk, shear, filler):
-    """First Piola stress of a solid of which a share ``filler`` (0 to 1) is void."""
+def piola(F, Q, bulk, shear, factor, filler):
+    """First Piola stress of a solid of which a share ``filler`` (0 to 1) is void; void does not stiffen."""
     P = F * 0
     if filler < 1:
-        P = (1 - filler) * solid_piola(F, Q, bulk, shear, least_ratio(filler))
+        P = (1 - filler) * solid_piola(F, Q, bulk, shear, factor, least_ratio(filler))
     if filler > 0:
         P += filler * filler_piola(F, shear)
     return P
 
 
 @ti.func
-def piola_adjoint(F, Q, bulk, shear, filler, P_bar):
-    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, and filler."""
+def piola_adjoint(F, Q, bulk, shear, factor, filler, P_bar):
+    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, factor and filler."""
     F_bar = F * 0
     Q_bar = F * 0
     bulk_bar = shear * 0
     shear_bar = shear * 0
+    factor_bar = shear * 0
     filler_bar = shear * 0
     if filler < 1:
-        by_F, by_Q, by_bulk, by_shear = solid_piola_adjoint(F, Q, bulk, shear, least_ratio(filler), P_bar)
+        by_F, by_Q, by_bulk, by_shear, by_factor = solid_piola_adjoint(
+            F, Q, bulk, shear, factor, least_ratio(filler), P_bar
+        )
         F_bar, Q_bar = (1 - filler) * by_F, (1 - filler) * by_Q
         bulk_bar, shear_bar = (1 - filler) * by_bulk, (1 - filler) * by_shear
+        factor_bar = (1 - filler) * by_factor
         if filler > 0:
             filler_bar -= bulk * by_bulk + shear * by_shear  # the law is linear in its moduli
     if filler > 0:
@@ -164,7 +204,7 @@ def piola_adjoint(F, Q, bulk, shear, filler, P_bar):
         shear_bar += filler * by_shear
         if filler < 1:
             filler_bar += shear * by_shear
-    return F_bar, Q_bar, bulk_bar, shear_bar, filler_bar
+    return F_bar, Q_bar, bulk_bar, shear_bar, factor_bar, filler_bar
 
 
 @ti.func

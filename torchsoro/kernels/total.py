@@ -3,7 +3,7 @@
 Points find F and their stress from the nodes; lines, sheets and nodes sum the forces; nodes move and meet the planes.
 These are four loops of one kernel, into which ``repeats`` substeps are unrolled, since a launch costs more than a loop.
 The clock advances in the pass over lines, which does not read it. ``loaded`` says at compile time whether there are
-forces, springs, drag or viscosity.
+forces, springs, drag or viscosity, ``stiffens`` whether solids stiffen with stretch.
 """
 
 import taichi as ti
@@ -74,6 +74,7 @@ from torchsoro.kernels.layout import (
     SPRING,
     SPRINGS,
     STEP_SIZE,
+    STIFFENING,
     STOP,
     SWEPT,
     VISCOSITY,
@@ -82,7 +83,7 @@ from torchsoro.kernels.layout import (
     VOLUME_VISCOSITY,
     VOLUMES,
 )
-from torchsoro.kernels.stress import filler_piola, least_ratio, piola, pull_back, viscous_piola
+from torchsoro.kernels.stress import filler_piola, least_ratio, piola, pull_back, stiffening, viscous_piola
 from torchsoro.kernels.surface import meet
 from torchsoro.kernels.tensor import (
     cofactor,
@@ -149,6 +150,7 @@ def external_force(
 def total_substep(
     repeats: ti.template(),
     loaded: ti.template(),
+    stiffens: ti.template(),
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -182,22 +184,27 @@ def total_substep(
                 if kind < 0:
                     filler = fixed[mat + FILLER * points]
                     Q = F * 0
+                    factor = filler * 0 + 1
                     if filler < 1:
+                        least = least_ratio(filler)
+                        if ti.static(stiffens):
+                            linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
+                            factor = stiffening(F, least, linear, square)
                         if elements > 0:
-                            S = pull_back(F, least_ratio(filler))
+                            S = factor * pull_back(F, least)
                             for e in range(elements):
                                 place = history + 6 * e * points
                                 number = ints[ELEMENT] + (b * elements + e) * PRONY
-                                a, gain = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN]
+                                decay, gain = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN]
                                 Z = load_symmetric(state, at + place, points)
                                 Q += fixed[number + PRONY_MODULUS] * (Z + gain * S)
-                                store_symmetric(state, out + place, points, a * Z - gain * (1 - a) * S)
+                                store_symmetric(state, out + place, points, decay * Z - gain * (1 - decay) * S)
                         if filler == 0 and not F.determinant() > 0:
                             ti.atomic_min(ints[COLLAPSED], t)
                     else:
                         for c in range(6 * elements):
                             state[out + history + c * points] = 0
-                    P = piola(F, Q, fixed[mat + BULK * points], shear, filler)
+                    P = piola(F, Q, fixed[mat + BULK * points], shear, factor, filler)
                 else:
                     for c in range(6 * elements):
                         state[out + history + c * points] = 0

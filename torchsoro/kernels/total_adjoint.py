@@ -84,6 +84,7 @@ from torchsoro.kernels.layout import (
     SPRINGS,
     STEP_SIZE,
     STEPS,
+    STIFFENING,
     STOP,
     SURFACES,
     SWEPT,
@@ -102,6 +103,8 @@ from torchsoro.kernels.stress import (
     piola_adjoint,
     pull_back,
     pull_back_adjoint,
+    stiffening,
+    stiffening_adjoint,
     viscous_piola_adjoint,
 )
 from torchsoro.kernels.surface import meet_adjoint, surface_spread
@@ -311,6 +314,7 @@ def external_adjoint(
 def total_substep_adjoint(
     repeats: ti.template(),
     loaded: ti.template(),
+    stiffens: ti.template(),
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -366,13 +370,19 @@ def total_substep_adjoint(
                         bulk, filler = fixed[mat + BULK * points], fixed[mat + FILLER * points]
                         Q = F * 0
                         S = F * 0
+                        factor, linear, square = filler * 0 + 1, filler * 0, filler * 0
+                        if ti.static(stiffens):
+                            linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
+                            factor = stiffening(F, least_ratio(filler), linear, square)
                         if elements > 0 and filler < 1:
-                            S = pull_back(F, least_ratio(filler))
+                            S = factor * pull_back(F, least_ratio(filler))
                             for e in range(elements):
                                 number = ints[ELEMENT] + (b * elements + e) * PRONY
                                 Z = load_symmetric(state, at + 6 * nodes + p + 6 * e * points, points)
                                 Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
-                        by_F, Q_bar, bulk_bar, shear_bar, filler_bar = piola_adjoint(F, Q, bulk, shear, filler, P_bar)
+                        by_F, Q_bar, bulk_bar, shear_bar, factor_bar, filler_bar = piola_adjoint(
+                            F, Q, bulk, shear, factor, filler, P_bar
+                        )
                         F_bar = by_F
                         work = bulk * bulk_bar + shear * shear_bar
                         add(False, sums, mat_bar + BULK * points, bulk_bar)
@@ -380,16 +390,22 @@ def total_substep_adjoint(
                         add(False, sums, mat_bar + FILLER * points, filler_bar)
                         if elements > 0 and filler < 1:
                             maxwell = at + 6 * nodes + p
-                            F_bar += pull_back_adjoint(
-                                F,
-                                least_ratio(filler),
-                                maxwell_adjoint(
-                                    ints, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar
-                                ),
+                            S_bar = maxwell_adjoint(
+                                ints, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar
                             )
+                            F_bar += pull_back_adjoint(F, least_ratio(filler), factor * S_bar)
+                            if ti.static(stiffens):
+                                factor_bar += contract(S_bar, pull_back(F, least_ratio(filler)))
                         else:
                             for c in range(6 * elements):
                                 bar[history + c * points] = 0
+                        if ti.static(stiffens):
+                            by_F, linear_bar, square_bar = stiffening_adjoint(
+                                F, least_ratio(filler), linear, square, factor_bar
+                            )
+                            F_bar += by_F
+                            add(False, sums, mat_bar + STIFFENING * points, linear_bar)
+                            add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
                     else:
                         for c in range(6 * elements):
                             bar[history + c * points] = 0

@@ -41,6 +41,7 @@ class Scene:
         plane_kind: int32 [planes, 3]: axis, side (+1 or -1), 1 for stick or 0 for Coulomb.
         springs: Whether any particle has a spring or drag, be it of zero.
         viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
+        stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
         probes: int64 [P], particles whose motion is recorded.
         lattice: Of the total-Lagrangian form; None for the updated form.
     """
@@ -55,6 +56,7 @@ class Scene:
     plane_kind: Tensor
     springs: bool
     viscous: bool
+    stiffens: bool
     probes: Tensor
     lattice: Lattice | None = None
 
@@ -258,6 +260,7 @@ class March:
             forward.substep,
             self.gpu,
             self._serial_nodes(chunk),
+            self.scene.stiffens,
             *_flat(self._tensors(chunk, states, scratch)),
             *self._sizes(chunk),
             states.shape[0],
@@ -288,6 +291,7 @@ class March:
             backward.substep_adjoint,
             self.gpu,
             self._serial_nodes(chunk),
+            self.scene.stiffens,
             *_flat([*self._tensors(chunk, states, scratch), bar, node_bar, before_bar, *sums.values()]),
             *self._sizes(chunk),
             chunk.nodes if self.gpu else self.lanes,

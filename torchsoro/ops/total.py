@@ -204,6 +204,7 @@ class TotalMarch:
             total.total_substep,
             REPEATS if self.gpu else 1,
             self.loaded,
+            self.scene.stiffens,
             ints,
             *(self.fixed.buffer, self.supply.buffer, states.view(-1), self.kept.buffer, self.scratch.buffer),
         )
@@ -257,6 +258,7 @@ class TotalMarch:
             total_adjoint.total_substep_adjoint,
             1,
             self.loaded,
+            self.scene.stiffens,
             ints,
             *(self.fixed.buffer, self.supply.buffer, states.view(-1), self.kept.buffer, self.scratch.buffer),
             *(bar.view(-1), back.buffer, sums.buffer),

@@ -1,5 +1,5 @@
-"""From the rheometer to a stable material: measured curves, superposition, relaxation spectrum, what a step affords.
+"""From measurements to a stable material: curves, superposition, spectrum, finite strain, what a step affords.
 
 Each public name has one import path, its module: ``torchsoro.rheology.measured``, ``.superposition``, ``.spectrum``,
-``.budget``.
+``.budget``; ``.finite``, ``.hyperelastic`` and ``.pointwise`` for tests at finite strain.
 """
