@@ -54,16 +54,15 @@ DESK = dataclasses.replace(
     settle=0.05,
     duration=0.2,
     sample_every=0.0025,
-    iterations=20,
+    iterations=30,
     filter_radius=0.007,
     filler=(0.1, 0.3),
     halvings=2,
-    patience=0,
+    patience=6,
     # In a single cycle, falling on the nose would be the longest stride.
     upright=8.0,
     sink=0.008,
     learning_rate=0.04,
-    penalty=10.0,
     window=2,
     tolerance=0.1,
 )
