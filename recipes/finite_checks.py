@@ -146,7 +146,12 @@ def clocks(folder: Path) -> list[Row]:
 
 
 def silicones(folder: Path) -> list[Row]:
-    """Laws without viscosity, fitted to each pull until rupture: moduli with intervals, in Pa and its multiples."""
+    """Laws without viscosity, fitted to each pull until rupture, with intervals.
+
+    They are wide where a law does not follow the curve: its residuals go together, so that they tell little. C30 is 0
+    where it would be negative, as the stress would then fall at some stretch. The last two columns are the error of the
+    law at stretches up to 2, and what it would be there if it was fitted to them only.
+    """
     rows: list[Row] = []
     for path in sorted(folder.glob("*.csv")):
         whole = read(path, rate=pull_rate(path))
@@ -199,14 +204,15 @@ def _speed(experiment: Experiment) -> tuple[float, float]:
 
 
 def _interval(found: Fit, name: str, unit: float = 1.0) -> str:
-    """A number with the ends of its interval; "?" for one that the tests do not tell, to a factor of ten."""
+    """A number with the ends of its interval; "?" where these are more than a factor of a hundred apart."""
     interval: Interval | None = found.intervals.get(name)
     if interval is None:
         return "-"
     value, low, high = (unit * v for v in (interval.value, interval.low, interval.high))
-    signed = name in ("C20", "C30")
-    unknown = high - low > 20 * abs(value) if signed else high > 100 * low
-    return f"{value:.3g} (?)" if unknown else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    if name not in ("C20", "C30"):
+        return f"{value:.3g} (?)" if high > 100 * low else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    value = 0.0 if abs(value) < 1e-6 * (high - low) else value  # held at 0, where the law would lose its stability
+    return f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
 def main(recordings: tyro.conf.Positional[Path]) -> None:
