@@ -1,24 +1,25 @@
 """Fits of the simulator's solid to finite-strain tests that others measured, and what they predict of tests left out.
 
-    python recipes/finite_checks.py RECORDINGS     # about three minutes on one core
+    python recipes/finite_checks.py RECORDINGS     # two to five minutes
 
-RECORDINGS is a folder with ``viscoelastic-shear-and-tension`` (an optically clear adhesive in shear, a tape in tension)
-and ``silicone-tensile-tests``; what is absent is skipped and said. The functions return their rows.
+RECORDINGS is a folder with ``viscoelastic-shear-and-tension`` (an optically clear adhesive in shear, a material without
+a name in tension) and ``silicone-tensile-tests``; what is absent is skipped and said. The functions return their rows.
 
 How the files are read:
 
 - Tension, load and unload: stretch and nominal stress as named, times as written; they are the way over the rate. The
-  authors have smoothed the curves to some 85 points, and a file or two begin with a step back.
+  authors have smoothed the curves to some 85 points, and one begins with a step back.
 - Stepped cyclic shear: shear stress and strain by their names, since force and displacement swap places in one file. By
   the times of the files the rates are 1, 2, 5 and 6 strains a *minute*; the file without a number is that of 2, and the
   one of 0.1 1/s that of 6.
 - Monotonic shear: the times are not those of an even rate of shear. Even with them goes the unlabelled column, which is
-  strain / sqrt(1 + strain^2 / 4), a strain measure that levels off at 2; in the end the shear would go a hundred times
-  as fast as the file's name says. :func:`clocks` fits the tests with these times and with strain / rate: the latter is
-  nearer, and is taken.
-- Silicones: engineering strain and stress, from the top of the pull. Four files have times that a spreadsheet continued
-  as text (40.9, 40.10, 40.11), so that times are strain / rate, at the speed and length in the file's head; the fits do
-  not depend on them. What comes after the largest stress is rupture and is left out, 1 to 4 samples of three files.
+  strain / sqrt(1 + strain^2 / 4), a strain measure that levels off at 2; in the end the shear would go 40 to 170
+  times as fast as the file's name says. :func:`clocks` fits the tests with these times and with strain / rate: the
+  latter is nearer, a little up to a strain of 2 and by half over all, and is taken.
+- Silicones: engineering strain and stress, the strain that of the cross-head. Three files have times that a spreadsheet
+  continued as text (40.9, 40.10, 40.11), one a last time that goes back, so that times are strain / rate, at the speed
+  and length in the file's head; the fits do not depend on them. What comes after the largest stress is rupture and is
+  left out, 1 to 3 samples of three files.
 """
 
 from __future__ import annotations
@@ -146,7 +147,12 @@ def clocks(folder: Path) -> list[Row]:
 
 
 def silicones(folder: Path) -> list[Row]:
-    """Laws without viscosity, fitted to each pull until rupture: moduli with intervals, in Pa and its multiples."""
+    """Laws without viscosity, fitted to each pull until rupture, with intervals.
+
+    They are wide where a law does not follow the curve: its residuals go together, so that they tell little. C30 is 0
+    where it would be negative, as the stress would then fall at some stretch. The last two columns are the error of the
+    law at stretches up to 2, and what it would be there if it was fitted to them only.
+    """
     rows: list[Row] = []
     for path in sorted(folder.glob("*.csv")):
         whole = read(path, rate=pull_rate(path))
@@ -199,14 +205,15 @@ def _speed(experiment: Experiment) -> tuple[float, float]:
 
 
 def _interval(found: Fit, name: str, unit: float = 1.0) -> str:
-    """A number with the ends of its interval; "?" for one that the tests do not tell, to a factor of ten."""
+    """A number with the ends of its interval; "?" where these are more than a factor of a hundred apart."""
     interval: Interval | None = found.intervals.get(name)
     if interval is None:
         return "-"
     value, low, high = (unit * v for v in (interval.value, interval.low, interval.high))
-    signed = name in ("C20", "C30")
-    unknown = high - low > 20 * abs(value) if signed else high > 100 * low
-    return f"{value:.3g} (?)" if unknown else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    if name not in ("C20", "C30"):
+        return f"{value:.3g} (?)" if high > 100 * low else f"{value:.3g} ({low:.3g} to {high:.3g})"
+    value = 0.0 if abs(value) < 1e-6 * (high - low) else value  # held at 0, where the law would lose its stability
+    return f"{value:.3g} ({low:.3g} to {high:.3g})"
 
 
 def main(recordings: tyro.conf.Positional[Path]) -> None:

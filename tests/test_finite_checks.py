@@ -1,0 +1,93 @@
+"""The recipe of finite-strain fits, on the recordings of others and without them."""
+
+import importlib
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchsoro.rheology.finite import Experiment
+
+RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
+recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
+
+
+@pytest.fixture(scope="module")
+def checks():
+    path = str(Path(__file__).parents[1] / "recipes")
+    sys.path.insert(0, path)
+    try:
+        yield importlib.import_module("finite_checks")
+    finally:
+        sys.path.remove(path)
+
+
+def folder(checks, name):
+    path = Path(RECORDINGS or "") / name
+    if not path.is_dir():
+        pytest.skip(f"there is no folder {path}")
+    return path
+
+
+def test_absent_folders_are_skipped_with_the_reason(checks, tmp_path, capsys):
+    checks.main(tmp_path)
+    said = capsys.readouterr().out
+    assert said.count("skipped, there is no folder") == 3
+    assert str(tmp_path / "silicone-tensile-tests") in said
+
+
+def test_a_pull_without_its_speed_is_refused(checks, tmp_path):
+    path = tmp_path / "pull.csv"
+    path.write_text("Speed (mm/min);450;;\nLength (mm);33;;\n")
+    assert checks.pull_rate(path) == pytest.approx(450 / 33 / 60)
+    path.write_text("Speed (mm/min);450;;\n")
+    with pytest.raises(ValueError, match=r"pull\.csv: no line Length \(mm\), wanted the number after it"):
+        checks.pull_rate(path)
+
+
+def test_a_test_is_kept_until_it_goes_beyond(checks):
+    numbers = np.array([1.0, 2.0, 3.0, 1.0])
+    test = Experiment(name="", mode="shear", time=np.arange(4.0), deformation=numbers, stress=numbers)
+    assert checks.until(test, 3.0).stress.tolist() == [1.0, 2.0, 3.0, 1.0]
+    assert checks.until(test, 2.5).stress.tolist() == [1.0, 2.0]
+
+
+@recordings
+def test_times_of_the_recordings_are_what_the_recipe_says(checks):
+    base = folder(checks, "viscoelastic-shear-and-tension")
+    for rate, tests in checks.tension(base).items():
+        for test in tests:  # the way over the rate
+            way = np.cumsum(np.abs(np.diff(test.deformation, prepend=1.0)))
+            assert test.time * rate == pytest.approx(way, abs=0.02 * way[-1]), test.name
+    for rate, (test,) in checks.stepped(base).items():
+        speed = 60 * np.abs(np.diff(test.deformation) / np.diff(test.time))
+        assert np.median(speed[speed > rate / 2]) == pytest.approx(rate, rel=0.01)
+    for rate, (test,) in checks.monotonic(base, clock=True).items():
+        even = test.deformation / np.sqrt(1 + test.deformation**2 / 4)
+        assert even[-1] / test.time[-1] == pytest.approx(rate, rel=0.03)
+        assert checks._speed(test)[1] > 20 * rate  # not an even rate of shear
+
+
+@recordings
+def test_viscosity_of_some_rates_predicts_another(checks):
+    base = folder(checks, "viscoelastic-shear-and-tension")
+    row = checks.split(checks.tension(base), [0.03], elements=1)
+    assert row["tests"] == "8, 2"
+    assert row["elements"] == 1
+    assert row["prediction, elastic [%]"] > 2 * row["prediction, viscous [%]"]
+    tests = checks._until(checks.stepped(base), checks.MODERATE + 0.02)
+    row = checks.split(tests, [2, 6], specimens=True)
+    assert row["prediction, elastic [%]"] > 3 * row["prediction, viscous [%]"]
+
+
+@recordings
+def test_every_silicone_is_read_and_fitted(checks):
+    rows = checks.silicones(folder(checks, "silicone-tensile-tests"))
+    assert len(rows) == 3 * 17
+    assert len({row["material"] for row in rows}) == 17
+    assert {row["left out"] for row in rows} == {0, 1, 3}
+    for neo, _, yeoh in zip(*(rows[k::3] for k in range(3)), strict=True):
+        assert yeoh["error [%]"] < 5 < neo["error [%]"]
+        assert yeoh["fitted to 2 [%]"] < 7
