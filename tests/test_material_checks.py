@@ -75,6 +75,7 @@ def test_folders_that_are_not_there_are_skipped_and_named(checks, tmp_path, caps
         assert f"{check}: skipped, there is no {tmp_path / folder}" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore")  # those of pandas are meant for pyvisco
 def test_pyvisco_fits_worse_with_as_many_terms(checks):
     pytest.importorskip("pyvisco", reason="what is compared with; an extra")
     omega = np.geomspace(1e-3, 1e6, 91)
