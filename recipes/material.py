@@ -3,6 +3,7 @@
     python recipes/material.py sweeps.csv --out runs/resin                 # sweeps at several temperatures
     python recipes/material.py sweeps.csv --out runs/resin --reference 21.8 --band 0.8 50 --dt 1e-5
     python recipes/material.py relaxation.csv --out runs/resin --deformation tension
+    python recipes/material.py creep.csv --out runs/resin --deformation shear
     python recipes/walker.py --material runs/resin/material.toml           # a robot of it
 
 Sweeps at several temperatures are shifted to one (time-temperature superposition), the master curve is fitted by
@@ -33,6 +34,7 @@ from torchsoro.rheology.superposition import Shift, arrhenius, master, superpose
 from torchsoro.settings import plain_errors
 from torchsoro.storage import atomic_write
 
+Curve = Sweep | Relaxation | Creep
 WORST = 5.0  # quality of an overlap above which two curves do not superpose
 
 
@@ -41,7 +43,7 @@ class Options:
     """What to make a material of, and for which simulation."""
 
     file: tyro.conf.Positional[Path]
-    """Table of frequency sweeps or of a relaxation test: text, .xls or .xlsx."""
+    """Table of frequency sweeps, relaxation or creep tests: text, .xls or .xlsx."""
     out: Path
     """Folder for the material and the report."""
     deformation: Literal["tension", "shear"] | None = None
@@ -84,7 +86,7 @@ class Found:
 
     curves: Any
     shift: Shift | None
-    curve: Sweep | Relaxation
+    curve: Curve
     spectrum: Spectrum
     budget: Budget
     material: Material
@@ -103,8 +105,6 @@ def main(options: Options) -> Found:
         deformation=options.deformation,
         temperature=options.temperature,
     )
-    if any(isinstance(curve, Creep) for curve in curves):
-        raise ValueError(f"file: {options.file} holds creep tests, wanted sweeps or relaxation tests")
     shift = None
     curve: Any = curves[0]
     if len(curves) > 1:
@@ -146,7 +146,7 @@ def main(options: Options) -> Found:
     return found
 
 
-def permanent(curve: Sweep | Relaxation, options: Options) -> tuple[Spectrum, str]:
+def permanent(measured: Curve, options: Options) -> tuple[Spectrum, str]:
     """Fit, and take for permanent what relaxes more slowly than the horizon, or than the data reach.
 
     Returns:
@@ -155,6 +155,9 @@ def permanent(curve: Sweep | Relaxation, options: Options) -> tuple[Spectrum, st
     Raises:
         ValueError: if nothing is left of the modulus by then.
     """
+    curve = measured
+    if options.equilibrium is not None and isinstance(curve, Creep):
+        raise ValueError(f"equilibrium: {options.equilibrium:g} with creep tests, wanted none: their fit finds it")
     if options.equilibrium is not None:
         return fit(curve, elements=options.elements, equilibrium=options.equilibrium), ""
     found = fit(curve, elements=options.elements)
@@ -174,10 +177,15 @@ def permanent(curve: Sweep | Relaxation, options: Options) -> tuple[Spectrum, st
     if isinstance(curve, Sweep):
         seen = curve.omega >= 0.3 / longest
         curve = dataclasses.replace(curve, omega=curve.omega[seen], storage=curve.storage[seen], loss=curve.loss[seen])
-    else:
+    elif isinstance(curve, Relaxation):
         seen = curve.time <= 3 * longest
         curve = dataclasses.replace(curve, time=curve.time[seen], modulus=curve.modulus[seen])
-    spectrum = fit(curve, elements=max(int((~slow).sum()), 1), equilibrium=modulus)
+    else:  # the relaxation that goes with the creep; it is not measured, and so there are no intervals
+        time = np.geomspace(curve.time[0], 3 * longest, 100)
+        about = {"temperature": curve.temperature, "deformation": curve.deformation}
+        curve = Relaxation(time=time, modulus=found.relaxation(time), **about)
+    known = not isinstance(measured, Creep)
+    spectrum = fit(curve, elements=max(int((~slow).sum()), 1), equilibrium=modulus, intervals=known)
     return spectrum, f"What is left after {longest:.2g} s, {modulus / 1e6:.3g} MPa, counts as permanent. "
 
 
@@ -248,14 +256,16 @@ def draw_shift(curves: Any, shift: Shift, curve: Any) -> Figure:
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     raw, reduced, factors = figure.subplots(1, 3)
     low, high = min(c.temperature for c in curves), max(c.temperature for c in curves)
+    creep = isinstance(curve, Creep)
     for c, log_a, log_b in zip(curves, shift.log_a, shift.log_b, strict=True):
         color = figure_color((c.temperature - low) / max(high - low, 1e-9))
         for x, y, style in series(c):
             raw.loglog(x, y, style, color=color, ms=3)
             factor = 10 ** (log_a if isinstance(c, Sweep) else -log_a)
-            reduced.loglog(x * factor, y * 10**log_b, style, color=color, ms=3)
+            reduced.loglog(x * factor, y * 10 ** (-log_b if creep else log_b), style, color=color, ms=3)
     name = "angular frequency [rad/s]" if isinstance(curve, Sweep) else "time [s]"
-    raw.set(xlabel=name, ylabel="modulus [Pa]", title="measured (dots: storage, crosses: loss)")
+    title = "measured (dots: storage, crosses: loss)" if isinstance(curve, Sweep) else "measured"
+    raw.set(xlabel=name, ylabel="compliance [1/Pa]" if creep else "modulus [Pa]", title=title)
     reduced.set(xlabel=f"{name}, reduced", title=f"at {shift.reference:.4g} C")
     factors.errorbar(shift.temperatures, shift.log_a, 2 * shift.log_a_error, fmt="o", ms=4, label="2 standard errors")
     if enough(shift):
@@ -269,7 +279,7 @@ def draw_shift(curves: Any, shift: Shift, curve: Any) -> Figure:
     return figure
 
 
-def draw_spectrum(curve: Sweep | Relaxation, spectrum: Spectrum) -> Figure:
+def draw_spectrum(curve: Curve, spectrum: Spectrum) -> Figure:
     """The data and what the Maxwell elements make of them; below, the relative error."""
     figure = Figure(figsize=(8.5, 4.8), layout="constrained")
     axis, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -280,13 +290,15 @@ def draw_spectrum(curve: Sweep | Relaxation, spectrum: Spectrum) -> Figure:
                 (curve.storage, curve.loss), spectrum.storage_loss(curve.omega), ("storage", "loss"), strict=True
             )
         ]
-    else:
+    elif isinstance(curve, Relaxation):
         parts = [(curve.time, curve.modulus, spectrum.relaxation(curve.time), "relaxation")]
+    else:
+        parts = [(curve.time, curve.compliance, spectrum.creep(curve.time), "creep")]
     for k, (x, measured, model, name) in enumerate(parts):
         axis.loglog(x, measured, "o", ms=3, color=f"C{k}", alpha=0.5, label=f"{name}, measured")
         axis.loglog(x, model, "-", lw=1.3, color=f"C{k}", label=f"{name}, {len(spectrum.moduli)} elements")
         below.semilogx(x, 100 * (model / measured - 1), ".", ms=4, color=f"C{k}")
-    axis.set(ylabel="modulus [Pa]")
+    axis.set(ylabel="compliance [1/Pa]" if isinstance(curve, Creep) else "modulus [Pa]")
     axis.legend(fontsize="small")
     below.set(xlabel="angular frequency [rad/s]" if isinstance(curve, Sweep) else "time [s]", ylabel="error [%]")
     for one in (axis, below):
@@ -294,11 +306,11 @@ def draw_spectrum(curve: Sweep | Relaxation, spectrum: Spectrum) -> Figure:
     return figure
 
 
-def series(curve: Sweep | Relaxation) -> list[tuple[np.ndarray, np.ndarray, str]]:
+def series(curve: Curve) -> list[tuple[np.ndarray, np.ndarray, str]]:
     """What to plot of a curve: abscissa, modulus, mark."""
     if isinstance(curve, Sweep):
         return [(curve.omega, curve.storage, "."), (curve.omega, curve.loss, "x")]
-    return [(curve.time, curve.modulus, ".")]
+    return [(curve.time, curve.modulus if isinstance(curve, Relaxation) else curve.compliance, ".")]
 
 
 def figure_color(share: float) -> tuple[float, float, float]:
@@ -306,17 +318,20 @@ def figure_color(share: float) -> tuple[float, float, float]:
     return (0.15 + 0.7 * share, 0.35 - 0.2 * abs(2 * share - 1), 0.85 - 0.7 * share)
 
 
-def write_curve(path: Path, curve: Sweep | Relaxation) -> None:
-    """Write the master curve as a table that ``material.py`` can read again."""
+def write_curve(path: Path, curve: Curve) -> None:
+    """Write the master curve as a table that ``material.py`` can read again; of creep it asks for --deformation."""
     letter = "E" if curve.deformation == "tension" else "G"
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     if isinstance(curve, Sweep):
         writer.writerow(["omega_rad_per_s", f"{letter}_storage_Pa", f"{letter}_loss_Pa"])
         writer.writerows(zip(curve.omega.tolist(), curve.storage.tolist(), curve.loss.tolist(), strict=True))
-    else:
+    elif isinstance(curve, Relaxation):
         writer.writerow(["time_s", f"{letter}_relax_Pa"])
         writer.writerows(zip(curve.time.tolist(), curve.modulus.tolist(), strict=True))
+    else:
+        writer.writerow(["time_s", "creep_compliance_1_per_Pa"])
+        writer.writerows(zip(curve.time.tolist(), curve.compliance.tolist(), strict=True))
     with atomic_write(path) as file:
         file.write(text.getvalue().encode())
 

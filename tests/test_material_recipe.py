@@ -88,6 +88,36 @@ def test_a_melt_is_refused_and_the_way_out_is_named(modules, tmp_path):
         modules["material"].main(modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0))
 
 
+def test_creep_tests_become_a_material(modules, tmp_path):
+    # Retardation after 1e-6, 3e-6 and 5e-6 1/Pa at 20 C; at 35 C a tenth of the time for it.
+    time, retarded, compliances = np.geomspace(1e-3, 1e2, 60), np.array([0.01, 1.0]), np.array([3e-6, 5e-6])
+    lines, rng = ["T_C,time_s,creep_compliance_1_per_Pa"], np.random.default_rng(3)
+    for t, shift in ((20.0, 1.0), (35.0, 0.1)):
+        creep = 1e-6 + ((1 - np.exp(-time[:, None] / (shift * retarded))) * compliances).sum(1)
+        noisy = creep * np.exp(0.01 * rng.standard_normal(60))
+        lines += [f"{t},{x!r},{y!r}" for x, y in zip(time.tolist(), noisy.tolist(), strict=True)]
+    file = tmp_path / "creep.csv"
+    file.write_text("\n".join(lines) + "\n")
+    recipe = modules["material"]
+    options = recipe.Options(file=file, out=tmp_path / "out", deformation="shear", reference=20.0, poisson_ratio=0.4)
+    found = recipe.main(options)
+    assert found.shift.log_a == pytest.approx([0.0, -1.0], abs=0.03)
+    assert found.material.solid.shear == pytest.approx(1 / 9e-6, rel=0.02)
+    instantaneous = found.spectrum.equilibrium + found.spectrum.moduli.sum()
+    assert instantaneous == pytest.approx(1e6, rel=0.05)
+    truth = 1e-6 + ((1 - np.exp(-time[:, None] / retarded)) * compliances).sum(1)
+    np.testing.assert_allclose(found.spectrum.creep(time), truth, rtol=0.02)
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert page.count("<img") == 3
+    again = recipe.main(dataclasses.replace(options, file=tmp_path / "out" / "master.csv", out=tmp_path / "again"))
+    assert again.material.solid.youngs_modulus == pytest.approx(found.material.solid.youngs_modulus, rel=1e-6)
+    early = recipe.main(dataclasses.replace(options, horizon=0.1))
+    assert early.material.solid.shear == pytest.approx(1 / 4e-6, rel=0.1)
+    assert early.material.left_out.startswith("What is left after 0.1 s")
+    with pytest.raises(ValueError, match="equilibrium: 100000 with creep tests, wanted none"):
+        recipe.main(dataclasses.replace(options, equilibrium=1e5))
+
+
 def test_the_shaker_has_the_resonance_of_a_spring_and_its_simulation_agrees(modules):
     shaker = modules["shaker"]
     solid = Solid(youngs_modulus=1.2e7, poisson_ratio=0.4, density=1200.0)

@@ -1,7 +1,8 @@
-"""The notebooks run from top to bottom, on a shortened training, and their losses fall."""
+"""The notebooks run from top to bottom, shortened: losses fall, and a ball of a fitted material bounces less."""
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import nbformat
@@ -28,6 +29,24 @@ def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatc
     assert change < -0.01
     drawn = [o for cell in notebook.cells for o in cell.get("outputs", []) if "image/png" in o.get("data", {})]
     assert len(drawn) == 2
+
+
+@pytest.mark.notebook
+@pytest.mark.filterwarnings("default")
+def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHSORO_NOTEBOOK_CELLS", "4")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    notebook = nbformat.read(NOTEBOOKS / "02_from_sweep_to_bounce.ipynb", as_version=4)
+    notebook.cells.append(nbformat.v4.new_code_cell("print(*restitution)"))
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    restitution = list(map(float, notebook.cells[-1].outputs[-1].text.split()))
+    assert len(restitution) == 6
+    assert restitution[0] > 0.85  # four cells across the ball are few
+    assert 0.4 < restitution[3] < 0.65
+    assert all(more < less + 0.01 for less, more in pairwise(restitution))
 
 
 def test_the_committed_notebooks_hold_their_figures_and_stay_small():

@@ -152,6 +152,9 @@ def test_complex_modulus_and_compliance_are_each_others_inverse(gaps, weights, f
     storage, loss = both.storage_loss(omega)
     np.testing.assert_allclose((storage + 1j * loss) * compliance, 1, rtol=1e-9)
     assert len(found.times) == len(times) + (fluidity > 0)
+    time = np.geomspace(1e-3, 1e3 * times[-1], 30)
+    creep = 1e-7 + ((1 - np.exp(-time[:, None] / times)) * compliances).sum(1) + fluidity * time
+    np.testing.assert_allclose(both.creep(time), creep, rtol=1e-6)
 
 
 def test_a_creep_test_gives_the_relaxation_spectrum():

@@ -50,6 +50,29 @@ def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarra
     return Relaxing(values=np.append(equilibrium, moduli[::-1]), times=1 / found[::-1])
 
 
+def compliance(equilibrium: float, moduli: np.ndarray, times: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Creep compliance [n] 1/Pa at times [n] s after a step of stress, of a relaxation spectrum.
+
+    The viscous strains follow v_i' = (e - v_i) / tau_i under the strain e = (1 + sum_i E_i v_i) / (E_inf + sum_i E_i).
+    Scaled by sqrt(E_i tau_i) that system is symmetric, and its modes decay, or one of a liquid flows.
+
+    Args:
+        equilibrium: E_inf [Pa].
+        moduli: E_i [M] Pa.
+        times: tau_i [M] s.
+        time: [n] s.
+    """
+    used = moduli > 0
+    stiff, tau = moduli[used], times[used]
+    total = equilibrium + stiff.sum()
+    root = np.sqrt(stiff / tau)
+    rates, modes = np.linalg.eigh(np.diag(1 / tau) - np.outer(root, root) / total)
+    share = modes.T @ root
+    decay = np.maximum(rates, 0.0) * np.asarray(time, dtype=float)[..., None]
+    grown = np.where(decay > 1e-12, -np.expm1(-decay) / np.maximum(decay, 1e-300), 1.0) * np.asarray(time)[..., None]
+    return (1 + grown @ share**2 / total) / total
+
+
 def relaxing(problem: Problem, found: Found, *, optimised: bool) -> tuple[Relaxing, np.ndarray]:
     """The relaxation spectrum of a fitted retardation spectrum, and how well it is known.
 

@@ -20,7 +20,7 @@ import torch
 from scipy.stats import f as fisher
 
 from torchsoro.material import Prony, Solid
-from torchsoro.rheology.creep import relaxing
+from torchsoro.rheology.creep import compliance, relaxing
 from torchsoro.rheology.leastsquares import Found, Problem, fixed, floor, free, inflation, profiles
 from torchsoro.rheology.measured import Creep, Deformation, Relaxation, Sweep
 from torchsoro.rheology.residuals import relative_residuals
@@ -130,6 +130,10 @@ class Spectrum:
     def relaxation(self, time: np.ndarray) -> np.ndarray:
         """Relaxation modulus [Pa] at times [s] after a step of strain."""
         return self.equilibrium + np.exp(-np.asarray(time, dtype=float)[..., None] / self.times) @ self.moduli
+
+    def creep(self, time: np.ndarray) -> np.ndarray:
+        """Creep compliance [1/Pa] at times [s] after a step of stress."""
+        return compliance(self.equilibrium, self.moduli, self.times, time)
 
     def prony(self, *, equilibrium: float | None = None) -> Prony:
         """Maxwell elements for the simulator, relative to the equilibrium modulus, the slowest first as in Table S1.
