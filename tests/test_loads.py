@@ -62,6 +62,17 @@ def test_the_same_force_twice_is_twice_the_force(way):
     assert float(end[1]) == pytest.approx(2 * float(end[0]), rel=1e-9)
 
 
+def test_shares_weight_a_group():
+    body = block()[1]
+    share = torch.linspace(0, 1, 64, dtype=torch.float64)
+    share = share / share.sum()
+    mass = attach(body, [PointMass(particles=EVERY, mass=0.2, share=share)]).body.mass
+    torch.testing.assert_close(mass - body.mass, 0.2 * share)
+    both = torch.stack([share, share.flip(0)])
+    springs = attach(body, [Spring(particles=EVERY, stiffness=torch.tensor([3.0, 5.0]), share=both)]).spring
+    torch.testing.assert_close(springs, torch.tensor([[3.0], [5.0]], dtype=torch.float64) * both)
+
+
 @ways("apic", "total")
 def test_a_point_mass_has_inertia_and_weight(way):
     push, load = Force(particles=EVERY, value=vector(0.01, 0.0, 0.0)), PointMass(particles=EVERY, mass=3 * MASS)
@@ -218,6 +229,11 @@ def test_a_tube_pulls_on_a_visco_elastic_body(way):
         ([Spring(particles=EVERY, stiffness=1.0)] * 2, r"springs: two groups share a particle"),
         ([Force(particles=EVERY, value=torch.zeros(2))], r"force: shape \(2,\), wanted \[\.\.\., 3\]"),
         ([Force(particles=EVERY, value=vector(0, 0, math.inf))], r"force = .*: wanted finite"),
+        ([PointMass(particles=EVERY, mass=1.0, share=torch.ones(64))], r"share: shape \(64,\), sums 64\.0, wanted"),
+        (
+            [Force(particles=EVERY, value=vector(0, 0, 1), share=torch.full((2, 64), 1 / 64))],
+            r"share of a force: shape \(2,\) of a batch",
+        ),
     ],
 )
 def test_bad_loads_are_refused(loads, message):

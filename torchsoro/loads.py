@@ -1,4 +1,7 @@
-"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube or a tip load."""
+"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube or a tip load.
+
+A group shares its load equally, or by ``share`` [..., n], whose sum is 1.
+"""
 
 from __future__ import annotations
 
@@ -14,17 +17,19 @@ from torchsoro.material import Body
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Force:
-    """A dead force on a group, shared equally among its particles.
+    """A dead force on a group.
 
     Attributes:
         particles: int64 indices [n].
         value: [..., 3] N, constant; or [..., S, 3] with ``time``.
         time: [S] s, increasing; interpolated linearly.
+        share: Of each particle [..., n]; equal if None.
     """
 
     particles: Tensor
     value: Tensor
     time: Tensor | None = None
+    share: Tensor | None = None
 
     def at(self, t: Tensor) -> Tensor:
         """Force at times t [T]: [..., T, 3] N."""
@@ -35,15 +40,17 @@ class Force:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PointMass:
-    """A mass carried by a group, with inertia and weight, shared equally.
+    """A mass carried by a group, with inertia and weight.
 
     Attributes:
         particles: int64 indices [n].
         mass: [...] kg.
+        share: Of each particle [..., n]; equal if None.
     """
 
     particles: Tensor
     mass: Tensor | float
+    share: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,24 +61,28 @@ class Spring:
         particles: int64 indices [n].
         stiffness: [...] N/m of the whole group.
         shift: [..., 3] m from the reference place to the rest point.
+        share: Of each particle [..., n]; equal if None.
     """
 
     particles: Tensor
     stiffness: Tensor | float
     shift: Tensor | None = None
+    share: Tensor | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Drag:
-    """Linear drag on a group, shared equally.
+    """Linear drag on a group.
 
     Attributes:
         particles: int64 indices [n].
         coefficient: [...] N s/m of the whole group.
+        share: Of each particle [..., n]; equal if None.
     """
 
     particles: Tensor
     coefficient: Tensor | float
+    share: Tensor | None = None
 
 
 Load = Force | PointMass | Spring | Drag
@@ -118,8 +129,10 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
     shares = [x.new_zeros(0, count)]
     held = torch.zeros(count, dtype=torch.bool, device=x.device)
     for load in loads:
-        group = _indicator(load.particles, count, x)
+        group = _shares(load.particles, load.share, count, x)
         if isinstance(load, Force):
+            if group.ndim > 1:
+                raise ValueError(f"share of a force: shape {tuple(group.shape[:-1])} of a batch, wanted [n]")
             shares.append(group.unsqueeze(0))
             _check_vector("force", load.value)
         elif isinstance(load, PointMass):
@@ -127,13 +140,14 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
         elif isinstance(load, Drag):
             drag = drag + _amount("drag coefficient", load.coefficient, x).unsqueeze(-1) * group
         else:
-            if bool((held & (group > 0)).any()):
+            there = (group > 0).reshape(-1, count).any(0)
+            if bool((held & there).any()):
                 raise ValueError("springs: two groups share a particle, wanted groups apart from each other")
-            held |= group > 0
+            held |= there
             spring = spring + _amount("stiffness", load.stiffness, x).unsqueeze(-1) * group
             if load.shift is not None:
                 _check_vector("spring shift", load.shift)
-                place = (group > 0).to(x).unsqueeze(-1)
+                place = there.to(x).unsqueeze(-1)
                 anchor = anchor + place * load.shift.to(x).unsqueeze(-2)
     loose = body.drag is None and not any(isinstance(load, Spring | Drag) for load in loads)
     return Attached(
@@ -146,18 +160,28 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
     )
 
 
-def _indicator(particles: Tensor, count: int, like: Tensor) -> Tensor:
-    """Each particle's equal share of a group [N]."""
+def _shares(particles: Tensor, share: Tensor | None, count: int, like: Tensor) -> Tensor:
+    """Each particle's share of a group [..., N]."""
     if particles.dtype != torch.int64:
         raise ValueError(f"particles: {particles.dtype}, wanted int64 indices")
-    indices = torch.unique(particles.to(like.device))
+    indices, which = torch.unique(particles.to(like.device), return_inverse=True)
     if len(indices) == 0:
         raise ValueError("particles: an empty group, wanted at least one particle")
     if int(indices[0]) < 0 or int(indices[-1]) >= count:
         raise ValueError(f"particles: index {int(indices[0])} to {int(indices[-1])}, wanted 0 to {count - 1}")
     group = like.new_zeros(count)
-    group[indices] = 1 / len(indices)
-    return group
+    if share is None:
+        group[indices] = 1 / len(indices)
+        return group
+    share = share.detach().to(like)
+    total = share.sum(-1)
+    if share.shape[-1:] != particles.shape or not bool((share >= 0).all() & ((total - 1).abs() < 1e-4).all()):
+        raise ValueError(
+            f"share: shape {tuple(share.shape)}, sums {total.tolist()}, wanted [..., {len(particles)}], numbers of at "
+            "least 0 whose sum is 1"
+        )
+    place = indices[which]
+    return like.new_zeros(*share.shape[:-1], count).index_add(-1, place, share)
 
 
 def _check_vector(name: str, value: Tensor) -> None:
