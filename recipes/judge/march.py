@@ -136,7 +136,7 @@ def case_of(setup: dict[str, Any], mesh: Mesh, pressure: Sequence[tuple[float, f
     )
 
 
-def turned(vector: Floats, rotation: Sequence[float]) -> Floats:
+def turned(vector: Floats, rotation: Sequence[float] | Floats) -> Floats:
     """A vector [..., 3] turned by a rotation vector [rad]."""
     angle = float(np.linalg.norm(rotation))
     if angle == 0:
@@ -185,7 +185,7 @@ class March:
     def _ground(self) -> None:
         case, world, mesh = self.case, self.world, self.case.mesh
         wave = float((self.bulk + 4 / 3 * self.shear).max())
-        stiff = world.foam or 5 * wave / float(mesh.size.min())
+        stiff = world.foam or wave / float(mesh.size.min())
         self.ground = np.array([stiff, world.foam_loss, world.adhesion, world.adhesion_reach])
         self.plane, self.coulomb = np.zeros(6), np.array([0.0, 0.0, 1.0])
         if case.plane is None:

@@ -137,7 +137,7 @@ class Line:
     full: float = 20e3
 
     def arriving(self, supply: Floats, dt: float) -> Floats:
-        """Pressure [T] Pa at the chamber from that measured [T] at steps dt [s] apart; its volume acts in ``inside``."""
+        """Pressure [T] Pa at the chamber from that measured, dt [s] apart; its volume acts in ``inside``."""
         p = self.gain * supply
         p = p * (1 - self.loss * (0.5 + 0.5 * np.clip(p / self.full, 0, 2)))
         if self.leak:
