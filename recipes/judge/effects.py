@@ -125,7 +125,7 @@ def soft_side(world: World, s: Specimen, rng: np.random.Generator) -> tuple[Worl
 
 def density(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Of the whole body."""
-    factor = _either(rng, 1.04, 1.6)
+    factor = _either(rng, 1.015, 1.6)
     return replace(world, density=factor), Effect(name="density", parameters={"factor": factor}, form={})
 
 
@@ -139,7 +139,7 @@ def attached_mass(world: World, s: Specimen, rng: np.random.Generator) -> tuple[
 
 
 def tether(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
-    """A hanging chain; scored on the mass that it hangs on the body and on its stiffness, both at rest."""
+    """A hanging chain; scored on the mass that it hangs on the body at rest, and its stiffness over 4 mm."""
     point = np.asarray(_spot(s, rng))
     down = np.asarray(s.setup["gravity"]) / 9.81
     aside = rng.standard_normal(3)
@@ -151,7 +151,7 @@ def tether(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, 
     chain = Chain(
         point=_vector(point),
         support=_vector(support),
-        length=float(np.linalg.norm(support - point) * rng.uniform(1.0, 1.15)),
+        length=float(np.linalg.norm(support - point) * rng.uniform(0.99, 1.04)),
         mass=0.25 * s.body_mass * size,
         stiffness=80 * size * float(rng.uniform(0.3, 1)),
         damping=0.2 * size,
@@ -164,7 +164,7 @@ def tether(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, 
         return max(chain.numbers()[2] * stretch, 0.0) * end / np.linalg.norm(end)
 
     away = (point - support) / np.linalg.norm(point - support)
-    step = 1e-3
+    step = 4e-3
     stiffness = float((pull(point - step * away) - pull(point + step * away)) @ away) / (2 * step)
     effect = Effect(
         name="tether",

@@ -226,6 +226,7 @@ class March:
             self.chains.append(
                 (nodes, weights, beads, np.zeros_like(beads), np.asarray(chain.support, float), chain.numbers())
             )
+        self.drawn: tuple[Ints, Floats] | None = None
         self.slosh = [np.zeros((2, 3)) for _ in world.lumps]
         if case.pressure[0].size:
             self.areas = np.zeros((len(mesh.chambers[0].nodes), 9, 3))
@@ -302,7 +303,8 @@ class March:
                 state[0] += self.dt * state[1]
         if self.world.magnet is not None:
             at, fixed, strength = self.world.magnet
-            nodes, weights = _ball(self.case.mesh, at, 0.004)
+            nodes, weights = self.drawn or _ball(self.case.mesh, at, 0.004)
+            self.drawn = nodes, weights
             reach = np.asarray(fixed) - weights @ self.x[nodes]
             far = max(float(np.linalg.norm(reach)), 0.004)
             self.force[nodes] += weights[:, None] * strength * (0.01 / far) ** 3 * reach / far

@@ -12,6 +12,7 @@ may be off by 10 %, the pressure by 5 %, beside clock, scale, frame, marker plac
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 import multiprocessing
@@ -29,6 +30,7 @@ from effects import LIBRARY, OUTSIDE, Effect, own_world
 from experiment import Trial, toml
 from lobatto import Floats
 from march import Broken, March, case_of
+from scipy.interpolate import CubicSpline
 from specimens import SPECIMENS, Specimen, mesh_for
 from visible import detectability
 from world import World
@@ -93,6 +95,18 @@ def _motion(specimen: Specimen, trial: Trial, number: int, world: World, errors:
     return March(case, world).run(instants(specimen, errors, trial.name)[1], nodes, shapes)
 
 
+@functools.cache
+def believed_motion(name: str, finer: float) -> CubicSpline:
+    """Markers of the held-out trial over time, had the experimenter been right in everything."""
+    specimen = SPECIMENS[name]()
+    trial = specimen.trials[-1]
+    mesh = mesh_for(name, finer)
+    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
+    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
+    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
+    return CubicSpline(t, March(case, World()).run(t, *mesh.interpolation(points)))
+
+
 def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str, Any]:
     """Simulate, film and write one case; returns its truth."""
     rng = np.random.default_rng(seed)
@@ -125,7 +139,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     if errors.told:
         recording["noise"] = float(f"{errors.noise:.2g}")
     (folder / "setup.toml").write_text(toml({**specimen.setup, "recording": recording}))
-    count, trials = len(errors.places), {}
+    count, trials, believed = len(errors.places), {}, 0.0
     for trial, moved, still in zip(specimen.trials, runs, plain, strict=True):
         told, _ = instants(specimen, errors, trial.name)
         record = film(specimen, errors, told, moved[:, :count], rng)
@@ -134,7 +148,11 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
         record.write((kept if trial.held_out else place) / "markers.csv")
         if trial.held_out:
             # Free of measurement errors: what a perfect prediction for the stated markers and true times is.
-            replace(record, value=moved[:, count:], axes="xyz").write(kept / "clean.csv")
+            true = instants(specimen, errors, trial.name)[1]
+            replace(record, time=true, value=moved[:, count:], axes="xyz").write(kept / "clean.csv")
+            if not trial.tables:
+                (place / "trial.toml").write_text("# as in setup.toml\n")
+            believed = np.sqrt(np.mean((believed_motion(plan.specimen, finer)(true) - moved[:, count:]) ** 2))
         axes = ["xyz".index(a) for a in record.axes]
         effect = float(np.sqrt(np.mean((moved - still)[:, :count, axes] ** 2)))
         trials[trial.name] = {
@@ -163,6 +181,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
         "nuisance": {"youngs_modulus": young * bare.modulus, "pressure_gain": bare.line.gain},
         "measurement": errors.table(),
         "trials": trials,
+        "believed_heldout_rms_mm": 1e3 * float(believed),
         "seconds": time.perf_counter() - started,
     }
 
