@@ -131,7 +131,7 @@ def density(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World,
 
 def attached_mass(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """A lump stuck to the surface."""
-    mass, radius = s.body_mass * log_uniform(rng, 0.003, 0.2), float(rng.uniform(0.003, 0.007))
+    mass, radius = s.body_mass * log_uniform(rng, 0.005, 0.25), float(rng.uniform(0.003, 0.007))
     point = _spot(s, rng)
     lump = Lump(point=point, mass=mass, radius=radius)
     effect = Effect(name="attached_mass", parameters={"mass_kg": mass}, form={"radius_m": radius}, location=point)
@@ -182,14 +182,14 @@ def _full(s: Specimen) -> float:
 
 def pressure_lag(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Two volumes in series."""
-    lag = log_uniform(rng, 0.002, 0.08)
+    lag = log_uniform(rng, 0.004, 0.08)
     effect = Effect(name="pressure_lag", parameters={"time_constant_s": lag}, form={"volumes": 2})
     return replace(world, line=replace(world.line, lag=lag)), effect
 
 
 def pressure_loss(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """A fraction that grows with the pressure: half as large near zero."""
-    loss = log_uniform(rng, 0.03, 0.45)
+    loss = log_uniform(rng, 0.05, 0.45)
     full = _full(s)
     effect = Effect(name="pressure_loss", parameters={"fraction": 0.9 * loss}, form={"fraction_at_full": loss})
     return replace(world, line=replace(world.line, loss=loss, full=full)), effect
@@ -197,7 +197,7 @@ def pressure_loss(world: World, s: Specimen, rng: np.random.Generator) -> tuple[
 
 def leak(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """An orifice behind a supply that takes its time to fill the chamber."""
-    strength, filling = log_uniform(rng, 0.03, 0.6), log_uniform(rng, 0.006, 0.03)
+    strength, filling = log_uniform(rng, 0.05, 0.6), log_uniform(rng, 0.006, 0.03)
     root = (-strength + math.sqrt(strength**2 + 4)) / 2
     effect = Effect(
         name="leak",
@@ -209,7 +209,7 @@ def leak(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Ef
 
 def air_stiffness(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Air closed off in chamber and line, by Boyle's law."""
-    closed = log_uniform(rng, 0.02, 1.0)
+    closed = log_uniform(rng, 0.05, 1.0)
     stiffness = closed * (ATMOSPHERE + 0.5 * _full(s))
     effect = Effect(name="air_stiffness", parameters={"air_stiffness_pa": stiffness}, form={"closed": closed})
     return replace(world, line=replace(world.line, closed=closed)), effect
@@ -282,7 +282,7 @@ def initial_motion(world: World, s: Specimen, rng: np.random.Generator) -> tuple
 
 def drag(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Quadratic, on the normal motion of the surface; scored as fluid density times drag coefficient."""
-    value = log_uniform(rng, 3, 1500)
+    value = log_uniform(rng, 8, 2000)
     effect = Effect(name="drag", parameters={"density_drag_kg_m3": 2 * value}, form={})
     return replace(world, drag=value), effect
 

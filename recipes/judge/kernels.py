@@ -8,25 +8,55 @@ import numba
 import numpy as np
 
 _D = np.array([[-1.5, 2.0, -0.5], [-0.5, 0.0, 0.5], [0.5, -2.0, 1.5]])
+LANES = 28  # of an element's 27 points, filled up so that they fit the vector registers
+_J, _LOG, _TWO, _TRACE, _WEIGHT, _MU, _K = 36, 37, 38, 39, 40, 41, 42
 _jit = numba.njit(cache=True, fastmath=True, error_model="numpy")
 
 
 @_jit
 def gradients(local, scale, out):
-    """Reference gradient out[3 a + b, q] = d u_a / d X_b from nodal values local[a, q], q = i + 3 j + 9 k."""
+    """Reference gradient, row 3 a + b of out: d u_a / d X_b, from nodal values local[27 a + q], q = i + 3 j + 9 k.
+
+    Along a line of three nodes at -1, 0, 1 the derivative of a quadratic is (-3, 4, -1)/2, (-1, 0, 1)/2, (1, -4, 3)/2.
+    """
     for a in range(3):
-        for k in range(3):
-            for j in range(3):
-                for i in range(3):
-                    q = i + 3 * j + 9 * k
-                    gx, gy, gz = 0.0, 0.0, 0.0
-                    for m in range(3):
-                        gx += _D[i, m] * local[a, m + 3 * j + 9 * k]
-                        gy += _D[j, m] * local[a, i + 3 * m + 9 * k]
-                        gz += _D[k, m] * local[a, i + 3 * j + 9 * m]
-                    out[3 * a, q] = gx * scale[0]
-                    out[3 * a + 1, q] = gy * scale[1]
-                    out[3 * a + 2, q] = gz * scale[2]
+        for b in range(3):
+            stride = 3**b
+            first, second = (3, 9) if b == 0 else ((1, 9) if b == 1 else (1, 3))
+            row, half = (3 * a + b) * LANES, 0.5 * scale[b]
+            for m in range(3):
+                for n in range(3):
+                    at = first * m + second * n
+                    u, v, w = (
+                        local[27 * a + at],
+                        local[27 * a + at + stride],
+                        local[27 * a + at + 2 * stride],
+                    )
+                    out[row + at] = half * (4 * v - 3 * u - w)
+                    out[row + at + stride] = half * (w - u)
+                    out[row + at + 2 * stride] = half * (u - 4 * v + 3 * w)
+
+
+@_jit
+def gathered(p, scale, local):
+    """Nodal sums local[27 a + l] = sum over points and b of (d N_l / d X_b) p[3 a + b]: the transpose of gradients."""
+    local[:] = 0.0
+    for a in range(3):
+        for b in range(3):
+            stride = 3**b
+            first, second = (3, 9) if b == 0 else ((1, 9) if b == 1 else (1, 3))
+            row, half = (3 * a + b) * LANES, 0.5 * scale[b]
+            for m in range(3):
+                for n in range(3):
+                    at = first * m + second * n
+                    u, v, w = (
+                        p[row + at],
+                        p[row + at + stride],
+                        p[row + at + 2 * stride],
+                    )
+                    local[27 * a + at] += half * (w - 3 * u - v)
+                    local[27 * a + at + stride] += half * 4 * (u - w)
+                    local[27 * a + at + 2 * stride] += half * (v - u + 3 * w)
 
 
 @_jit
@@ -42,109 +72,158 @@ def material(x, rest, cells, size, weight, shear, bulk, discrete, old, history, 
         shear: mu [M, 27] Pa.
         bulk: K [M, 27] Pa.
         discrete: a, b and g of each Maxwell element [E, 3].
-        old: S of the step before [M, 6, 27].
-        history: H [M, E, 6, 27].
+        old: S of the step before [M, 6, LANES].
+        history: H [M, E, 6, LANES].
         law: 1/J_m of a Gent solid, then 1/r and m [Pa] of Ogden and Roxburgh; zeros for neo-Hookean.
         peak: Largest deviatoric energy so far [M, 27] Pa.
         force: [N, 3] N.
     """
     elements = discrete.shape[0]
-    local = np.empty((3, 27))
-    f = np.empty((9, 27))
-    p = np.empty((9, 27))
-    s = np.empty((6, 27))
+    local = np.empty(81)
+    w = np.zeros(43 * LANES)  # rows: F 0-8, cofactors 9-17, Cb 18-23, S 24-29, T 30-35, then single ones; P in 0-8
     scale = np.empty(3)
     least = 1e9
+    plain = law[0] == 0 and law[1] == 0
     for e in range(cells.shape[0]):
         for q in range(27):
             n = cells[e, q]
             for a in range(3):
-                local[a, q] = x[n, a] - rest[n, a]
+                local[27 * a + q] = x[n, a] - rest[n, a]
+            w[_WEIGHT * LANES + q] = weight[e, q]
+            w[_MU * LANES + q] = shear[e, q]
+            w[_K * LANES + q] = bulk[e, q]
         for a in range(3):
             scale[a] = 2 / size[e, a]
-        gradients(local, scale, f)
+        gradients(local, scale, w)
+        for c in range(9):
+            w[c * LANES + 27] = 0.0
+        for q in range(LANES):
+            w[0 * LANES + q] += 1
+            w[4 * LANES + q] += 1
+            w[8 * LANES + q] += 1
+        _strain(w)
         for q in range(27):
-            f[0, q] += 1
-            f[4, q] += 1
-            f[8, q] += 1
-        for q in range(27):
-            f0, f1, f2, f3, f4, f5, f6, f7, f8 = (
-                f[0, q], f[1, q], f[2, q], f[3, q], f[4, q], f[5, q], f[6, q], f[7, q], f[8, q]
-            )  # fmt: skip
-            # Cofactors: dJ/dF.
-            k0, k1, k2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
-            k3, k4, k5 = f2 * f7 - f1 * f8, f0 * f8 - f2 * f6, f1 * f6 - f0 * f7
-            k6, k7, k8 = f1 * f5 - f2 * f4, f2 * f3 - f0 * f5, f0 * f4 - f1 * f3
-            j = f0 * k0 + f1 * k1 + f2 * k2
-            least = min(least, j)
-            log = math.log(max(j, 1e-3))
-            third = math.exp(-log / 3)
-            two = third * third
-            # Cb and its inverse (det Cb = 1: the adjugate); order xx, yy, zz, xy, yz, xz.
-            c0 = two * (f0 * f0 + f3 * f3 + f6 * f6)
-            c1 = two * (f1 * f1 + f4 * f4 + f7 * f7)
-            c2 = two * (f2 * f2 + f5 * f5 + f8 * f8)
-            c3 = two * (f0 * f1 + f3 * f4 + f6 * f7)
-            c4 = two * (f1 * f2 + f4 * f5 + f7 * f8)
-            c5 = two * (f0 * f2 + f3 * f5 + f6 * f8)
-            trace = c0 + c1 + c2
-            t, inv = trace / 3, 1 / j
-            s0 = inv * (1 - t * (c1 * c2 - c4 * c4))
-            s1 = inv * (1 - t * (c0 * c2 - c5 * c5))
-            s2 = inv * (1 - t * (c0 * c1 - c3 * c3))
-            s3 = -inv * t * (c4 * c5 - c3 * c2)
-            s4 = -inv * t * (c3 * c5 - c4 * c0)
-            s5 = -inv * t * (c3 * c4 - c5 * c1)
-            s[0, q], s[1, q], s[2, q], s[3, q], s[4, q], s[5, q] = s0, s1, s2, s3, s4, s5
-            factor = 1 / (1 - min(law[0] * (trace - 3), 0.9))
-            if law[1] > 0:
-                energy = shear[e, q] / 2 * (trace - 3)
-                if energy > peak[e, q]:
-                    peak[e, q] = energy
-                else:
-                    factor *= 1 - law[1] * math.erf((peak[e, q] - energy) / law[2])
-            t0, t1, t2, t3, t4, t5 = factor * s0, factor * s1, factor * s2, factor * s3, factor * s4, factor * s5
-            for m in range(elements):
-                a, b, g = discrete[m, 0], discrete[m, 1], discrete[m, 2]
-                h0 = a * history[e, m, 0, q] + b * (s0 - old[e, 0, q])
-                h1 = a * history[e, m, 1, q] + b * (s1 - old[e, 1, q])
-                h2 = a * history[e, m, 2, q] + b * (s2 - old[e, 2, q])
-                h3 = a * history[e, m, 3, q] + b * (s3 - old[e, 3, q])
-                h4 = a * history[e, m, 4, q] + b * (s4 - old[e, 4, q])
-                h5 = a * history[e, m, 5, q] + b * (s5 - old[e, 5, q])
-                history[e, m, 0, q], history[e, m, 1, q], history[e, m, 2, q] = h0, h1, h2
-                history[e, m, 3, q], history[e, m, 4, q], history[e, m, 5, q] = h3, h4, h5
-                t0, t1, t2 = t0 + g * h0, t1 + g * h1, t2 + g * h2
-                t3, t4, t5 = t3 + g * h3, t4 + g * h4, t5 + g * h5
-            # P = tau F^-T with tau = mu J dev(Fb T Fb^T) + ... ; F T first, then the deviator's trace is T : Cb.
-            third_trace = (t0 * c0 + t1 * c1 + t2 * c2 + 2 * (t3 * c3 + t4 * c4 + t5 * c5)) / 3
-            w = weight[e, q]
-            own = w * shear[e, q] * j * two
-            iso = w * (bulk[e, q] / 2 * (j * (j - 1) + log) * inv - shear[e, q] * third_trace)
-            p[0, q] = own * (f0 * t0 + f1 * t3 + f2 * t5) + iso * k0
-            p[1, q] = own * (f0 * t3 + f1 * t1 + f2 * t4) + iso * k1
-            p[2, q] = own * (f0 * t5 + f1 * t4 + f2 * t2) + iso * k2
-            p[3, q] = own * (f3 * t0 + f4 * t3 + f5 * t5) + iso * k3
-            p[4, q] = own * (f3 * t3 + f4 * t1 + f5 * t4) + iso * k4
-            p[5, q] = own * (f3 * t5 + f4 * t4 + f5 * t2) + iso * k5
-            p[6, q] = own * (f6 * t0 + f7 * t3 + f8 * t5) + iso * k6
-            p[7, q] = own * (f6 * t3 + f7 * t1 + f8 * t4) + iso * k7
-            p[8, q] = own * (f6 * t5 + f7 * t4 + f8 * t2) + iso * k8
+            least = min(least, w[_J * LANES + q])
+        if plain:
+            for c in range(6):
+                for q in range(LANES):
+                    w[(30 + c) * LANES + q] = w[(24 + c) * LANES + q]
+        else:
+            _soften(w, law, peak[e])
+        for m in range(elements):
+            a, b, g = discrete[m, 0], discrete[m, 1], discrete[m, 2]
+            for c in range(6):
+                row, before = history[e, m, c], old[e, c]
+                for q in range(LANES):
+                    h = a * row[q] + b * (w[(24 + c) * LANES + q] - before[q])
+                    row[q] = h
+                    w[(30 + c) * LANES + q] += g * h
         if elements > 0:
             for c in range(6):
-                for q in range(27):
-                    old[e, c, q] = s[c, q]
-        for a in range(3):
-            for k in range(3):
-                for j2 in range(3):
-                    for i in range(3):
-                        total = 0.0
-                        for m in range(3):
-                            total += _D[m, i] * scale[0] * p[3 * a, m + 3 * j2 + 9 * k]
-                            total += _D[m, j2] * scale[1] * p[3 * a + 1, i + 3 * m + 9 * k]
-                            total += _D[m, k] * scale[2] * p[3 * a + 2, i + 3 * j2 + 9 * m]
-                        force[cells[e, i + 3 * j2 + 9 * k], a] -= total
+                for q in range(LANES):
+                    old[e, c, q] = w[(24 + c) * LANES + q]
+        _stress(w)
+        gathered(w, scale, local)
+        for q in range(27):
+            for a in range(3):
+                force[cells[e, q], a] -= local[27 * a + q]
     return least
+
+
+@_jit
+def _strain(w):
+    for q in range(LANES):
+        f0, f1, f2 = w[q], w[LANES + q], w[2 * LANES + q]
+        f3, f4, f5 = w[3 * LANES + q], w[4 * LANES + q], w[5 * LANES + q]
+        f6, f7, f8 = w[6 * LANES + q], w[7 * LANES + q], w[8 * LANES + q]
+        k0, k1, k2 = f4 * f8 - f5 * f7, f5 * f6 - f3 * f8, f3 * f7 - f4 * f6
+        w[9 * LANES + q], w[10 * LANES + q], w[11 * LANES + q] = k0, k1, k2
+        w[12 * LANES + q], w[13 * LANES + q], w[14 * LANES + q] = (
+            f2 * f7 - f1 * f8,
+            f0 * f8 - f2 * f6,
+            f1 * f6 - f0 * f7,
+        )
+        w[15 * LANES + q], w[16 * LANES + q], w[17 * LANES + q] = (
+            f1 * f5 - f2 * f4,
+            f2 * f3 - f0 * f5,
+            f0 * f4 - f1 * f3,
+        )
+        j = f0 * k0 + f1 * k1 + f2 * k2
+        # ln J = 2 artanh z and J^(-2/3) by their series, which the compiler vectorises: 1e-9 for J from 1/2 to 2.
+        z = (j - 1) / (j + 1)
+        zz = z * z
+        log = 1 / 13 + zz * (1 / 15 + zz * (1 / 17 + zz * (1 / 19 + zz / 21)))
+        log = 2 * z * (1 + zz * (1 / 3 + zz * (1 / 5 + zz * (1 / 7 + zz * (1 / 9 + zz * (1 / 11 + zz * log))))))
+        y = -log / 3
+        third = 1 / 120 + y * (1 / 720 + y * (1 / 5040 + y * (1 / 40320 + y * (1 / 362880 + y / 3628800))))
+        third = 1 + y * (1 + y * (1 / 2 + y * (1 / 6 + y * (1 / 24 + y * third))))
+        two = third * third
+        c0 = two * (f0 * f0 + f3 * f3 + f6 * f6)
+        c1 = two * (f1 * f1 + f4 * f4 + f7 * f7)
+        c2 = two * (f2 * f2 + f5 * f5 + f8 * f8)
+        c3 = two * (f0 * f1 + f3 * f4 + f6 * f7)
+        c4 = two * (f1 * f2 + f4 * f5 + f7 * f8)
+        c5 = two * (f0 * f2 + f3 * f5 + f6 * f8)
+        t, inv = (c0 + c1 + c2) / 3, 1 / j
+        (
+            w[18 * LANES + q],
+            w[19 * LANES + q],
+            w[20 * LANES + q],
+            w[21 * LANES + q],
+            w[22 * LANES + q],
+            w[23 * LANES + q],
+        ) = c0, c1, c2, c3, c4, c5
+        # S = (I - t Cb^-1) / J; det Cb = 1, so that its inverse is its adjugate. Order xx, yy, zz, xy, yz, xz.
+        w[24 * LANES + q] = inv * (1 - t * (c1 * c2 - c4 * c4))
+        w[25 * LANES + q] = inv * (1 - t * (c0 * c2 - c5 * c5))
+        w[26 * LANES + q] = inv * (1 - t * (c0 * c1 - c3 * c3))
+        w[27 * LANES + q] = -inv * t * (c4 * c5 - c3 * c2)
+        w[28 * LANES + q] = -inv * t * (c3 * c5 - c4 * c0)
+        w[29 * LANES + q] = -inv * t * (c3 * c4 - c5 * c1)
+        (
+            w[_J * LANES + q],
+            w[_LOG * LANES + q],
+            w[_TWO * LANES + q],
+            w[_TRACE * LANES + q],
+        ) = j, log, two, 3 * t
+
+
+@_jit
+def _soften(w, law, peak):
+    for q in range(27):
+        factor = 1 / (1 - min(law[0] * (w[_TRACE * LANES + q] - 3), 0.9))
+        if law[1] > 0:
+            energy = w[_MU * LANES + q] / 2 * (w[_TRACE * LANES + q] - 3)
+            if energy > peak[q]:
+                peak[q] = energy
+            else:
+                factor *= 1 - law[1] * math.erf((peak[q] - energy) / law[2])
+        for c in range(6):
+            w[(30 + c) * LANES + q] = factor * w[(24 + c) * LANES + q]
+
+
+@_jit
+def _stress(w):
+    # P = tau F^-T, tau = mu J dev(Fb T Fb^T) + K/2 (J (J - 1) + ln J) I: with F T first the trace is T : Cb.
+    for q in range(LANES):
+        t0, t1, t2, t3, t4, t5 = (
+            w[30 * LANES + q],
+            w[31 * LANES + q],
+            w[32 * LANES + q],
+            w[33 * LANES + q],
+            w[34 * LANES + q],
+            w[35 * LANES + q],
+        )
+        mean = t0 * w[18 * LANES + q] + t1 * w[19 * LANES + q] + t2 * w[20 * LANES + q]
+        mean = (mean + 2 * (t3 * w[21 * LANES + q] + t4 * w[22 * LANES + q] + t5 * w[23 * LANES + q])) / 3
+        j, weight, mu = w[_J * LANES + q], w[_WEIGHT * LANES + q], w[_MU * LANES + q]
+        own = weight * mu * j * w[_TWO * LANES + q]
+        iso = weight * (w[_K * LANES + q] / 2 * (j * (j - 1) + w[_LOG * LANES + q]) / j - mu * mean)
+        for r in (0, 3, 6):
+            a, b, c = w[r * LANES + q], w[(r + 1) * LANES + q], w[(r + 2) * LANES + q]
+            w[r * LANES + q] = own * (a * t0 + b * t3 + c * t5) + iso * w[(9 + r) * LANES + q]
+            w[(r + 1) * LANES + q] = own * (a * t3 + b * t1 + c * t4) + iso * w[(10 + r) * LANES + q]
+            w[(r + 2) * LANES + q] = own * (a * t5 + b * t4 + c * t2) + iso * w[(11 + r) * LANES + q]
 
 
 @_jit

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from kernels import advance, area_vectors, drag, material, push
+from kernels import LANES, advance, area_vectors, drag, material, push
 from lobatto import Floats, Ints, Mesh, box_mesh
 from numpy.typing import NDArray
 from world import World, chain_step
@@ -200,8 +200,8 @@ class March:
         count, elements = len(self.case.mesh.cells), len(self.elements)
         ratio = dt / self.elements[:, 1]
         self.discrete = np.stack([np.exp(-ratio), -np.expm1(-ratio) / ratio, self.elements[:, 0]], -1)
-        self.old = np.zeros((count, 6, 27))
-        self.history = np.zeros((count, elements, 6, 27))
+        self.old = np.zeros((count, 6, LANES))
+        self.history = np.zeros((count, elements, 6, LANES))
         self.peak = np.zeros((count, 27))
 
     def _start(self) -> None:
@@ -244,7 +244,11 @@ class March:
         u[self.case.held] = 0
         top = 0.0
         free, none = np.zeros(3), np.zeros((0, 3))
-        scratch = np.zeros((len(mesh.cells), 6, 27)), np.zeros((len(mesh.cells), 0, 6, 27)), np.zeros(mesh.weight.shape)
+        scratch = (
+            np.zeros((len(mesh.cells), 6, LANES)),
+            np.zeros((len(mesh.cells), 0, 6, LANES)),
+            np.zeros(mesh.weight.shape),
+        )
         root = np.sqrt(self.mass)[:, None]
         for _ in range(60):
             u /= np.linalg.norm(u)
@@ -270,7 +274,7 @@ class March:
             self.x, mesh.nodes, mesh.cells, mesh.size, mesh.weight, shear, bulk, self.discrete, self.old,
             self.history, self.law, self.peak, self.force,
         )  # fmt: skip
-        if not least > 0.05:
+        if not least > 0.2:
             raise Broken(f"an element turned inside out at t = {self.t:.4g} s")
 
     def _pressure(self, number: int) -> None:
