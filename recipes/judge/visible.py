@@ -12,18 +12,24 @@ from specimens import Specimen
 
 
 def detectability(
-    specimen: Specimen, times: Sequence[Floats], change: Sequence[Floats], plain: Sequence[Floats], noise: float
+    specimen: Specimen,
+    times: Sequence[Floats],
+    change: Sequence[Floats],
+    plain: Sequence[Floats],
+    unsure: Sequence[Sequence[Floats]],
+    noise: float,
 ) -> float:
     """Root mean square of an effect over the noise, after the best imitation by measurement errors and modulus.
 
-    Imitated by: clock and place of each trial, scale, frame, place of each marker, with their usual sizes as priors,
-    and the motion's slowing with a modulus that is off: time that runs at another rate together with a larger motion.
+    Imitated by: clock of each trial, scale, frame, place of each marker, modulus and pressure, with their usual sizes
+    as priors.
 
     Args:
         specimen: The body, for its axes.
         times: Instants of each trial [T] s.
         change: What the effect changes in each trial [T, markers, 3] m.
         plain: Motion without it [T, markers, 3] m.
+        unsure: Changes by one usual error of each believed number that may be off [numbers][trials][T, markers, 3] m.
         noise: Standard deviation [m].
     """
     axes = ["xyz".index(a) for a in specimen.setup["recording"].get("axes", "xyz")]
@@ -47,10 +53,8 @@ def detectability(
             unit = np.zeros((count, 3))
             unit[marker, a] = 1
             add([n + unit for n in nothing], 5e-4)
-    clamped = "clamp" in specimen.setup
-    if clamped:
-        add([s * t[:, None, None] for s, t in zip(speed, times, strict=True)], 0.05)
-        add([x - x[:1] for x in plain], 0.1)
+    for parts in unsure:
+        add(parts, 1.0)
     matrix = np.stack(columns, 1) / noise
     target = np.concatenate([c[..., axes].ravel() for c in change]) / noise
     both = np.concatenate([matrix, np.eye(matrix.shape[1])])
