@@ -218,7 +218,7 @@ def air_stiffness(world: World, s: Specimen, rng: np.random.Generator) -> tuple[
 def friction(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Stribeck: larger at rest."""
     believed = s.setup["plane"][0]["friction"]
-    sliding = log_uniform(rng, 0.1, 1.0) if believed == "stick" else believed * _either(rng, 1.1, 3.0)
+    sliding = log_uniform(rng, 0.12, 0.9) if believed == "stick" else believed * _either(rng, 1.1, 3.0)
     rest, speed = sliding * float(rng.uniform(1.1, 1.5)), log_uniform(rng, 0.01, 0.1)
     form = {"at_rest": rest, "stribeck_m_s": speed, "believed": believed}
     effect = Effect(name="friction", parameters={"coefficient": sliding}, form=form)
@@ -227,7 +227,7 @@ def friction(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World
 
 def adhesion(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """A traction that grows and fades with the gap, without history."""
-    traction, reach = log_uniform(rng, 15, 3000), float(rng.uniform(1e-4, 5e-4))
+    traction, reach = log_uniform(rng, 5, 1000), float(rng.uniform(1e-4, 5e-4))
     effect = Effect(
         name="adhesion",
         parameters={"energy_j_m2": math.e * traction * reach},
@@ -238,9 +238,10 @@ def adhesion(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World
 
 def wall_offset(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Ground higher or lower."""
-    offset = log_uniform(rng, 2e-4, 6e-3) * float(rng.choice((-1, 1)))
     low = s.setup["body"]["origin"][2]
-    offset = min(offset, 0.9 * low)
+    offset = log_uniform(rng, 0.4 * low, 3 * low)
+    if offset > 0.9 * low or rng.random() < 0.5:
+        offset = -offset
     return replace(world, plane_offset=offset), Effect(name="wall_offset", parameters={"offset_m": offset}, form={})
 
 
@@ -343,7 +344,7 @@ def heat(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Ef
 
 def foam(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """A floor that gives and damps."""
-    stiffness = log_uniform(rng, 5e4, 1e6)
+    stiffness = log_uniform(rng, 3e4, 5e5)
     loss = stiffness * log_uniform(rng, 2e-3, 2e-2)
     form = {"stiffness_pa_m": stiffness, "loss_pa_s_m": loss}
     return replace(world, foam=stiffness, foam_loss=loss), Effect(name="foam", parameters={}, form=form, outside=True)

@@ -312,7 +312,10 @@ def advance(x, v, mass, force, dt, held, plane, area, ground, coulomb):
                 normal += v[n, a] * plane[3 + a]
             press = 0.0
             if gap < 0:
-                press = max(-ground[0] * gap - ground[1] * normal, 0.0) * area[n]
+                # The loss acts on the velocity at the end of the step, so that it cannot grow however large it is.
+                rate = dt * area[n] / mass[n]
+                after = (normal - rate * ground[0] * gap) / (1 + rate * ground[1])
+                press = max((after - normal) * mass[n] / dt, 0.0)
             pull = 0.0
             if ground[2] > 0 and gap > 0:
                 pull = ground[2] * area[n] * gap / ground[3] * math.exp(1 - gap / ground[3])

@@ -18,7 +18,7 @@ class Specimen:
     """A body and what is done to it.
 
     Attributes:
-        name: "bar", "finger", "block", "slider" or "post".
+        name: "bar", "finger", "pad", "slider" or "post".
         setup: Tables of setup.toml.
         trials: Given ones and, last, the one held out.
         rate: Of the camera [Hz].
@@ -186,38 +186,39 @@ def _thrown(name: str, held_out: bool, *start: float, spin: Sequence[float] = (0
 
 
 @functools.cache
-def block() -> Specimen:
-    """A block thrown on a plate to which it is believed to stick while it presses."""
+def pad() -> Specimen:
+    """A pad that lies on a plate to which it is believed to stick; an edge is lifted, or pushed to and fro."""
+    right = [[0.078, 0.008, 0.0], [0.090, 0.032, 0.014]]
+    left = [[0.0, 0.008, 0.0], [0.012, 0.032, 0.014]]
     setup = _setup(
-        "soft block, thrown on a plate",
-        (0.066, 0.044, 0.026),
-        (0.0, 0.0, 0.010),
-        duration=0.6,
-        material={"youngs_modulus": 300e3, "density": 1100.0, "prony": [[0.8, 0.003]]},
-        start={"velocity": [0.3, 0.0, -0.3]},
+        "soft pad on a plate, lifted and pushed",
+        (0.090, 0.040, 0.014),
+        (0.0, 0.0, 0.0003),
+        duration=0.8,
+        material={"youngs_modulus": 80e3, "density": 1100.0, "prony": [[0.8, 0.004]]},
         plane=[{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": "stick"}],
         markers=[
-            (0.033, 0.022, 0.036), (0.066, 0.022, 0.028), (0.0, 0.022, 0.028), (0.054, 0.0, 0.018), (0.014, 0.0, 0.030),
-            (0.033, 0.044, 0.022),
+            (0.090, 0.020, 0.010), (0.090, 0.006, 0.006), (0.070, 0.020, 0.0143), (0.045, 0.0, 0.008),
+            (0.0, 0.020, 0.010), (0.020, 0.030, 0.0143),
         ],
     )  # fmt: skip
+
+    def pulls(name: str, *steps: tuple[Any, ...], held_out: bool = False) -> Trial:
+        return Trial(name=name, held_out=held_out, tables={"load": [_load(*step) for step in steps]})
+
     trials = (
-        _thrown("a", False, 0.30, 0, -0.30),
-        _thrown("b", False, 0.55, 0.1, -0.20),
-        _thrown("c", False, 0.0, 0.0, -0.50),
-        _thrown("d", True, 0.45, 0, -0.40),
-    )
-    names = ("friction", "friction", "adhesion", "wall_offset", "gravity_tilt", "initial_motion", "viscoelastic",
-             "attached_mass", "modulus")  # fmt: skip
+        pulls("a", (right, (0, 0, 0.17), 0.1), (right, (0, 0, -0.17), 0.5)),
+        pulls("b", (left, (0.3, 0, 0), 0.08), (left, (-0.3, 0, 0), 0.2), (left, (-0.35, 0, 0), 0.45),
+              (left, (0.35, 0, 0), 0.58)),
+        pulls("c", (right, (0.10, 0.10, 0.12), 0.1), (right, (-0.10, -0.10, -0.12), 0.3), (left, (0, 0, 0.15), 0.45)),
+        pulls("d", (right, (-0.15, 0.05, 0.13), 0.1), (right, (0.15, -0.05, -0.03), 0.35), held_out=True),
+    )  # fmt: skip
+    names = ("friction", "friction", "adhesion", "adhesion", "wall_offset", "density", "viscoelastic",
+             "attached_mass", "modulus", "soft_side")  # fmt: skip
     return Specimen(
-        name="block",
-        setup=setup,
-        trials=trials,
-        rate=200,
-        edge=0.011,
-        effects=names,
-        outside=("foam", "magnet", "gust"),
-    )
+        name="pad", setup=setup, trials=trials, rate=150, edge=0.007, effects=names,
+        outside=("foam", "magnet", "gust", "sloshing"),
+    )  # fmt: skip
 
 
 @functools.cache
@@ -254,7 +255,7 @@ def slider() -> Specimen:
     )
 
 
-SPECIMENS = {"bar": bar, "finger": finger, "block": block, "slider": slider, "post": post}
+SPECIMENS = {"bar": bar, "finger": finger, "pad": pad, "slider": slider, "post": post}
 
 
 @functools.cache

@@ -2,6 +2,7 @@
 
     python recipes/judge/verify.py recordings FOLDER     # case-*/ with setup.toml, trials/, heldout/ and truth.json
     python recipes/judge/verify.py meshes FOLDER --case case-P2
+    python recipes/judge/verify.py specimens             # what a finer mesh changes in the judge's own bodies
 
 The truth is put in, measurement errors too; what is left should be the noise.
 """
@@ -20,6 +21,8 @@ import tyro
 from experiment import Recording, Trial, read_setup
 from lobatto import Floats
 from march import March, case_of, mesh_of
+from seal import believed_motion
+from specimens import SPECIMENS, mesh_for
 from world import Lump, World
 
 
@@ -117,5 +120,27 @@ def meshes(folder: Path, /, *, case: str = "case-P2", edges: tuple[float, ...] =
         print(f"{case}  edge {1e3 * edge:.3g} mm  rms to the finest {rms:.4f} mm", flush=True)
 
 
+def specimens(*, finer: float = 1.5, trials: int = 1) -> None:
+    """Stated markers of the judge's bodies on its mesh against those on a finer one [mm], and its time [s].
+
+    Args:
+        finer: Divides the elements' edge.
+        trials: How many of each body.
+    """
+    for name, make in SPECIMENS.items():
+        for number in range(trials):
+            t = np.arange(0, make().setup["duration"], 0.005)
+            runs = {}
+            for factor in (1.0, finer):
+                started = time.process_time()
+                runs[factor] = believed_motion(name, number, World(), factor)(t), time.process_time() - started
+            coarse, seconds = runs[1.0]
+            gap = 1e3 * float(np.sqrt(np.mean((coarse - runs[finer][0]) ** 2)))
+            moved = 1e3 * float(np.sqrt(np.mean((coarse - coarse[0]) ** 2)))
+            elements = len(mesh_for(name).cells)
+            print(f"{name} {make().trials[number].name}: {elements} elements, processor {seconds:.1f} s, "
+                  f"to {finer:g} times finer {gap:.3f} mm, motion {moved:.2f} mm", flush=True)  # fmt: skip
+
+
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"recordings": recordings, "meshes": meshes})
+    tyro.extras.subcommand_cli_from_dict({"recordings": recordings, "meshes": meshes, "specimens": specimens})
