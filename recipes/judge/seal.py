@@ -75,7 +75,8 @@ def plans(effects: int, nulls: int, pairs: int, outside: int, rng: np.random.Gen
         specimen = every[i % len(every)]
         able = sorted(set(SPECIMENS[specimen]().effects))
         first, second = rng.choice(able, 2, replace=False)
-        found.append({"kind": "pair", "specimen": specimen, "effects": (str(first), str(second))})
+        both = sorted((str(first), str(second)), key=lambda name: name != "modulus")  # others are relative to it
+        found.append({"kind": "pair", "specimen": specimen, "effects": tuple(both)})
     for i in range(outside):
         name = list(OUTSIDE)[i % len(OUTSIDE)]
         able = [s for s in SPECIMENS if name in SPECIMENS[s]().outside]
@@ -250,6 +251,7 @@ def seal(
     seed_from_os: bool = False,
     processes: int = 2,
     finer: float = 1.0,
+    finish: bool = False,
 ) -> str:
     """Make a batch, or go on with it.
 
@@ -264,6 +266,7 @@ def seal(
         seed_from_os: Take the seed from the operating system; it is kept in the sealed file only.
         processes: That work side by side.
         finer: Divides the elements' edge; below 1 for a quick look.
+        finish: Make no more cases, write the truth of those that are there.
 
     Returns:
         SHA-256 of truth.sealed.
@@ -279,6 +282,9 @@ def seal(
         if not (out / "sealed" / f"{plan.name}.json").exists()
     ]
     print(f"{len(todo)} cases, {len(todo) - len(jobs)} of them there already", flush=True)
+    if finish:
+        unmade = {plan.name for plan, *_ in jobs}
+        todo, jobs = [plan for plan in todo if plan.name not in unmade], []
     if processes > 1:
         with multiprocessing.get_context("spawn").Pool(processes) as pool:
             for line in pool.imap_unordered(_work, jobs):
@@ -289,7 +295,7 @@ def seal(
     truths = [json.loads((out / "sealed" / f"{plan.name}.json").read_text()) for plan in todo]
     held = {
         str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for folder in ("cases", "sealed") for p in sorted((out / folder).rglob("*.csv"))
+        for folder in ("cases", "sealed") for plan in todo for p in sorted((out / folder / plan.name).rglob("*.csv"))
     }  # fmt: skip
     text = json.dumps({**kept, "cases": truths, "files": held}, indent=1)
     (out / "truth.sealed").write_text(text)
