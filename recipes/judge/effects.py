@@ -251,7 +251,7 @@ def gravity_tilt(world: World, s: Specimen, rng: np.random.Generator) -> tuple[W
     axis = np.array([0.0, 1.0, 0.0]) if "axes" in s.setup["recording"] else rng.standard_normal(3)
     axis -= (axis @ down) * down
     axis /= np.linalg.norm(axis)
-    angle = math.radians(log_uniform(rng, 0.4, 12)) * float(rng.choice((-1, 1)))
+    angle = math.radians(log_uniform(rng, 0.8, 20)) * float(rng.choice((-1, 1)))
     form = {"gravity": _vector(turned(9.81 * down, angle * axis))}
     effect = Effect(name="gravity_tilt", parameters={"angle_rad": abs(angle)}, form=form)
     return replace(world, gravity_turn=_vector(angle * axis)), effect
@@ -290,7 +290,7 @@ def drag(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Ef
 
 def stiffening(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
     """Gent: mu / (1 - (I1 - 3) / Jm); scored on 1 / Jm."""
-    value = log_uniform(rng, 0.08, 5.0)
+    value = log_uniform(rng, 0.25, 6.0)
     effect = Effect(name="stiffening", parameters={"coefficient": value}, form={"limit": 1 / value})
     return replace(world, gent=value), effect
 
@@ -318,7 +318,7 @@ def magnet(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, 
     way = rng.standard_normal(3)
     way[2] = abs(way[2])
     fixed = point + way / np.linalg.norm(way) * rng.uniform(0.015, 0.03)
-    strength = 9.81 * s.body_mass * log_uniform(rng, 0.5, 5)
+    strength = 9.81 * s.body_mass * log_uniform(rng, 1, 6)
     form = {"at_m": _vector(fixed), "force_at_10mm_n": strength}
     effect = Effect(name="magnet", parameters={}, form=form, location=_vector(point), outside=True)
     return replace(world, magnet=(_vector(point), _vector(fixed), strength)), effect
@@ -330,7 +330,7 @@ def gust(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Ef
     start = float(rng.uniform(0.2, 0.6)) * duration
     window = (start, start + float(rng.uniform(0.1, 0.3)) * duration)
     angle = rng.uniform(0, 2 * math.pi)
-    pressure = 9.81 * s.body_mass / np.prod(sorted(s.setup["body"]["size"])[1:]) * log_uniform(rng, 0.1, 1)
+    pressure = 9.81 * s.body_mass / np.prod(sorted(s.setup["body"]["size"])[1:]) * log_uniform(rng, 0.4, 3)
     traction = _vector(pressure * np.array([math.cos(angle), 0.3, math.sin(angle)]))
     effect = Effect(name="gust", parameters={}, form={"traction_pa": traction}, window=window, outside=True)
     return replace(world, gust=(traction, *window)), effect
