@@ -1,0 +1,162 @@
+"""One answer beside its truth."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from experiment import Recording
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scored:
+    """What is needed of a case and its answer.
+
+    Attributes:
+        case: Name.
+        kind: "effect", "null", "decoy", "pair" or "outside".
+        strength: Of the effect over the noise.
+        length: Of the body [m].
+        truth: Names that were put in.
+        verdict: Of the answer; "missing" without one.
+        names: That it commits to.
+        set: Names that it cannot tell apart, those it commits to included.
+        unknown: Whether it says that something is missing which it does not know.
+        location_error: Distance of the place of the true effect [m].
+        parameter_errors: Relative errors of the numbers that truth and answer share.
+        covered: Whether the interval of each holds the truth.
+        told_ratio: Held-out error after over before, as the answer states it.
+        sealed_ratio: The same for the sealed trial, if the answer predicted it.
+        seconds: That the answer took.
+    """
+
+    case: str
+    kind: str
+    strength: float
+    length: float
+    truth: tuple[str, ...]
+    verdict: str
+    names: tuple[str, ...] = ()
+    set: tuple[str, ...] = ()
+    unknown: bool = False
+    location_error: float | None = None
+    parameter_errors: tuple[float, ...] = ()
+    covered: tuple[bool, ...] = ()
+    told_ratio: float | None = None
+    sealed_ratio: float | None = None
+    seconds: float = 0.0
+
+
+def _rms(value: Any) -> float:
+    """Root mean square of a number, or of all numbers in nested lists and tables."""
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    if isinstance(value, list):
+        parts = [_rms(v) for v in value]
+        parts = [p for p in parts if not math.isnan(p)]
+        return math.sqrt(sum(p * p for p in parts) / len(parts)) if parts else math.nan
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+
+def _told(answer: Mapping[str, Any]) -> float | None:
+    held = answer.get("heldout")
+    rows = held if isinstance(held, list) else [held] if isinstance(held, Mapping) else []
+    rows = [r for r in rows if isinstance(r, Mapping)]
+    if rows and not any("before" in r for r in rows):
+        rows = [v for r in rows for v in r.values() if isinstance(v, Mapping)]
+    before, after = _rms([r.get("before") for r in rows]), _rms([r.get("after") for r in rows])
+    return after / before if before > 0 and not math.isnan(after) else None
+
+
+def _sealed(truth: Mapping[str, Any], folder: Path, batch: Path) -> float | None:
+    path = folder / "predicted.csv"
+    if not path.exists():
+        return None
+    clean = Recording.read(batch / "sealed" / truth["case"] / "clean.csv")
+    guess = Recording.read(path)
+    if guess.names != clean.names or guess.axes not in ("xyz", "xz"):
+        return None
+    chosen = ["xyz".index(a) for a in guess.axes]
+    inside = (clean.time >= guess.time[0]) & (clean.time <= guess.time[-1])
+    flat = guess.value.reshape(len(guess.time), -1)
+    at = np.stack([np.interp(clean.time[inside], guess.time, column) for column in flat.T], 1)
+    gap = at - clean.value[inside][..., chosen].reshape(len(at), -1)
+    return float(1e3 * np.sqrt(np.mean(gap**2)) / truth["believed_heldout_rms_mm"])
+
+
+def parameter_error(name: str, value: float, truth: float) -> float:
+    """Relative error; of a factor that is 1 where nothing is missing, that of its logarithm."""
+    if name == "factor":
+        return abs(math.log(max(value, 1e-9) / truth)) / max(abs(math.log(truth)), 1e-9)
+    return abs(value - truth) / max(abs(truth), 1e-12)
+
+
+def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[str, Any]) -> Scored:
+    """Read the answer to a case and compare.
+
+    Args:
+        truth: Of the case, from truth.sealed.
+        folder: Of all answers.
+        batch: That the case belongs to.
+        words: Names that the answers use for ours: {"effects": {...}, "parameters": {effect: {...}}}.
+    """
+    put = tuple(e["name"] for e in truth["effects"])
+    common: dict[str, Any] = {
+        "case": truth["case"],
+        "kind": truth["kind"],
+        "strength": truth["strength"],
+        "length": truth["body_length_m"],
+        "truth": put,
+    }
+    path = folder / truth["case"] / "explanation.json"
+    if not path.exists():
+        return Scored(**common, verdict="missing")
+    answer = json.loads(path.read_text())
+    effects = words.get("effects", {})
+
+    def ours(name: str) -> str:
+        return effects.get(name, name)
+
+    verdict = str(answer.get("verdict", "failed"))
+    named = {ours(e["name"]): e for e in answer.get("effects") or []}
+    listed = [ours(n if isinstance(n, str) else n["name"]) for n in answer.get("set") or []]
+    group: tuple[str, ...] = ()
+    if verdict == "explained":
+        group = tuple(dict.fromkeys([*named, *listed]))
+    elif verdict == "cannot_distinguish":
+        group = tuple(dict.fromkeys(listed or named))
+    errors, covered, place = [], [], None
+    for effect in truth["effects"]:
+        said = named.get(effect["name"])
+        if said is None or verdict != "explained":
+            continue
+        if effect["location_m"] is not None and said.get("location_m") is not None:
+            place = math.dist(effect["location_m"], said["location_m"])
+        rename = words.get("parameters", {}).get(effect["name"], {})
+        for name, number in (said.get("parameters") or {}).items():
+            own = rename.get(name, name)
+            if own in effect["parameters"]:
+                real = effect["parameters"][own]
+                value = number["value"] if isinstance(number, Mapping) else number
+                errors.append(parameter_error(own, float(value), real))
+                if isinstance(number, Mapping) and number.get("low") is not None and number.get("high") is not None:
+                    covered.append(bool(number["low"] <= real <= number["high"]))
+    cost = answer.get("cost") or {}
+    return Scored(
+        **common,
+        verdict=verdict,
+        names=tuple(named) if verdict == "explained" else (),
+        set=group,
+        unknown=verdict == "unknown_physics" or any(n.startswith("unknown") for n in group),
+        location_error=place,
+        parameter_errors=tuple(errors),
+        covered=tuple(covered),
+        told_ratio=_told(answer),
+        sealed_ratio=_sealed(truth, folder / truth["case"], batch),
+        seconds=float(answer.get("judge_seconds", cost.get("seconds", 0.0)) or 0.0),
+    )

@@ -1,0 +1,213 @@
+"""Score answers against a sealed batch: the acceptance table, confusions, accuracy over strength.
+
+    python recipes/judge/score.py runs/judge/test --answers tool=runs/judge/answers baseline=runs/judge/modulus_only
+
+Every folder of answers (``<case>/explanation.json``) is a column. Intervals are Clopper and Pearson's, 95 %. Strength
+is the root mean square of the effect over the noise that errors of measurement could not imitate; "strong" means at
+least twice ``--threshold``, the strength at which an effect can just be seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+from answers import Scored, match
+from scipy.stats import beta
+
+NAMED = ("explained",)
+SETS = ("explained", "cannot_distinguish")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rate:
+    """A share with its interval.
+
+    Attributes:
+        hits: How many.
+        of: Of how many.
+    """
+
+    hits: int
+    of: int
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Clopper and Pearson, 95 %."""
+        low = float(beta.ppf(0.025, self.hits, self.of - self.hits + 1)) if self.hits else 0.0
+        high = float(beta.ppf(0.975, self.hits + 1, self.of - self.hits)) if self.hits < self.of else 1.0
+        return low, high
+
+    def __str__(self) -> str:
+        """Share, interval, counts."""
+        if not self.of:
+            return "no case"
+        low, high = self.interval
+        return f"{100 * self.hits / self.of:.0f} % [{100 * low:.0f}, {100 * high:.0f}] {self.hits}/{self.of}"
+
+
+def rate(cases: Sequence[Scored], holds: Callable[[Scored], bool]) -> Rate:
+    """Share of cases for which it holds."""
+    return Rate(hits=sum(map(holds, cases)), of=len(cases))
+
+
+def _median(values: Sequence[float], unit: str = "", scale: float = 1.0) -> str:
+    if not values:
+        return "no case"
+    low, middle, high = (scale * float(np.percentile(values, q)) for q in (25, 50, 75))
+    return f"{middle:.3g}{unit} (quartiles {low:.3g}, {high:.3g}; {len(values)})"
+
+
+def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
+    """Rows of the acceptance table and what goes with it."""
+    quiet = [c for c in cases if c.kind in ("null", "decoy")]
+    single = [c for c in cases if c.kind == "effect"]
+    strong = [c for c in single if c.strength >= 2 * threshold]
+    faint = [c for c in single if c.strength < threshold]
+    pairs = [c for c in cases if c.kind == "pair"]
+    outside = [c for c in cases if c.kind == "outside"]
+    committed = [c for c in strong if c.verdict in NAMED and len(c.names) == 1]
+    spoke = [c for c in strong if c.verdict in SETS and c.set]
+    right = [c for c in single if c.verdict in NAMED and c.truth[0] in c.names]
+    local = [c.location_error / c.length for c in right if c.location_error is not None]
+    errors = [e for c in right for e in c.parameter_errors]
+    covered = [x for c in right for x in c.covered]
+    told = [c.told_ratio for c in strong if c.verdict in SETS and c.told_ratio is not None]
+    sealed = [c.sealed_ratio for c in strong if c.verdict in SETS and c.sealed_ratio is not None]
+    sizes = [len(c.set) for c in spoke]
+    return {
+        "false alarms, nulls and decoys (<= 10 %)": str(rate(quiet, lambda c: c.verdict != "nothing_missing")),
+        "  nulls alone": str(rate([c for c in quiet if c.kind == "null"], lambda c: c.verdict != "nothing_missing")),
+        "  decoys alone": str(rate([c for c in quiet if c.kind == "decoy"], lambda c: c.verdict != "nothing_missing")),
+        "right name when it commits, strong (>= 80 %)": str(rate(committed, lambda c: c.names == c.truth)),
+        "commits to one name, strong (>= 50 %)": str(Rate(hits=len(committed), of=len(strong))),
+        "truth inside the reported set (>= 90 %)": str(rate(spoke, lambda c: c.truth[0] in c.set)),
+        "  mean size of the set (<= 2.5)": f"{np.mean(sizes):.2f} ({len(sizes)})" if sizes else "no case",
+        "  over all strong cases, silent ones too": str(rate(strong, lambda c: c.truth[0] in c.set)),
+        "location, median over body length (<= 0.15)": _median(local),
+        "parameter error, median (<= 25 %)": _median(errors, " %", 100),
+        "  coverage of 90 % intervals (80-97 %)": str(Rate(hits=sum(covered), of=len(covered))),
+        "held-out after / before, as the answer says (<= 0.6)": _median(told),
+        "  improved in (>= 90 %)": str(Rate(hits=sum(r < 1 for r in told), of=len(told))),
+        "held-out after / before, sealed trial": _median(sealed),
+        "  improved in ": str(Rate(hits=sum(r < 1 for r in sealed), of=len(sealed))),
+        "outside the library: unknown (>= 60 %)": str(rate(outside, lambda c: c.unknown)),
+        "  wrong confident name (<= 20 %)": str(rate(outside, lambda c: c.verdict in NAMED)),
+        "pairs: one name right": str(rate(pairs, lambda c: any(n in c.names for n in c.truth))),
+        "  both right": str(rate(pairs, lambda c: set(c.truth) <= set(c.names))),
+        "fainter than the threshold: nothing, or the truth": str(
+            rate(faint, lambda c: c.verdict == "nothing_missing" or c.truth[0] in c.set)
+        ),
+        "failed to answer": str(rate(cases, lambda c: c.verdict in ("failed", "missing"))),
+        "seconds for an answer": _median([c.seconds for c in cases if c.seconds]),
+    }
+
+
+def over_strength(cases: Sequence[Scored]) -> list[str]:
+    """Detected, named, in the set, for classes of strength."""
+    single = [c for c in cases if c.kind == "effect"]
+    edges = [0.0, 0.25, 0.5, 1, 2, 4, 8, 16, math.inf]
+    lines = []
+    for low, high in itertools.pairwise(edges):
+        here = [c for c in single if low <= c.strength < high]
+        if here:
+            seen = rate(here, lambda c: c.verdict not in ("nothing_missing", "failed", "missing"))
+            named = rate(here, lambda c: c.verdict in NAMED and c.names == c.truth)
+            inside = rate(here, lambda c: c.truth[0] in c.set)
+            lines.append(f"{low:>5g} to {high:<5g} seen {seen}   named {named}   in the set {inside}")
+    return lines
+
+
+def half_seen(cases: Sequence[Scored]) -> float:
+    """Strength at which half of the single effects are seen, from a logistic curve; not a number without enough."""
+    single = [c for c in cases if c.kind == "effect" and c.strength > 0]
+    y = np.array([c.verdict not in ("nothing_missing", "failed", "missing") for c in single], float)
+    if len(y) < 10 or y.min() == y.max():
+        return math.nan
+    x = np.log([c.strength for c in single])
+    slopes, middles = np.linspace(0.3, 6, 40), np.linspace(x.min(), x.max(), 80)
+    p = 1 / (1 + np.exp(-slopes[:, None, None] * (x - middles[:, None])))
+    p = np.clip(p, 0.02, 0.98)
+    score = (y * np.log(p) + (1 - y) * np.log(1 - p)).sum(-1)
+    return float(np.exp(middles[np.unravel_index(score.argmax(), score.shape)[1]]))
+
+
+def confusion(cases: Sequence[Scored]) -> list[str]:
+    """What was answered for each name that was put in."""
+    rows: dict[str, dict[str, int]] = {}
+    for c in cases:
+        truth = " + ".join(c.truth) if c.truth else c.kind
+        said = " + ".join(c.names) if c.verdict in NAMED else c.verdict
+        if c.verdict == "cannot_distinguish":
+            said = "set with it" if any(n in c.set for n in c.truth) else "set without it"
+        rows.setdefault(truth, {}).setdefault(said, 0)
+        rows[truth][said] += 1
+    return [
+        f"{truth:<32} " + ", ".join(f"{said} {n}" for said, n in sorted(found.items(), key=lambda i: -i[1]))
+        for truth, found in sorted(rows.items())
+    ]
+
+
+def check(batch: Path) -> dict[str, Any]:
+    """The truth; ValueError if it or a recording is not as it was sealed."""
+    text = (batch / "truth.sealed").read_text()
+    stated = (batch / "truth.sha256").read_text().split()[0]
+    if hashlib.sha256(text.encode()).hexdigest() != stated:
+        raise ValueError(f"batch = {batch}: truth.sealed is not what was sealed (SHA-256), wanted it unchanged")
+    truth = json.loads(text)
+    for name, digest in truth["files"].items():
+        if hashlib.sha256((batch / name).read_bytes()).hexdigest() != digest:
+            raise ValueError(f"batch = {batch}: {name} is not what was sealed (SHA-256), wanted it unchanged")
+    return truth
+
+
+def score(
+    batch: Path, /, *, answers: tuple[str, ...], threshold: float = 1.0, rename: Path | None = None,
+    out: Path | None = None,
+) -> dict[str, dict[str, str]]:  # fmt: skip
+    """Print the tables.
+
+    Args:
+        batch: Folder that seal.py made.
+        answers: Folders of answers, each as NAME=FOLDER or FOLDER.
+        threshold: Strength at which an effect can just be seen.
+        rename: JSON {"effects": {theirs: ours}, "parameters": {"effect": {theirs: ours}}} for other vocabularies.
+        out: JSON file for the tables and every case.
+
+    Returns:
+        The acceptance table of each folder of answers.
+    """
+    truth = check(batch)
+    words = json.loads(rename.read_text()) if rename else {}
+    found: dict[str, list[Scored]] = {}
+    for item in answers:
+        label, _, folder = item.rpartition("=")
+        found[label or Path(folder).name] = [match(t, Path(folder), batch, words) for t in truth["cases"]]
+    tables = {label: table(cases, threshold) for label, cases in found.items()}
+    rows = next(iter(tables.values()))
+    width = max(map(len, rows))
+    columns = [max(len(label), *(len(v) for v in rows.values())) for label, rows in tables.items()]
+    print(f"{len(truth['cases'])} cases, batch {truth['batch']}, strong: at least {2 * threshold:g}")
+    print("  ".join(["".ljust(width), *(label.ljust(w) for label, w in zip(tables, columns, strict=True))]))
+    for row in rows:
+        cells = [t[row].ljust(w) for t, w in zip(tables.values(), columns, strict=True)]
+        print("  ".join([row.ljust(width), *cells]))
+    for label, cases in found.items():
+        print(f"\n{label}: over strength (half are seen at {half_seen(cases):.2g})", *over_strength(cases), sep="\n")
+        print(f"\n{label}: what was answered", *confusion(cases), sep="\n")
+    if out is not None:
+        every = {label: [asdict(c) for c in cases] for label, cases in found.items()}
+        out.write_text(json.dumps({"tables": tables, "cases": every}, indent=1))
+    return tables
+
+
+if __name__ == "__main__":
+    tyro.cli(score)

@@ -1,0 +1,311 @@
+"""Make sealed cases: recordings whose cause is written down where who explains them cannot look.
+
+    python recipes/judge/seal.py --out runs/judge/test --batch test --effects 60 --nulls 60 --pairs 10 --outside 12 \
+        --seed-from-os
+    python recipes/judge/seal.py --out runs/judge/calibration --batch calibration ...   # to tune on; disjoint seeds
+
+Writes OUT/cases/<id>/, which may be shown, OUT/truth.sealed and its SHA-256, and OUT/sealed/ with the recordings of the
+held-out trials. Interrupted, the same command goes on. What is always there and never counts as physics: the modulus
+may be off by 10 %, the pressure by 5 %, beside clock, scale, frame, marker places, noise and losses. The effect
+"modulus" is at least 25 %. Half of the nulls are decoys: errors of measurement larger than stated.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import multiprocessing
+import os
+import secrets
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+from camera import DECOYS, Errors, decoy, draw_errors, film, instants
+from effects import LIBRARY, OUTSIDE, Effect, own_world
+from experiment import Trial, toml
+from lobatto import Floats
+from march import Broken, March, case_of
+from scipy.interpolate import CubicSpline
+from specimens import SPECIMENS, Specimen, mesh_for
+from visible import detectability
+from world import Line, World
+
+BATCHES = ("calibration", "test", "smoke")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a case is to be.
+
+    Attributes:
+        name: Of its folder.
+        kind: "effect", "null", "decoy", "pair" or "outside".
+        specimen: Its body.
+        effects: Names to draw.
+        decoy: Kind of decoy, or "".
+    """
+
+    name: str
+    kind: str
+    specimen: str
+    effects: tuple[str, ...] = ()
+    decoy: str = ""
+
+
+def plans(effects: int, nulls: int, pairs: int, outside: int, rng: np.random.Generator) -> list[Plan]:
+    """A shuffled list in which specimens and names come about equally often."""
+    found: list[dict[str, Any]] = []
+    names = sorted(LIBRARY)
+    for i in range(effects):
+        if i % len(names) == 0:
+            rng.shuffle(names)
+        name = names[i % len(names)]
+        able = [s for s in SPECIMENS if name in SPECIMENS[s]().effects]
+        found.append({"kind": "effect", "specimen": str(rng.choice(able)), "effects": (name,)})
+    every = list(SPECIMENS)
+    for i in range(nulls):
+        kind = DECOYS[i // 2 % len(DECOYS)] if i % 2 else ""
+        found.append({"kind": "decoy" if kind else "null", "specimen": every[i % len(every)], "decoy": kind})
+    for i in range(pairs):
+        specimen = every[i % len(every)]
+        able = sorted(set(SPECIMENS[specimen]().effects))
+        first, second = rng.choice(able, 2, replace=False)
+        both = sorted((str(first), str(second)), key=lambda name: name != "modulus")  # others are relative to it
+        found.append({"kind": "pair", "specimen": specimen, "effects": tuple(both)})
+    for i in range(outside):
+        name = list(OUTSIDE)[i % len(OUTSIDE)]
+        able = [s for s in SPECIMENS if name in SPECIMENS[s]().outside]
+        found.append({"kind": "outside", "specimen": str(rng.choice(able)), "effects": (name,)})
+    order = rng.permutation(len(found))
+    return [Plan(name=f"case-{n:03d}", **found[i]) for n, i in enumerate(order)]
+
+
+def _motion(specimen: Specimen, trial: Trial, number: int, world: World, errors: Errors, finer: float) -> Floats:
+    mesh = mesh_for(specimen.name, finer)
+    duration = specimen.setup["duration"]
+    tables = {**specimen.setup, **trial.tables}
+    times = {"started": number * duration, "lasting": len(specimen.trials) * duration}
+    case = case_of(tables, mesh, trial.pressure, **times)
+    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
+    nodes, shapes = mesh.interpolation(np.concatenate([points + np.asarray(errors.places), points]))
+    return March(case, world).run(instants(specimen, errors, trial.name)[1], nodes, shapes)
+
+
+@functools.cache
+def believed_motion(name: str, number: int, world: World, finer: float) -> CubicSpline:
+    """Stated markers over time in one trial, had the experimenter been right in all but ``world``."""
+    specimen = SPECIMENS[name]()
+    trial = specimen.trials[number]
+    mesh = mesh_for(name, finer)
+    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
+    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
+    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
+    return CubicSpline(t, March(case, world).run(t, *mesh.interpolation(points)))
+
+
+def unsure(specimen: Specimen, times: dict[int, Floats], finer: float) -> list[list[Floats]]:
+    """What each trial changes by if the modulus is 5 % higher, and, with a chamber, the pressure 3 %."""
+    others = [World(modulus=1.05)]
+    if "chamber" in specimen.setup:
+        others.append(World(line=Line(gain=1.03)))
+    return [
+        [
+            believed_motion(specimen.name, i, world, finer)(t) - believed_motion(specimen.name, i, World(), finer)(t)
+            for i, t in times.items()
+        ]
+        for world in others
+    ]
+
+
+def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str, Any]:
+    """Simulate, film and write one case; returns its truth."""
+    rng = np.random.default_rng(seed)
+    specimen = SPECIMENS[plan.specimen]()
+    started = time.perf_counter()
+    for _ in range(8):
+        errors = draw_errors(specimen, rng)
+        bare = world = own_world(specimen, rng)
+        drawn: list[Effect] = []
+        for name in plan.effects:
+            world, effect = {**LIBRARY, **OUTSIDE}[name](world, specimen, rng)
+            drawn.append(effect)
+        if plan.decoy:
+            errors = decoy(errors, plan.decoy, specimen, rng)
+        try:
+            runs = [_motion(specimen, t, i, world, errors, finer) for i, t in enumerate(specimen.trials)]
+            if drawn:
+                plain = [_motion(specimen, t, i, bare, errors, finer) for i, t in enumerate(specimen.trials)]
+            else:
+                plain = runs
+            break
+        except Broken:
+            continue
+    else:
+        raise RuntimeError(f"{plan.name}: eight draws of {plan.effects} on {plan.specimen} turned inside out")
+    folder, kept = out / "cases" / plan.name, out / "sealed" / plan.name
+    folder.mkdir(parents=True, exist_ok=True)
+    kept.mkdir(parents=True, exist_ok=True)
+    recording = dict(specimen.setup["recording"])
+    if errors.told:
+        recording["noise"] = float(f"{errors.noise:.2g}")
+    (folder / "setup.toml").write_text(toml({**specimen.setup, "recording": recording}))
+    count, trials, believed = len(errors.places), {}, 0.0
+    for trial, moved, still in zip(specimen.trials, runs, plain, strict=True):
+        told, _ = instants(specimen, errors, trial.name)
+        record = film(specimen, errors, told, moved[:, :count], rng)
+        place = folder / ("heldout" if trial.held_out else "trials") / trial.name
+        trial.write(place)
+        record.write((kept if trial.held_out else place) / "markers.csv")
+        if trial.held_out:
+            # Free of measurement errors: what a perfect prediction for the stated markers and true times is.
+            true = instants(specimen, errors, trial.name)[1]
+            replace(record, time=true, value=moved[:, count:], axes="xyz").write(kept / "clean.csv")
+            if not trial.tables:
+                (place / "trial.toml").write_text("# as in setup.toml\n")
+            guess = believed_motion(plan.specimen, len(specimen.trials) - 1, World(), finer)(true)
+            believed = np.sqrt(np.mean((guess - moved[:, count:]) ** 2))
+        axes = ["xyz".index(a) for a in record.axes]
+        effect = float(np.sqrt(np.mean((moved - still)[:, :count, axes] ** 2)))
+        trials[trial.name] = {
+            "held_out": trial.held_out,
+            "rms_effect_mm": 1e3 * effect,
+            "effect_over_noise": effect / errors.noise,
+            "motion_rms_mm": 1e3 * float(np.sqrt(np.mean((moved - moved[0])[:, :count, axes] ** 2))),
+        }
+    visible = 0.0
+    if drawn:
+        given = [i for i, t in enumerate(specimen.trials) if not t.held_out]
+        times = {i: instants(specimen, errors, specimen.trials[i].name)[1] for i in given}
+        visible = detectability(
+            specimen,
+            list(times.values()),
+            [(runs[i] - plain[i])[:, :count] for i in given],
+            [plain[i][:, :count] for i in given],
+            unsure(specimen, times, finer),
+            errors.noise,
+        )
+    young = specimen.setup["material"]["youngs_modulus"]
+    return {
+        "case": plan.name,
+        "kind": plan.kind,
+        "specimen": plan.specimen,
+        "body_length_m": specimen.length,
+        "effects": [e.table() for e in drawn],
+        "expected_verdict": {"null": "nothing_missing", "decoy": "nothing_missing", "outside": "unknown_physics"}.get(
+            plan.kind, "explained"
+        ),
+        "decoy": plan.decoy,
+        "strength": visible,
+        "nuisance": {"youngs_modulus": young * bare.modulus, "pressure_gain": bare.line.gain},
+        "measurement": errors.table(),
+        "trials": trials,
+        "believed_heldout_rms_mm": 1e3 * float(believed),
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def _work(job: tuple[Plan, list[int], Path, float]) -> str:
+    plan, seed, out, finer = job
+    target = out / "sealed" / f"{plan.name}.json"
+    truth = make(plan, seed, out, finer)
+    part = target.with_suffix(".part")
+    part.write_text(json.dumps(truth, indent=1))
+    part.rename(target)
+    return f"{plan.name} done in {truth['seconds']:.0f} s"
+
+
+def _wanted(out: Path, batch: str, seed: int | None, counts: tuple[int, ...], finer: float) -> dict[str, Any]:
+    """The settings of an interrupted batch, which must be these, or new ones."""
+    path = out / "sealed" / "seed.json"
+    if path.exists():
+        before = json.loads(path.read_text())
+        now = {"batch": batch, "counts": list(counts), "finer": finer}
+        differ = [k for k, v in now.items() if before[k] != v]
+        if differ or (seed is not None and seed != before["seed"]):
+            raise ValueError(f"out = {out}: holds a batch with other settings ({', '.join(differ) or 'seed'}); "
+                             "wanted the same or an empty folder")  # fmt: skip
+        return before
+    if seed is None:
+        raise ValueError("seed = None: wanted --seed NUMBER or --seed-from-os")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    now = {"batch": batch, "seed": seed, "counts": list(counts), "finer": finer}
+    path.write_text(json.dumps(now))
+    os.chmod(path, 0o600)
+    return now
+
+
+def seal(
+    *,
+    out: Path,
+    batch: Literal["calibration", "test", "smoke"] = "test",
+    effects: int = 60,
+    nulls: int = 60,
+    pairs: int = 10,
+    outside: int = 12,
+    seed: int | None = None,
+    seed_from_os: bool = False,
+    processes: int = 2,
+    finer: float = 1.0,
+    finish: bool = False,
+) -> str:
+    """Make a batch, or go on with it.
+
+    Args:
+        out: Folder of the batch.
+        batch: Batches of different names share no random number, whatever the seed.
+        effects: Cases with one effect of the library.
+        nulls: Cases without; every second is a decoy.
+        pairs: Cases with two effects.
+        outside: Cases with an effect outside the library.
+        seed: Of all draws.
+        seed_from_os: Take the seed from the operating system; it is kept in the sealed file only.
+        processes: That work side by side.
+        finer: Divides the elements' edge; below 1 for a quick look.
+        finish: Make no more cases, write the truth of those that are there.
+
+    Returns:
+        SHA-256 of truth.sealed.
+    """
+    counts = (effects, nulls, pairs, outside)
+    fresh = secrets.randbits(63) if seed_from_os and not (out / "sealed" / "seed.json").exists() else seed
+    kept = _wanted(out, batch, fresh, counts, finer)
+    entropy = [BATCHES.index(batch), kept["seed"]]
+    todo = plans(*counts, np.random.default_rng(entropy))
+    jobs = [
+        (plan, [*entropy, number], out, finer)
+        for number, plan in enumerate(todo)
+        if not (out / "sealed" / f"{plan.name}.json").exists()
+    ]
+    print(f"{len(todo)} cases, {len(todo) - len(jobs)} of them there already", flush=True)
+    if finish:
+        unmade = {plan.name for plan, *_ in jobs}
+        todo, jobs = [plan for plan in todo if plan.name not in unmade], []
+    if processes > 1:
+        with multiprocessing.get_context("spawn").Pool(processes) as pool:
+            for line in pool.imap_unordered(_work, jobs):
+                print(line, flush=True)
+    else:
+        for job in jobs:
+            print(_work(job), flush=True)
+    truths = [json.loads((out / "sealed" / f"{plan.name}.json").read_text()) for plan in todo]
+    held = {
+        str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest()
+        for folder in ("cases", "sealed") for plan in todo for p in sorted((out / folder / plan.name).rglob("*.csv"))
+    }  # fmt: skip
+    text = json.dumps({**kept, "cases": truths, "files": held}, indent=1)
+    (out / "truth.sealed").write_text(text)
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    (out / "truth.sha256").write_text(f"{digest}  truth.sealed\n")
+    visible = [t["strength"] for t in truths if t["effects"]]
+    spread = f"; strengths {min(visible):.2g} to {max(visible):.2g}" if visible else ""
+    print(f"{len(truths)} cases{spread}\nSHA-256 of truth.sealed: {digest}")
+    return digest
+
+
+if __name__ == "__main__":
+    tyro.cli(seal)

@@ -1,0 +1,328 @@
+"""The judge: its finite elements against closed forms, and the way from sealing to scoring."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import math
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+JUDGE = Path(__file__).parents[1] / "recipes" / "judge"
+YOUNG, NU, RHO = 100e3, 0.4, 1000.0
+
+
+@pytest.fixture(scope="module")
+def judge() -> Iterator[SimpleNamespace]:
+    pytest.importorskip("numba")
+    sys.path.insert(0, str(JUDGE))
+    try:
+        yield SimpleNamespace(**{p.stem: importlib.import_module(p.stem) for p in sorted(JUDGE.glob("*.py"))})
+    finally:
+        sys.path.remove(str(JUDGE))
+
+
+def body(size, **tables):
+    return {
+        "gravity": [0.0, 0.0, 0.0],
+        "duration": 1.0,
+        "start": "rest",
+        "body": {"shape": "box", "size": list(size), "origin": [0.0, 0.0, 0.0]},
+        "material": {"density": RHO, "youngs_modulus": YOUNG, "poisson_ratio": NU, "prony": []},
+        **tables,
+    }
+
+
+def march(judge, setup, edge, world=None, pressure=()):
+    mesh = judge.march.mesh_of(setup, edge)
+    case = judge.march.case_of(setup, mesh, pressure)
+    return judge.march.March(case, world or judge.world.World())
+
+
+def inner(judge, run, x):
+    """Forces of the stress at positions x."""
+    run.x[:] = x
+    run.force[:] = 0
+    run._material()
+    return run.force.copy()
+
+
+def elastic_energy(mesh, x):
+    """By NumPy, from the gradient of the quadratic interpolation at the nodes."""
+    d = np.array([[-1.5, 2.0, -0.5], [-0.5, 0.0, 0.5], [0.5, -2.0, 1.5]])
+    u = x[mesh.cells].reshape(-1, 3, 3, 3, 3)
+    parts = [np.einsum(rule, d, u) for rule in ("il,ekjla->ekjia", "jl,eklia->ekjia", "kl,eljia->ekjia")]
+    f = np.stack(parts, -1).reshape(len(mesh.cells), 27, 3, 3) * (2 / mesh.size)[:, None, None, :]
+    j = np.linalg.det(f)
+    trace = (f**2).sum((-1, -2)) * j ** (-2 / 3)
+    shear, bulk = YOUNG / (2 * (1 + NU)), YOUNG / (3 * (1 - 2 * NU))
+    density = shear / 2 * (trace - 3) + bulk / 4 * ((j - 1) ** 2 + np.log(j) ** 2)
+    return float((mesh.weight * density).sum())
+
+
+def test_the_judge_imports_nothing_of_the_package():
+    allowed = {path.stem for path in JUDGE.glob("*.py")} | {"numpy", "numba", "scipy", "tyro"} | sys.stdlib_module_names
+    for path in JUDGE.glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, path
+                names = [node.module or ""]
+            elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                assert node.func.id not in ("__import__", "exec", "eval"), path
+                continue
+            else:
+                continue
+            assert {name.split(".")[0] for name in names} <= allowed, path
+        assert "importlib" not in path.read_text(), path
+
+
+def test_a_homogeneous_strain_leaves_no_force_inside(judge):
+    run = march(judge, body((0.03, 0.02, 0.02), chamber=[]), 0.01)
+    mesh = run.case.mesh
+    f = np.array([[1.1, 0.1, -0.05], [0.02, 0.9, 0.1], [0.0, -0.1, 1.05]])
+    force = inner(judge, run, mesh.nodes @ f.T)
+    within = ((mesh.nodes > mesh.nodes.min(0) + 1e-6) & (mesh.nodes < mesh.nodes.max(0) - 1e-6)).all(1)
+    assert np.abs(force[within]).max() < 1e-12 * np.abs(force).max() + 1e-13
+    assert np.abs(force.sum(0)).max() < 1e-12
+    far = mesh.nodes[:, 0] > 0.03 - 1e-9
+    j = np.linalg.det(f)
+    b = f @ f.T * j ** (-2 / 3)
+    shear, bulk = YOUNG / (2 * (1 + NU)), YOUNG / (3 * (1 - 2 * NU))
+    tau = shear * (b - np.trace(b) / 3 * np.eye(3)) + bulk / 2 * (j * (j - 1) + math.log(j)) * np.eye(3)
+    traction = (tau @ np.linalg.inv(f).T)[:, 0] * 0.02 * 0.02
+    # The sides' tractions end at the far edges too, so the half of the body is balanced instead of its end.
+    assert np.allclose(-force[far].sum(0)[0], traction[0], rtol=1e-9)
+
+
+def test_forces_are_the_gradient_of_the_energy(judge):
+    run = march(judge, body((0.02, 0.02, 0.03)), 0.01)
+    mesh, rng = run.case.mesh, np.random.default_rng(1)
+    x = mesh.nodes + 1e-4 * rng.standard_normal(mesh.nodes.shape)
+    way = rng.standard_normal(x.shape)
+    step = 1e-8
+    slope = (elastic_energy(mesh, x + step * way) - elastic_energy(mesh, x - step * way)) / (2 * step)
+    assert -(inner(judge, run, x) * way).sum() == pytest.approx(slope, rel=1e-6)
+
+
+def test_a_held_shear_relaxes_with_the_maxwell_elements(judge):
+    world = judge.world.World(elements=((2.0, 0.01),))
+    run = march(judge, body((0.02, 0.02, 0.02)), 0.02, world)
+    x = run.case.mesh.nodes @ np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1.0]]).T
+    forces = [np.linalg.norm(inner(judge, run, x)) for _ in range(400)]
+    b = -math.expm1(-run.dt / 0.01) / (run.dt / 0.01)
+    n = np.arange(400)
+    want = 1 + 2 * b * np.exp(-n * run.dt / 0.01)
+    steady = np.linalg.norm(inner(judge, march(judge, body((0.02, 0.02, 0.02)), 0.02), x))
+    assert np.allclose(np.array(forces) / steady, want, rtol=1e-6)
+
+
+def test_a_pressed_block_shrinks_as_in_closed_form(judge):
+    run = march(judge, body((0.03, 0.02, 0.02)), 0.01)
+    mesh, bulk = run.case.mesh, YOUNG / (3 * (1 - 2 * NU))
+    stretch = 0.95
+    j = stretch**3
+    pressure = -bulk / 2 * ((j - 1) + math.log(j) / j)
+    force = inner(judge, run, stretch * mesh.nodes)
+    largest = np.abs(force).max()
+    volume = judge.kernels.area_vectors(run.x, mesh.outside.nodes, mesh.outside.sign, run.skin)
+    judge.kernels.push(mesh.outside.nodes, run.skin, pressure, force)
+    assert volume == pytest.approx(j * 0.03 * 0.02 * 0.02)
+    assert np.abs(force).max() < 1e-9 * largest
+
+
+def test_walls_of_a_chamber_carry_no_net_force_and_enclose_its_volume(judge):
+    chamber = [{"name": "c1", "box": [[0.01, 0.01, 0.01], [0.02, 0.025, 0.02]], "air_stiffness": 0.0}]
+    setup = body((0.03, 0.035, 0.03), chamber=chamber)
+    run = march(judge, setup, 0.01, pressure=[(0.0, 1e3), (1.0, 1e3)])
+    mesh, rng = run.case.mesh, np.random.default_rng(2)
+    assert run.first_volume == pytest.approx(0.01 * 0.015 * 0.01)
+    assert mesh.weight.sum() == pytest.approx(0.03 * 0.035 * 0.03 - 0.01 * 0.015 * 0.01)
+    run.x[:] += 2e-4 * rng.standard_normal(run.x.shape)
+    run.force[:] = 0
+    run._pressure(0)
+    assert np.abs(run.force.sum(0)).max() < 1e-12 < np.abs(run.force).max()
+
+
+def test_free_fall_onto_the_plane_and_sliding_to_a_stop(judge):
+    plane = [{"point": [0, 0, 0.0], "normal": [0, 0, 1.0], "friction": 0.5}]
+    setup = body((0.02, 0.02, 0.01), gravity=[0, 0, -9.81], plane=plane, start={"velocity": [0.4, 0, 0.5]})
+    setup["material"]["prony"] = [[1.0, 0.002]]
+    run = march(judge, setup, 0.01)
+    nodes, shapes = run.case.mesh.interpolation(np.array([[0.01, 0.01, 0.005]]))
+    t = np.array([0.05, 0.1])
+    x = run.run(t, nodes, shapes)[:, 0]
+    assert np.allclose(x[:, 0], 0.01 + 0.4 * t, atol=1e-6)
+    assert np.allclose(x[:, 2], 0.005 + 0.5 * t - 4.905 * t**2, atol=1e-5)
+    setup["start"] = {"velocity": [0.4, 0, 0]}
+    way = march(judge, setup, 0.01).run(np.array([0.12]), nodes, shapes)[0, 0, 0] - 0.01
+    assert way == pytest.approx(0.4**2 / (2 * 0.5 * 9.81), rel=0.05)
+
+
+def test_a_spinning_vibrating_block_keeps_its_energy_and_momentum(judge):
+    setup = body((0.03, 0.02, 0.02), start={"velocity": [0.1, 0, 0], "angular_velocity": [3.0, 5.0, 20.0]})
+    run = march(judge, setup, 0.01)
+    run.v += 5 * (run.x - run.x.mean(0)) * np.array([1, -1, 0.5])
+    momentum, energies = (run.mass[:, None] * run.v).sum(0), []
+    for number in range(2000):
+        old = run.v.copy()
+        before = elastic_energy(run.case.mesh, run.x) if number % 100 == 1 else 0
+        run.step(number)
+        if before:
+            energies.append(before + 0.5 * float((run.mass[:, None] * old * run.v).sum()))
+    assert np.ptp(energies) < 2e-3 * np.mean(energies)
+    assert abs(energies[-1] / energies[0] - 1) < 1e-3
+    assert np.allclose((run.mass[:, None] * run.v).sum(0), momentum, atol=1e-12)
+
+
+def test_frequency_of_a_slender_bar(judge):
+    setup = body((0.12, 0.012, 0.012), clamp=[{"box": [[-1, -1, -1], [1e-5, 1, 1]]}])
+    world = judge.world.World(velocity=(0.0, 0.0, 0.01))
+    run = march(judge, setup, 0.012, world)
+    nodes, shapes = run.case.mesh.interpolation(np.array([[0.12, 0.006, 0.006]]))
+    t = np.arange(0.001, 1.4, 0.001)
+    z = run.run(t, nodes, shapes)[:, 0, 2] - 0.006
+    z -= z.mean()
+    cross = np.flatnonzero((z[:-1] < 0) & (z[1:] >= 0))
+    exact = t[cross] - z[cross] * 0.001 / (z[cross + 1] - z[cross])
+    frequency = 1 / np.diff(exact).mean()
+    euler = 1.8751041**2 / (2 * math.pi) * math.sqrt(YOUNG / (12 * RHO)) * 0.012 / 0.12**2
+    assert frequency == pytest.approx(euler, rel=0.02)
+
+
+def test_every_effect_is_nothing_at_its_default_and_something_when_drawn(judge):
+    rng = np.random.default_rng(3)
+    plain = judge.world.World()
+    for make in judge.specimens.SPECIMENS.values():
+        specimen = make()
+        for name in {*specimen.effects, *specimen.outside}:
+            world, effect = {**judge.effects.LIBRARY, **judge.effects.OUTSIDE}[name](plain, specimen, rng)
+            assert world != plain
+            assert effect.name == name
+            assert effect.outside == (name in judge.effects.OUTSIDE)
+            assert (effect.location is not None) >= (name in judge.effects.LOCAL)
+            assert all(math.isfinite(v) for v in effect.parameters.values())
+
+
+def test_a_setup_survives_toml_and_an_experiment_its_files(judge, tmp_path):
+    for make in judge.specimens.SPECIMENS.values():
+        specimen = make()
+        assert tomllib.loads(judge.experiment.toml(specimen.setup)) == specimen.setup
+        for trial in specimen.trials:
+            trial.write(tmp_path / specimen.name / trial.name)
+            back = judge.experiment.Trial.read(tmp_path / specimen.name / trial.name)
+            assert back.tables == tomllib.loads(judge.experiment.toml(trial.tables))
+            assert np.allclose(np.array(back.pressure), np.array(trial.pressure), rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def batch(judge, tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("judge")
+    settings = {"batch": "smoke", "effects": 2, "nulls": 2, "pairs": 1, "outside": 1, "seed": 5, "processes": 1}
+    digest = judge.seal.seal(out=out, finer=0.35, **settings)
+    stamps = {p: p.stat().st_mtime_ns for p in (out / "cases").rglob("*.csv")}
+    assert judge.seal.seal(out=out, finer=0.35, **settings) == digest
+    assert stamps == {p: p.stat().st_mtime_ns for p in (out / "cases").rglob("*.csv")}
+    with pytest.raises(ValueError, match=r"wanted the same or an empty folder"):
+        judge.seal.seal(out=out, finer=0.35, **{**settings, "effects": 3})
+    return out
+
+
+def test_a_sealed_case_shows_no_truth(judge, batch):
+    for case in (batch / "cases").iterdir():
+        names = {str(p.relative_to(case)) for p in case.rglob("*") if p.is_file()}
+        assert "setup.toml" in names
+        assert sum(n.endswith("markers.csv") for n in names) == 3
+        assert "heldout/d/trial.toml" in names
+        assert not any("truth" in n or n == "heldout/d/markers.csv" for n in names)
+        setup = judge.experiment.read_setup(case)
+        record = judge.experiment.Recording.read(case / "trials/a/markers.csv")
+        assert record.names == tuple(m["name"] for m in setup["marker"])
+        assert 0.5 < np.isfinite(record.value).mean() <= 1
+
+
+def write_answer(folder, case, answer):
+    (folder / case).mkdir(parents=True)
+    (folder / case / "explanation.json").write_text(json.dumps(answer))
+
+
+def test_a_perfect_and_a_silent_answer_are_scored_as_such(judge, batch, tmp_path, capsys):
+    truth = json.loads((batch / "truth.sealed").read_text())
+    assert {c["kind"] for c in truth["cases"]} == {"effect", "null", "decoy", "pair", "outside"}
+    for case in truth["cases"]:
+        effects = [
+            {
+                "name": e["name"],
+                "parameters": {
+                    k: {"value": v, "low": v - abs(v), "high": v + abs(v)} for k, v in e["parameters"].items()
+                },
+                "location_m": e["location_m"],
+            }
+            for e in case["effects"]
+        ]
+        known = case["expected_verdict"] == "explained"
+        answer = {
+            "verdict": case["expected_verdict"],
+            "effects": effects if known else [],
+            "heldout": {"trials": ["c"], "before": {"c": {"m1": 1e-3}}, "after": {"c": {"m1": 1e-4}}},
+        }
+        write_answer(tmp_path / "perfect", case["case"], answer)
+        write_answer(tmp_path / "silent", case["case"], {"verdict": "nothing_missing", "effects": []})
+        clean = (batch / "sealed" / case["case"] / "clean.csv").read_text()
+        (tmp_path / "perfect" / case["case"] / "predicted.csv").write_text(clean)
+    folders = (f"perfect={tmp_path / 'perfect'}", f"silent={tmp_path / 'silent'}")
+    tables = judge.score.score(batch, answers=folders, threshold=0.0, out=tmp_path / "score.json")
+    assert "acceptance" not in capsys.readouterr().err
+    perfect, silent = tables["perfect"], tables["silent"]
+    assert perfect["false alarms, nulls and decoys (<= 10 %)"].startswith("0 % [0, 84] 0/2")
+    assert perfect["right name when it commits, strong (>= 80 %)"].endswith("2/2")
+    assert perfect["pairs: both right".replace("pairs: ", "  ")].endswith("1/1")
+    assert perfect["outside the library: unknown (>= 60 %)"].endswith("1/1")
+    assert perfect["parameter error, median (<= 25 %)"].startswith("0 %")
+    assert perfect["held-out after / before, as the answer says (<= 0.6)"].startswith("0.1 ")
+    assert float(perfect["held-out after / before, sealed trial"].split()[0]) < 1e-3
+    assert silent["commits to one name, strong (>= 50 %)"].endswith("0/2")
+    assert silent["false alarms, nulls and decoys (<= 10 %)"].endswith("0/2")
+
+
+def test_score_refuses_what_was_changed_after_sealing(judge, batch, tmp_path):
+    path = next(iter(sorted((batch / "cases").rglob("markers.csv"))))
+    before = path.read_bytes()
+    try:
+        path.write_bytes(before + b"\n")
+        with pytest.raises(ValueError, match="is not what was sealed"):
+            judge.score.check(batch)
+    finally:
+        path.write_bytes(before)
+
+
+def test_ask_runs_the_tool_on_a_copy_and_once(judge, batch, tmp_path):
+    tool = tmp_path / "tool.py"
+    tool.write_text(
+        "import json, pathlib, sys\n"
+        "case, out = pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[3])\n"
+        "assert not list(case.parent.rglob('*truth*')) and case.parent.name != 'cases'\n"
+        "out.mkdir()\n"
+        "if case.name == 'case-000': sys.exit('no')\n"
+        "text = json.dumps({'verdict': 'nothing_missing', 'effects': []})\n"
+        "(out / 'explanation.json').write_text(text)\n"
+    )
+    command = f"{sys.executable} {tool}"
+    digest = judge.ask.ask(batch, answers=tmp_path / "answers", tool=command)
+    assert judge.ask.ask(batch, answers=tmp_path / "answers", tool="false") == digest
+    verdicts = [json.loads(p.read_text())["verdict"] for p in sorted((tmp_path / "answers").rglob("explanation.json"))]
+    assert verdicts == ["failed"] + ["nothing_missing"] * 5
+
+
+def test_intervals_are_those_of_clopper_and_pearson(judge):
+    low, high = judge.score.Rate(hits=18, of=30).interval
+    assert (round(low, 2), round(high, 2)) == (0.41, 0.77)
+    assert judge.score.Rate(hits=0, of=10).interval == (0.0, pytest.approx(0.3085, abs=1e-4))
