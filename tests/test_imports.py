@@ -43,10 +43,14 @@ archive
 robot
 results
 sim2real.recording
-sim2real.residual
-sim2real.location
-sim2real.hypothesis
+sim2real.experiment sim2real.scenario
+sim2real.twin
+sim2real.hypothesis sim2real.residual
+sim2real.body_effects
+sim2real.outer_effects
+sim2real.library
 sim2real.fit
+sim2real.heldout sim2real.model sim2real.numerics sim2real.verdict
 sim2real.report
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

@@ -1,0 +1,135 @@
+"""Experiments and recordings on disk."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from torchsoro.sim2real.experiment import read_experiment
+from torchsoro.sim2real.recording import Recording, read_table
+
+SETUP = """
+title = "bar"
+duration = 0.1
+
+[body]
+size = [0.04, 0.02, 0.02]
+
+[material]
+density = 1000.0
+youngs_modulus = 1e5
+poisson_ratio = 0.4
+prony = [[0.5, 0.01]]
+
+[[clamp]]
+box = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]
+
+[[marker]]
+name = "tip"
+at = [0.04, 0.01, 0.02]
+
+[recording]
+kind = "video"
+axes = ["x", "z"]
+noise = 1e-4
+"""
+
+
+def experiment(folder: Path, setup: str = SETUP, markers: str | None = None) -> Path:
+    rows = "\n".join(f"{0.01 * k},{0.04 + 1e-3 * k},{0.02 - 1e-3 * k}" for k in range(5))
+    (folder / "trials" / "a").mkdir(parents=True, exist_ok=True)
+    (folder / "setup.toml").write_text(setup, encoding="utf-8")
+    (folder / "trials" / "a" / "markers.csv").write_text(
+        markers or f"time_s,tip_x_m,tip_z_m\n{rows}\n", encoding="utf-8"
+    )
+    return folder
+
+
+def test_reads_what_is_written(tmp_path):
+    found = read_experiment(experiment(tmp_path))
+    setup, (trial,) = found.setup, found.trials
+    assert setup.size == (0.04, 0.02, 0.02) and setup.axes == (0, 2) and setup.prony == ((0.5, 0.01),)
+    assert setup.gravity == (0.0, 0.0, -9.81) and setup.velocity == (0.0, 0.0, 0.0)
+    np.testing.assert_allclose(trial.recording.place[:, 0], [[0.04 + 1e-3 * k, 0.02 - 1e-3 * k] for k in range(5)])
+
+
+def test_a_trial_replaces_tables_of_the_setup(tmp_path):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "a" / "trial.toml").write_text(
+        "[start]\nvelocity = [1.0, 0.0, 0.0]\n[[load]]\nbox = [[0,0,0],[0.01,0.01,0.01]]\nforce = [0.0, 0.0, -1.0]\n"
+    )
+    found = read_experiment(folder)
+    assert found.setup.loads == () and found.trials[0].setup.velocity == (1.0, 0.0, 0.0)
+    assert found.trials[0].setup.loads[0].force == (0.0, 0.0, -1.0)
+
+
+def test_an_empty_cell_is_a_lost_sample(tmp_path):
+    table = "time_s,tip_x_m,tip_z_m\n0,1,2\n0.1,,2\n0.2,1,2\n"
+    recording = read_experiment(experiment(tmp_path, markers=table)).trials[0].recording
+    assert recording.seen[:, 0].tolist() == [[True, True], [False, True], [True, True]]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("duration = 0.1", "", r"duration = None, wanted a finite number"),
+        ("duration = 0.1", "duration = 0.1\nspeed = 3", r"unknown speed"),
+        ("poisson_ratio = 0.4", "poisson_ratio = 0.5", r"poisson_ratio = 0\.5, wanted less than 0\.5"),
+        ("[[0.5, 0.01]]", "[[0.5, -1]]", r"prony = .*, wanted at most five pairs of positive numbers"),
+        ("size = [0.04, 0.02, 0.02]", "size = [0.04, 0.02]", r"size = \[0\.04, 0\.02\], wanted three finite numbers"),
+        ('kind = "video"', 'kind = "film"', r"kind = 'film', wanted one of 'mocap', 'video'"),
+        ('name = "tip"', 'name = "end"', r"columns time_s, tip_x_m, tip_z_m, wanted also end_x_m, end_z_m"),
+        ("box = [[-0.001, -0.001, -0.001],", "box = [[0.1, 0.1, 0.1],", r"wanted the lower corner first"),
+    ],
+)
+def test_what_does_not_fit_is_named(tmp_path, old, new, message):
+    with pytest.raises(ValueError, match=message):
+        read_experiment(experiment(tmp_path, SETUP.replace(old, new)))
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("time_s,tip_x_m,tip_z_m\n0,1,2\n0.1,x,2\n0.2,1,2\n", r"line 3: tip_x_m = 'x', wanted a number or nothing"),
+        ("time_s,tip_x_m,tip_z_m\n0,1\n", r"line 2 has 2 cells, wanted 3"),
+        ("time_s,tip_x_m,tip_z_m\n0,1,2\n0,1,2\n0.2,1,2\n", r"does not increase after sample 0"),
+        ("time_s\n", r"1 lines, wanted names of columns and numbers below"),
+    ],
+)
+def test_bad_tables_are_refused(tmp_path, table, message):
+    with pytest.raises(ValueError, match=message):
+        read_experiment(experiment(tmp_path, markers=table))
+
+
+def test_no_trial_is_refused(tmp_path):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "a" / "markers.csv").unlink()
+    (folder / "trials" / "a").rmdir()
+    with pytest.raises(ValueError, match="no trial"):
+        read_experiment(folder)
+
+
+def test_a_chamber_needs_its_pressure(tmp_path):
+    chamber = '[[chamber]]\nname = "c"\nbox = [[0.01, 0.005, 0.005], [0.03, 0.015, 0.015]]\n'
+    with pytest.raises(ValueError, match=r"no pressure\.csv"):
+        read_experiment(experiment(tmp_path, SETUP + chamber))
+    (tmp_path / "trials" / "a" / "pressure.csv").write_text("time_s,c_pa\n0,0\n0.1,1000\n")
+    assert read_experiment(tmp_path).trials[0].pressure.pressure.tolist() == [[0.0, 1000.0]]
+
+
+def test_recordings_check_themselves():
+    time = np.array([0.0, 0.1, 0.2])
+    with pytest.raises(ValueError, match="wanted \\[T, M, 3\\]"):
+        Recording(time=time, place=np.zeros((3, 1, 2)))
+    with pytest.raises(ValueError, match="infinite"):
+        Recording(time=time, place=np.full((3, 1, 3), math.inf))
+
+
+def test_tables_keep_their_order(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("a, b\n1,2\n3,\n")
+    found = read_table(path)
+    assert list(found) == ["a", "b"] and found["a"] == [1.0, 3.0] and math.isnan(found["b"][1])

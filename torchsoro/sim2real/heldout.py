@@ -1,0 +1,63 @@
+"""How well a model predicts trials that were not used to find it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchsoro.sim2real.experiment import Trial
+from torchsoro.sim2real.fit import Fit, Problem
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Prediction:
+    """A trial as predicted.
+
+    Attributes:
+        trial: Its name.
+        seen: Predicted recording [T, M, A] m.
+        error: Root mean square of each marker [M] m, over all axes.
+        total: The same over all markers [m].
+    """
+
+    trial: str
+    seen: np.ndarray
+    error: np.ndarray
+    total: float
+
+
+def predict(problem: Problem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
+    """Predict trials with the parameters and measurement errors of a fit; only each trial's clock is found anew.
+
+    Args:
+        problem: The fit's.
+        fit: What was found.
+        trials: With recordings; those of the problem or others.
+        believed: Simulate the setup as it is believed, but see it with the fit's measurement errors.
+    """
+    there = Problem(problem.experiment, problem.twin, trials=trials, noise=problem.noise, report=problem.report)
+    effects = () if believed else fit.effects
+    point = np.zeros(len(there.common)) if believed else fit.point
+    motions = there.simulate(effects, point[None])
+    count, known = len(there.trials), fit.errors[len(problem.trials) :]
+    found = []
+    for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
+        assert trial.recording is not None
+        one = motion.alone()
+        errors = np.concatenate([np.zeros(count), known])
+        for _ in range(6):
+            seen, by = there.camera.see(one, i, errors)
+            left, slope = trial.recording.place - seen, by[..., i]
+            good = np.isfinite(left)
+            weight = (problem.noise / there.camera.deviations[i]) ** 2
+            errors[i] += (float((left[good] * slope[good]).sum()) - weight * errors[i]) / (
+                float((slope[good] ** 2).sum()) + weight
+            )
+        seen, _ = there.camera.see(one, i, errors)
+        square = (trial.recording.place - seen) ** 2
+        error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
+        total = float(np.sqrt(np.nanmean(square.sum(-1))))
+        found.append(Prediction(trial=trial.name, seen=seen, error=error, total=total))
+    return found

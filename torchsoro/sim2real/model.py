@@ -1,0 +1,134 @@
+"""A model on disk, ``model.toml``: a setup with what was found to be missing from it, and what it predicts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsoro.sim2real.body_effects import Modulus
+from torchsoro.sim2real.experiment import Setup, Trial, read_tables, read_trial, setup_of
+from torchsoro.sim2real.fit import Fit
+from torchsoro.sim2real.hypothesis import Hypothesis
+from torchsoro.sim2real.library import library
+from torchsoro.sim2real.outer_effects import PressureGain
+from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.twin import Twin
+from torchsoro.storage import atomic_write
+
+_HEAD = "# A setup with what was found to be missing: [model] and [[effect]]; the rest is as believed.\n"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """What a file holds.
+
+    Attributes:
+        tables: Of the setup, as believed.
+        setup: The same, read.
+        spacing: Of the twin's particles [m].
+        ln_modulus: What the modulus is off.
+        ln_pressure: What the pressure is off.
+        effects: What was missing, with its values [K], places included.
+    """
+
+    tables: dict[str, Any]
+    setup: Setup
+    spacing: float
+    ln_modulus: float
+    ln_pressure: float
+    effects: tuple[tuple[Hypothesis, np.ndarray], ...]
+
+    def apply(self, scenario: Scenario, twin: Twin) -> Scenario:
+        """A scenario with all that was found."""
+        values = torch.tensor([[self.ln_modulus, self.ln_pressure]], dtype=torch.float64)
+        scenario = Modulus()(scenario, values[:, :1], twin)
+        if scenario.pressure is not None:
+            scenario = PressureGain()(scenario, values[:, 1:], twin)
+        for effect, found in self.effects:
+            scenario = effect(scenario, torch.from_numpy(found)[None], twin)
+        return scenario
+
+
+def write_model(path: Path, setup: Path, fit: Fit, spacing: float) -> None:
+    """Write a setup with a fit's findings.
+
+    Args:
+        path: Of the model; its folder exists.
+        setup: The setup.toml that was believed, which is copied.
+        fit: What was found.
+        spacing: Of the twin's particles [m].
+    """
+    belief = [*fit.belief.tolist(), 0.0][:2]
+    lines = [_HEAD, setup.read_text(encoding="utf-8").rstrip(), "", "[model]", f"spacing = {spacing!r}"]
+    lines += [f"ln_modulus = {belief[0]!r}", f"ln_pressure = {belief[1]!r}"]
+    for effect, values in zip(fit.effects, fit.values, strict=True):
+        lines += ["", "[[effect]]", f"name = {json.dumps(effect.name)}"]
+        count = len(effect.quantities)
+        for quantity, value in zip(effect.quantities, values[:count].tolist(), strict=True):
+            lines.append(f"{quantity.name} = {value!r} # {quantity.unit}")
+        if effect.local:
+            lines.append(f"at = {values[count:].tolist()!r} # m")
+    with atomic_write(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+
+
+def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model:
+    """Read a model.
+
+    Args:
+        path: Of the file.
+        effects: Those that may be in it; the library if None.
+
+    Raises:
+        ValueError: if the file cannot be read, or an effect or a parameter of it is missing or unknown.
+    """
+    tables = read_tables(path)
+    numbers, rows = tables.pop("model", None), tables.pop("effect", [])
+    wanted = {"spacing", "ln_modulus", "ln_pressure"}
+    if not isinstance(numbers, dict) or set(numbers) != wanted:
+        raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
+    known = {e.name: e for e in (library() if effects is None else effects)}
+    found = []
+    for row in rows:
+        effect = known.get(row.get("name"))
+        if effect is None:
+            raise ValueError(f"{path}: [[effect]] name = {row.get('name')!r}, wanted one of {', '.join(known)}")
+        names = [q.name for q in effect.quantities]
+        if set(row) - {"name", "at"} != set(names) or ("at" in row) != effect.local:
+            wants = [*names, *(["at"] if effect.local else [])]
+            raise ValueError(f"{path}: [[effect]] {effect.name} has {', '.join(row)}, wanted {', '.join(wants)}")
+        found.append((effect, np.array([*(row[name] for name in names), *row.get("at", [])], dtype=float)))
+    return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **numbers)
+
+
+def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarray]:
+    """Markers in a trial that nobody has recorded yet.
+
+    Args:
+        model: What is known.
+        trial: Its trial.toml; a pressure.csv stands beside it where the body has a chamber.
+        source: Where the model comes from, for messages.
+
+    Returns:
+        Columns of a markers.csv.
+
+    Raises:
+        ValueError: if the trial cannot be read.
+        SimulationDiverged: if the simulation breaks down.
+    """
+    if trial.name != "trial.toml":
+        raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
+    told: Trial = read_trial(trial.parent, model.tables, source)
+    twin = Twin(told.setup, spacing=model.spacing)
+    motion = twin.simulate(model.apply(twin.scenario(told), twin)).alone()
+    columns = {"time_s": motion.time.numpy()}
+    for m, marker in enumerate(told.setup.markers):
+        for axis in told.setup.axes:
+            columns[f"{marker.name}_{'xyz'[axis]}_m"] = motion.place[:, m, axis].numpy()
+    return columns

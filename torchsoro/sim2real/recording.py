@@ -1,0 +1,103 @@
+"""Recorded marker places: a table over time, with lost samples."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+AXES = "xyz"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class Recording:
+    """Marker places over time.
+
+    Attributes:
+        time: [T] s, increasing, by the recording's own clock.
+        place: [T, M, A] m; NaN where a sample was lost. A is the number of recorded axes.
+        axes: Which axes those are, 0 to 2.
+
+    Raises:
+        ValueError: for shapes that do not fit, times that do not increase, or a marker that was never seen.
+    """
+
+    time: np.ndarray
+    place: np.ndarray
+    axes: tuple[int, ...] = (0, 1, 2)
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        if self.time.ndim != 1 or len(self.time) < 3 or self.place.shape[:1] != self.time.shape:
+            raise ValueError(
+                f"time, place: shapes {self.time.shape} and {self.place.shape}, wanted [T], [T, M, A], T > 2"
+            )
+        if self.place.ndim != 3 or self.place.shape[2] != len(self.axes):
+            raise ValueError(f"place: shape {self.place.shape}, wanted [T, M, {len(self.axes)}] as axes = {self.axes}")
+        late = np.flatnonzero(~(np.diff(self.time) > 0))
+        if len(late) or not np.isfinite(self.time).all():
+            raise ValueError(
+                f"time: does not increase after sample {late[0] if len(late) else 0}, wanted increasing times"
+            )
+        if np.isinf(self.place).any():
+            raise ValueError("place: an infinite number, wanted finite ones, or NaN for a lost sample")
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Where a sample was not lost, bool [T, M, A]."""
+        return np.isfinite(self.place)
+
+    @classmethod
+    def read(cls, path: Path, markers: Sequence[str], axes: Sequence[int] = (0, 1, 2)) -> Recording:
+        """Read ``time_s, <marker>_x_m, <marker>_y_m, ...``; an empty cell is a lost sample.
+
+        Args:
+            path: CSV file.
+            markers: Names of the markers wanted, in this order; others are left out.
+            axes: Recorded axes.
+
+        Raises:
+            ValueError: if a column is missing or a cell is no number, with the file.
+        """
+        columns = read_table(path)
+        wanted = [[f"{name}_{AXES[a]}_m" for a in axes] for name in markers]
+        if missing := [n for n in ("time_s", *itertools.chain(*wanted)) if n not in columns]:
+            raise ValueError(f"{path}: columns {', '.join(columns)}, wanted also {', '.join(missing)}")
+        place = np.array([[columns[name] for name in row] for row in wanted]).transpose(2, 0, 1)
+        try:
+            return cls(time=np.array(columns["time_s"]), place=place, axes=tuple(axes))
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
+
+
+def read_table(path: Path) -> dict[str, list[float]]:
+    """Columns of a CSV file by name; an empty cell is NaN.
+
+    Raises:
+        ValueError: if the file cannot be read, has no rows, or a cell is no number; with file and line.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: {error}; wanted a table of numbers") from error
+    rows = list(csv.reader(lines))
+    if len(rows) < 2:
+        raise ValueError(f"{path}: {len(rows)} lines, wanted names of columns and numbers below")
+    names = [name.strip() for name in rows[0]]
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    for number, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        if len(row) != len(names):
+            raise ValueError(f"{path}: line {number} has {len(row)} cells, wanted {len(names)} as in the first")
+        for name, cell in zip(names, row, strict=True):
+            try:
+                columns[name].append(float(cell) if cell.strip() else math.nan)
+            except ValueError:
+                raise ValueError(f"{path}: line {number}: {name} = {cell!r}, wanted a number or nothing") from None
+    return columns

@@ -1,0 +1,325 @@
+"""An explanation on disk: ``report.html`` for people, ``explanation.json`` for programs."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from scipy.stats import norm
+
+from torchsoro.document import Document
+from torchsoro.sim2real.experiment import Trial
+from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.heldout import Prediction
+from torchsoro.sim2real.numerics import Numerics
+from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.verdict import Candidate, Verdict
+from torchsoro.storage import atomic_write
+
+LEVEL = 0.9
+RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Explanation:
+    """All that was found out about an experiment.
+
+    Attributes:
+        problem: Recordings and twin.
+        numerics: The twin's own error.
+        verdict: What can be said.
+        before: All trials as believed, those that were fitted first.
+        after: The same with the best effect, or with nothing where nothing is missing.
+        heldout: Names of the trials that were only predicted.
+        seconds: It took.
+    """
+
+    problem: Problem
+    numerics: Numerics
+    verdict: Verdict
+    before: tuple[Prediction, ...]
+    after: tuple[Prediction, ...]
+    heldout: tuple[str, ...]
+    seconds: float
+
+    @property
+    def best(self) -> Fit:
+        """The fit that is shown: of the best effect, or of nothing."""
+        return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.nothing
+
+
+def effect_rows(candidate: Candidate, weight: float, scenario: Scenario) -> list[dict[str, Any]]:
+    """The effects of a candidate, as in explanation.json; intervals by the law of errors, within bounds."""
+    wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
+    fit = candidate.fit
+    spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
+    for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
+        count = len(effect.quantities)
+        steps = 1e-4 * np.array([q.scale for q in effect.quantities])
+        told = effect.told(values[:count], scenario)
+        ahead = [effect.told(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
+        parameters = {}
+        for name, (value, unit) in told.items():
+            slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
+            half = wide * spread * math.sqrt(max(float(slope @ covariance[:count, :count] @ slope), 0.0))
+            parameters[name] = {"value": value, "low": value - half, "high": value + half, "unit": unit}
+            for quantity in effect.quantities:
+                if quantity.name == name:
+                    parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
+        rows.append(
+            {
+                "name": effect.name,
+                "parameters": parameters,
+                "confidence": weight,
+                "location_m": [float(v) for v in values[count:]] if effect.local else None,
+                "time_window_s": None,
+            }
+        )
+    return rows
+
+
+def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of explanation.json."""
+    v, problem = e.verdict, e.problem
+    scores = np.array([c.score for c in v.chosen])
+    weights = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum() if len(scores) else scores
+    names = [m.name for m in problem.experiment.setup.markers]
+
+    def errors(predictions: Sequence[Prediction]) -> dict[str, Any]:
+        return {p.trial: {"all": p.total, **dict(zip(names, map(float, p.error), strict=True))} for p in predictions}
+
+    kept = set(e.heldout)
+    return {
+        "verdict": v.kind,
+        "effects": effect_rows(v.chosen[0], float(weights[0]), problem.scenarios[0]) if v.chosen else [],
+        "set": [c.fit.name for c in v.chosen],
+        "ranking": [
+            {
+                "name": c.fit.name,
+                "score": c.score,
+                "explained": c.explained,
+                "misfit": c.fit.misfit,
+                "finished": c.finished,
+                "effects": effect_rows(c, 0.0, problem.scenarios[0]),
+            }
+            for c in v.ranking
+        ],
+        "noise": {
+            "standard_deviation_m": problem.noise,
+            "numerics_m": {
+                t.name: float(np.sqrt((n**2).mean())) for t, n in zip(problem.trials, problem.numerics, strict=True)
+            },
+            "spacings_m": list(e.numerics.spacings),
+            "cells_through_thinnest_wall": e.numerics.cells,
+            "excess": v.excess,
+        },
+        "nuisance": {
+            "ln_modulus": float(e.best.belief[0]),
+            **({"ln_pressure": float(e.best.belief[1])} if len(e.best.belief) > 1 else {}),
+            **dict(zip(problem.camera.names, map(float, e.best.errors), strict=True)),
+        },
+        "error_before": errors(e.before),
+        "error_after": errors(e.after),
+        "heldout": [
+            {"trial": b.trial, "before": b.total, "after": a.total}
+            for b, a in zip(e.before, e.after, strict=True)
+            if b.trial in kept
+        ],
+        "cost": {"simulations": problem.simulations, "seconds": e.seconds},
+        "version": version("torchsoro"),
+        "settings": dict(settings),
+    }
+
+
+def lead(e: Explanation) -> str:
+    """The answer in plain words."""
+    v = e.verdict
+    held = [(b.total, a.total) for b, a in zip(e.before, e.after, strict=True) if b.trial in e.heldout]
+    gain = ""
+    if held:
+        before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
+        gain = (
+            f" On the trials that were not used ({', '.join(e.heldout)}) the error is {1e3 * after:.2f} mm instead of "
+            f"{1e3 * before:.2f} mm."
+        )
+    if v.kind == "nothing_missing":
+        return (
+            "Nothing is missing: clock, scale, marker places, modulus and pressure within their beliefs, and the error "
+            f"of the simulation itself explain the difference.{gain}"
+        )
+    if v.kind == "unknown_physics":
+        best = v.ranking[0] if v.ranking else None
+        tried = (
+            f" The best of what is known, {best.fit.name}, takes away {100 * best.explained:.0f} % of it."
+            if best
+            else ""
+        )
+        return f"Something is missing that is none of the known effects.{tried}{gain}"
+    parts = "; ".join(_said(c, e.problem.scenarios[0]) for c in v.chosen)
+    if v.kind == "cannot_distinguish":
+        return f"One of these is missing, and this recording cannot tell which: {parts}.{gain}"
+    second = next((c for c in v.ranking if c is not v.chosen[0]), None)
+    lost = ""
+    if second is not None:
+        lost = (
+            f" Next best is {second.fit.name}, which takes away {100 * max(second.explained, 0):.0f} % of the "
+            f"difference against {100 * v.chosen[0].explained:.0f} %."
+        )
+    return f"Missing is {parts}.{gain}{lost}"
+
+
+def _said(candidate: Candidate, scenario: Scenario) -> str:
+    parts = []
+    for row in effect_rows(candidate, 0.0, scenario):
+        numbers = ", ".join(
+            f"{name} {p['value']:.3g} {p['unit']} (90 %: {p['low']:.3g} to {p['high']:.3g})"
+            for name, p in row["parameters"].items()
+        )
+        where = row["location_m"]
+        place = "" if where is None else " at (" + ", ".join(f"{1e3 * x:.0f}" for x in where) + ") mm"
+        parts.append(f"{row['name']}{place}: {numbers}")
+    return " and ".join(parts)
+
+
+def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[str, Any]) -> None:
+    """Write report.html and explanation.json.
+
+    Args:
+        e: What was found.
+        trials: All, in the order of ``e.before``.
+        out: Folder, which exists.
+        settings: How it was asked for.
+    """
+    data = as_json(e, settings)
+    with atomic_write(out / "explanation.json") as file:
+        file.write((json.dumps(data, indent=2) + "\n").encode())
+    page = Document(e.problem.experiment.setup.title or "Explanation", lead(e))
+    page.section("Recorded, believed, explained")
+    for trial, before, after in zip(trials, e.before, e.after, strict=True):
+        kept = ", not used for the fit" if trial.name in e.heldout else ""
+        caption = f"Trial {trial.name}{kept}: markers as recorded, as believed, and as explained."
+        page.figure(draw_trial(trial, before, after), caption)
+    page.section("Where and when")
+    page.figure(draw_where(e, trials), "Mismatch before and after: on the body by marker, and over time.")
+    page.section("What was considered")
+    considered = [
+        {
+            "effect": c.fit.name,
+            "score": c.score,
+            "of the difference [%]": 100 * c.explained,
+            "misfit / samples": c.fit.misfit / c.fit.samples,
+            "to the end": c.finished,
+            "parameters": _said(c, e.problem.scenarios[0]),
+        }
+        for c in e.verdict.ranking
+    ]
+    if considered:
+        page.table(considered, "Score: gain in ln of the likelihood, studentised, less what the parameters are worth.")
+    page.section("Errors")
+    page.table(
+        [
+            {
+                "trial": b.trial,
+                "before [mm]": 1e3 * b.total,
+                "after [mm]": 1e3 * a.total,
+                "used": b.trial not in e.heldout,
+            }
+            for b, a in zip(e.before, e.after, strict=True)
+        ],
+        "Root mean square over markers, in space.",
+    )
+    page.section("What is not physics")
+    noise = data["noise"]
+    page.text(
+        f"Noise {1e3 * noise['standard_deviation_m']:.3f} mm. The simulation's own error, from twins of "
+        f"{', '.join(f'{1e3 * s:.2f}' for s in e.numerics.spacings)} mm between particles: "
+        + ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
+        + f". {e.numerics.cells:.1f} cells through the thinnest wall."
+    )
+    deviations = dict(zip(e.problem.camera.names, e.problem.camera.deviations, strict=True))
+    page.table(
+        [
+            {"measurement error": name, "fitted": value, "believed within": deviations.get(name)}
+            for name, value in data["nuisance"].items()
+        ]
+    )
+    page.text(f"{e.problem.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")
+    page.save(out / "report.html")
+
+
+def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:
+    """Each marker's recorded axes over time."""
+    recording = trial.recording
+    assert recording is not None
+    names = [m.name for m in trial.setup.markers]
+    count, axes = len(names), recording.axes
+    figure = Figure(figsize=(11, 1.2 + 1.35 * count), layout="constrained")
+    panels: Any = figure.subplots(count, len(axes), sharex=True, squeeze=False)
+    for m, a in np.ndindex(count, len(axes)):
+        panel: Axes = panels[m, a]
+        panel.plot(recording.time, 1e3 * recording.place[:, m, a], ".", ms=2, color=RECORDED, label="recorded")
+        panel.plot(recording.time, 1e3 * before.seen[:, m, a], "-", lw=1, color=NOMINAL, label="believed")
+        panel.plot(recording.time, 1e3 * after.seen[:, m, a], "-", lw=1, color=EXPLAINED, label="explained")
+        panel.tick_params(labelsize=7)
+        if a == 0:
+            panel.set_ylabel(f"{names[m]} [mm]", fontsize=8)
+        if m == 0:
+            panel.set_title("xyz"[axes[a]], fontsize=9)
+        if m == count - 1:
+            panel.set_xlabel("time [s]", fontsize=8)
+    panels[0, 0].legend(fontsize=7)
+    return figure
+
+
+def draw_where(e: Explanation, trials: Sequence[Trial]) -> Figure:
+    """Mismatch by marker on the body's side views, and over time with the pressure."""
+    setup = e.problem.experiment.setup
+    figure = Figure(figsize=(11, 6.5), layout="constrained")
+    halves: Any = figure.subfigures(2, 1)
+    top, bottom = halves
+    panels: Sequence[Axes] = top.subplots(1, 2)
+    at = np.array([m.at for m in setup.markers])
+    before = np.sqrt(np.mean([p.error**2 for p in e.before], axis=0))
+    after = np.sqrt(np.mean([p.error**2 for p in e.after], axis=0))
+    largest = max(float(before.max()), 1e-9)
+    for panel, (i, j) in zip(panels, ((0, 2), (0, 1)), strict=True):
+        low, size = np.array(setup.origin)[[i, j]], np.array(setup.size)[[i, j]]
+        panel.add_patch(_rectangle(low * 1e3, size * 1e3))
+        for number, (value, color) in enumerate(((before, NOMINAL), (after, EXPLAINED))):
+            sizes = 20 + 600 * value / largest
+            label = ("before", "after")[number]
+            panel.scatter(1e3 * at[:, i], 1e3 * at[:, j], s=sizes, color=color, alpha=0.55, label=label)
+        for c in e.verdict.chosen:
+            for row in effect_rows(c, 0.0, e.problem.scenarios[0]):
+                if row["location_m"] is not None:
+                    place = 1e3 * np.array(row["location_m"])
+                    panel.plot(place[i], place[j], "x", ms=11, mew=2.5, color="#a3154a", label=row["name"])
+        panel.set(aspect="equal", xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
+    panels[0].legend(fontsize=7)
+    axes = bottom.subplots(1, len(trials), squeeze=False)[0]
+    for panel, trial, one, other in zip(axes, trials, e.before, e.after, strict=True):
+        recording = trial.recording
+        assert recording is not None
+        for p, color in ((one, NOMINAL), (other, EXPLAINED)):
+            off = np.sqrt(np.nanmean(((recording.place - p.seen) ** 2).sum(-1), axis=1))
+            panel.plot(recording.time, 1e3 * off, color=color, lw=1)
+        panel.set(xlabel="time [s]", ylabel="off by [mm]", title=f"trial {trial.name}", yscale="log")
+        if trial.pressure is not None:
+            other_axis = panel.twinx()
+            supply = trial.pressure.pressure.reshape(-1, len(trial.pressure.time))[0].numpy()
+            other_axis.fill_between(trial.pressure.time.numpy(), supply / 1e3, color="0.85", zorder=0)
+            other_axis.set_ylabel("pressure [kPa]", fontsize=8)
+    return figure
+
+
+def _rectangle(low: np.ndarray, size: np.ndarray) -> Rectangle:
+    return Rectangle((float(low[0]), float(low[1])), float(size[0]), float(size[1]), fc="#e4e9ef", ec="0.6")
