@@ -67,8 +67,11 @@ def judge(
         effects: What is thought of; the library if None.
         report: Called with a line for each effect.
     """
-    scenario = problem.scenarios[0]
-    effects = [e for e in (library() if effects is None else effects) if e.applies(scenario, problem.twin)]
+    effects = [
+        effect
+        for effect in (library() if effects is None else effects)
+        if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
+    ]
     nothing = problem.fit()
     report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
     bases = [problem.base()]
