@@ -279,7 +279,7 @@ class Problem:
         start: np.ndarray | None = None,
         *,
         errors: np.ndarray | None = None,
-        rounds: int = 8,
+        rounds: int = 25,
         free: bool = False,
     ) -> Fit:
         """Fit effects, with modulus, pressure and measurement errors at their beliefs.
@@ -288,7 +288,8 @@ class Problem:
             effects: None, one or two.
             start: Where to begin, in scales; all zero if None.
             errors: Measurement errors to begin with.
-            rounds: Steps at most.
+            rounds: Steps at most, each a simulation of all trials. Derivatives, a simulation for each unknown, are
+                taken at the first point, at the last, and where a step gains little.
             free: Leave modulus and pressure without a prior, to see how far they alone go.
 
         Raises:
@@ -309,29 +310,30 @@ class Problem:
         places = np.array([False] * len(self.common) + [p for e in effects for p in _marks(e)])
         damping, moving = 1e-2, np.flatnonzero(~held)
         current = self._linearise(effects, at, errors, priors, moving, high)
-        for number in range(rounds):
-            ahead, last = None, number == rounds - 1
-            for attempt in range(3):
-                step = self._step(current, priors, held, places, low, high, damping)
-                # Seldom refused, so that the derivatives there are asked for at once.
-                ask = moving if attempt == 0 and not last else moving[:0]
-                try:
-                    ahead = self._linearise(effects, current.at + step, current.errors, priors, ask, high)
-                except SimulationDiverged:
-                    ahead = None
-                if ahead is not None and ahead.misfit < current.misfit:
+        anew = True  # whether the derivatives are those of this point
+        for _ in range(rounds):
+            step = self._step(current, priors, held, places, low, high, damping)
+            try:
+                ahead = self._linearise(effects, current.at + step, current.errors, priors, moving[:0], high)
+            except SimulationDiverged:
+                ahead = None
+            gained = 0.0 if ahead is None else current.misfit - ahead.misfit
+            if ahead is not None and gained > 0:
+                columns = _corrected(current, ahead)
+                current, damping = dataclasses.replace(ahead, columns=columns), max(damping / 5, 1e-4)
+                settled, anew = anew and gained < max(0.5, 1e-3 * ahead.misfit), False
+                if settled:
                     break
-                ahead, damping = None, damping * 10
-            if ahead is None:
-                break
-            gained, damping = current.misfit - ahead.misfit, max(damping / 5, 1e-4)
-            if last or gained < max(0.5, 1e-3 * ahead.misfit):
-                columns = ahead.columns if len(ask) else current.columns
-                current = dataclasses.replace(ahead, columns=columns)
-                break
-            if not len(ask):
-                ahead = self._linearise(effects, ahead.at, ahead.errors, priors, moving, high)
-            current = ahead
+            elif anew:
+                if damping > 10:
+                    break
+                damping *= 10
+                continue
+            # Derivatives that were carried along have done what they can.
+            if gained < 0.05 * current.misfit:
+                current, anew = self._linearise(effects, current.at, current.errors, priors, moving, high), True
+        if not anew:
+            current = self._linearise(effects, current.at, current.errors, priors, moving, high)
         return self._report(effects, current, priors, held)
 
     def _linearise(self, effects, at, errors, priors, moving, high) -> Point:
@@ -419,3 +421,10 @@ class Point:
 def _marks(effect: Hypothesis) -> list[bool]:
     """Which of an effect's unknowns are its place."""
     return [False] * len(effect.quantities) + [True] * (3 * effect.local)
+
+
+def _corrected(before: Point, after: Point) -> np.ndarray:
+    """Derivatives by the unknowns that agree with what a step did (Broyden's update)."""
+    step = after.at - before.at
+    expected = before.r - before.columns @ step - before.J @ (after.errors - before.errors)
+    return before.columns - np.outer(after.r - expected, step) / float(step @ step)

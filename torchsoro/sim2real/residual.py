@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.linalg import solve_triangular
 
 from torchsoro.sim2real.experiment import Setup, Trial
 from torchsoro.sim2real.recording import Recording
@@ -168,9 +168,3 @@ def estimate_noise(recordings: Sequence[Recording]) -> float:
     pooled = np.sort(np.concatenate(found))
     # Where a normal distribution has its lower quartile of absolute values; motion fills the upper part.
     return float(np.quantile(pooled, 0.25)) / 0.3186 / math.sqrt(20.0)
-
-
-def solve(J: np.ndarray, r: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Least squares |r - J x|^2 + |x * weight|^2 (prior deviations 1 / weight)."""
-    H = J.T @ J + np.diag(weight**2)
-    return cho_solve(cho_factor(H), J.T @ r)

@@ -75,7 +75,7 @@ def judge(
     nothing = problem.fit()
     report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
     bases = [problem.base()]
-    if np.abs(nothing.point).max() > 0.5:
+    if nothing.misfit < 0.8 * bases[0].misfit:
         bases.append(problem.base(nothing))
     looks: list[tuple[float, Hypothesis, np.ndarray]] = []
     for effect in effects:
@@ -93,7 +93,7 @@ def judge(
         best: Fit | None = None
         for start in starts:
             try:
-                fit = problem.fit([effect], start, errors=nothing.errors, rounds=8)
+                fit = problem.fit([effect], start, errors=nothing.errors, rounds=20)
             except SimulationDiverged as error:
                 report(f"{effect.name}: {error}")
                 continue
