@@ -72,7 +72,7 @@ def judge(
         for effect in (library() if effects is None else effects)
         if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
     ]
-    nothing = problem.fit()
+    nothing = problem.fit(rounds=8)
     report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
     bases = [problem.base()]
     if nothing.misfit < 0.8 * bases[0].misfit:
