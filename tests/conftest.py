@@ -52,9 +52,18 @@ def recipes() -> Iterator[dict[str, ModuleType]]:
     path = str(Path(__file__).parents[1] / "recipes")
     sys.path.insert(0, path)
     try:
-        yield {name: importlib.import_module(name) for name in ("walker", "climber", "replay", "compare")}
+        yield {
+            name: importlib.import_module(name)
+            for name in ("walker", "climber", "replay", "compare", "material_checks")
+        }
     finally:
         sys.path.remove(path)
+
+
+@pytest.fixture(scope="session")
+def checks(recipes) -> ModuleType:
+    """The recipe of material checks, as a module."""
+    return recipes["material_checks"]
 
 
 @pytest.fixture(scope="session")

@@ -5,10 +5,7 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,21 +14,11 @@ from torchsoro.rheology.measured import Sweep
 from torchsoro.rheology.spectrum import Interval, Spectrum, fit
 from torchsoro.rheology.superposition import Shift, master
 
-RECIPES = Path(__file__).parents[1] / "recipes"
 RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
 recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
 SOLID = Spectrum(
     equilibrium=1e6, moduli=np.full(8, 3e6), times=np.geomspace(1e-5, 1e2, 8), deformation="tension", temperature=20.0
 )
-
-
-@pytest.fixture(scope="module")
-def checks() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield importlib.import_module("material_checks")
-    finally:
-        sys.path.remove(str(RECIPES))
 
 
 def sweeps(shift: Shift) -> list[Sweep]:

@@ -336,30 +336,12 @@ def test_polystyrene_has_the_shifts_of_plazek():
     assert abs(law.C2 - 29.9) < 3 * law.C2_error
 
 
-def taken_apart(whole, published):
-    """A published master curve as the sweeps of 0.1 to 100 Hz that it was put together from, by its shift factors."""
-    measured = np.log10(2 * np.pi * np.geomspace(0.1, 100, 10))
-    apart = np.log10(whole.omega)[:, None, None] - measured[:, None] - published.log_a
-    nearest = np.abs(apart).reshape(len(whole.omega), -1)
-    label = np.where(nearest.min(1) < 1e-3, nearest.argmin(1) % len(published.log_a), -1)
-    return [
-        Sweep(
-            omega=whole.omega[label == k] / 10 ** published.log_a[k],
-            storage=whole.storage[label == k],
-            loss=whole.loss[label == k],
-            temperature=float(t),
-            deformation="tension",
-        )
-        for k, t in enumerate(published.temperatures)
-    ]
-
-
 @recordings
-def test_an_adhesive_has_its_published_shifts_where_they_are_known():
+def test_an_adhesive_has_its_published_shifts_where_they_are_known(checks):
     folder = Path(RECORDINGS) / "dma-nrel-polymer"
     (whole,) = read(folder / "freq_user_master.csv")
     published = read_shift(folder / "freq_user_master__shift_factors.csv")
-    shift = superpose(taken_apart(whole, published), reference=-5.0)
+    shift = superpose(checks.taken_apart(whole, published), reference=-5.0)
     # Published, the coldest sweep leaves a gap to its neighbour: that shift is nobody's.
     known = (shift.log_a_error < 0.15) & (shift.temperatures > -50)
     off = (shift.log_a - published.log_a)[known]
@@ -369,11 +351,11 @@ def test_an_adhesive_has_its_published_shifts_where_they_are_known():
 
 
 @recordings
-def test_the_storage_modulus_alone_gives_the_instruments_shifts_and_its_wlf():
+def test_the_storage_modulus_alone_gives_the_instruments_shifts_and_its_wlf(checks):
     pytest.importorskip("python_calamine", reason="reads workbooks")
     book = Path(RECORDINGS) / "dma-nrel-polymer" / "freq_Eplexor_master.xls"
     published = read_shift(book, columns={"temperature": "Temp.", "log_a": "Shift"}, units={"temperature": "C"})
-    shift = superpose(taken_apart(read(book)[0], published), reference=25.0, moduli="storage", misfit=0.0)
+    shift = superpose(checks.taken_apart(read(book)[0], published), reference=25.0, moduli="storage", misfit=0.0)
     known = shift.log_a_error < 0.15
     off = (shift.log_a - published.log_a)[known]
     print(f"{spread(off - off.mean()):.3f} decades rms at {known.sum()} of {len(known)} temperatures; {wlf(shift)}")

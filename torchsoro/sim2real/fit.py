@@ -40,7 +40,6 @@ class Fit:
     Attributes:
         effects: Fitted effects.
         values: Of each, in SI units; the place [m] of a local one follows its parameters.
-        deviations: Their standard deviations.
         covariances: Of each effect's values.
         belief: ln factors of modulus, and of pressure where there is one.
         errors: Measurement errors, as ``Camera.names``.
@@ -49,11 +48,11 @@ class Fit:
         unknowns: Of the effects.
         seen: What would have been recorded in each trial [T, M, A] m.
         whitened: Residual of each trial, divided by what may be.
+        point: All that was fitted by simulating, in scales.
     """
 
     effects: tuple[Hypothesis, ...]
     values: tuple[np.ndarray, ...]
-    deviations: tuple[np.ndarray, ...]
     covariances: tuple[np.ndarray, ...]
     belief: np.ndarray
     errors: np.ndarray
@@ -63,6 +62,11 @@ class Fit:
     seen: tuple[np.ndarray, ...]
     whitened: tuple[np.ndarray, ...]
     point: np.ndarray
+
+    @property
+    def deviations(self) -> tuple[np.ndarray, ...]:
+        """Standard deviations of the values."""
+        return tuple(np.sqrt(np.maximum(np.diag(c), 0)) for c in self.covariances)
 
     @property
     def name(self) -> str:
@@ -110,7 +114,6 @@ class Problem:
         if experiment.setup.cavities:
             self.common.append((PressureGain(), beliefs.pressure))
         self.simulations, self.seconds = 0, 0.0
-        self.known: dict[tuple, list[Motion]] = {}
 
     # Simulating -------------------------------------------------------------------------------------------------
 
@@ -280,7 +283,6 @@ class Problem:
         *,
         errors: np.ndarray | None = None,
         rounds: int = 25,
-        free: bool = False,
     ) -> Fit:
         """Fit effects, with modulus, pressure and measurement errors at their beliefs.
 
@@ -290,7 +292,6 @@ class Problem:
             errors: Measurement errors to begin with.
             rounds: Steps at most, each a simulation of all trials. Derivatives, a simulation for each unknown, are
                 taken at the first point, at the last, and where a step gains little.
-            free: Leave modulus and pressure without a prior, to see how far they alone go.
 
         Raises:
             SimulationDiverged: if the first point breaks down.
@@ -304,7 +305,7 @@ class Problem:
         own = {type(effect) for effect in effects}
         held = np.zeros(size, dtype=bool)
         for i, (effect, _) in enumerate(self.common):
-            priors[i] = 0.0 if free else 1.0
+            priors[i] = 1.0
             held[i] = type(effect) in own
             at[i] = 0.0 if held[i] else at[i]
         places = np.array([False] * len(self.common) + [p for e in effects for p in _marks(e)])
@@ -381,18 +382,15 @@ class Problem:
         covariance = np.zeros((size, size))
         covariance[np.ix_(~held, ~held)] = np.linalg.pinv(H)[:n, :n]
         scales = self.scales(effects)
-        deviation = np.sqrt(np.maximum(np.diag(covariance), 0)) * scales
-        values, deviations, covariances, k = [], [], [], len(self.common)
+        values, covariances, k = [], [], len(self.common)
         for effect in effects:
             count = len(effect.quantities) + 3 * effect.local
             values.append(point.at[k : k + count] * scales[k : k + count])
-            deviations.append(deviation[k : k + count])
             covariances.append((covariance * np.outer(scales, scales))[k : k + count, k : k + count])
             k += count
         return Fit(
             effects=tuple(effects),
             values=tuple(values),
-            deviations=tuple(deviations),
             covariances=tuple(covariances),
             belief=(point.at * scales)[: len(self.common)],
             errors=point.errors,

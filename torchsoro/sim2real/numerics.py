@@ -15,7 +15,6 @@ from torchsoro.sim2real.recording import Recording
 from torchsoro.sim2real.twin import SAMPLE, Twin
 
 SPEED = 4e6  # particle steps in a second, two cores
-CELLS = 3  # through every wall, at least
 FLOOR = 0.01  # of the motion, below which no twin is trusted
 
 

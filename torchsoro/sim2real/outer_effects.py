@@ -234,7 +234,5 @@ class InitialMotion(Hypothesis):
         velocity = scenario.velocity
         shape = torch.ones(twin.count, dtype=torch.float64)
         for axis, side in twin.faces:
-            face = twin.setup.origin[axis] + (twin.setup.size[axis] if side > 0 else 0.0)
-            depth = (side * (face - twin.positions[:, axis]) / twin.setup.size[axis]).clamp(0, 1)
-            shape = shape * depth**2
+            shape = shape * (twin.depth(axis, side) / twin.setup.size[axis]).clamp(0, 1) ** 2
         return scenario.replace(velocity=velocity + values[:, None, :] * shape[:, None])

@@ -108,7 +108,6 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "score": c.score,
                 "explained": c.explained,
                 "misfit": c.fit.misfit,
-                "finished": c.finished,
                 "effects": effect_rows(c, 0.0, problem.scenarios[0]),
             }
             for c in v.ranking
@@ -217,7 +216,6 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
             "score": c.score,
             "of the difference [%]": 100 * c.explained,
             "misfit / samples": c.fit.misfit / c.fit.samples,
-            "to the end": c.finished,
             "parameters": _said(c, e.problem.scenarios[0]),
         }
         for c in e.verdict.ranking

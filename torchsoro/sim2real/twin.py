@@ -69,8 +69,6 @@ class Twin:
     Args:
         setup: What is believed.
         spacing: Of the particles, half a cell [m].
-        shift: Of the lattice against the body, along axes that are not clamped and without chambers [spacings].
-        formulation: "total" or "updated".
         device: To simulate on.
 
     Raises:
@@ -83,16 +81,14 @@ class Twin:
         setup: Setup,
         *,
         spacing: float,
-        shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        formulation: str = "total",
         device: str | torch.device = "cpu",
     ) -> None:
         if setup.mesh is not None:
             raise ValueError(f"setup: body of {setup.mesh.name}, wanted a box")
-        self.setup, self.spacing, self.formulation = setup, spacing, formulation
+        self.setup, self.spacing = setup, spacing
         self.device = torch.device(device)
         self.faces = [_face(box, setup) for box in setup.clamps]
-        low, counts = self._lattice(shift)
+        low, counts = self._lattice()
         self.low, self.counts = low, counts
         axes = [a + (torch.arange(n, dtype=torch.float64) + 0.5) * spacing for a, n in zip(low, counts, strict=True)]
         places = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
@@ -115,8 +111,7 @@ class Twin:
         self.stiff = torch.where(self.air, 1.0, share[keep] * self._bending())
         self.softer = torch.ones_like(self.share)
         for axis, side in self.faces:
-            face = (setup.origin[axis] + setup.size[axis]) if side > 0 else setup.origin[axis]
-            depth = side * (face - self.positions[:, axis])
+            depth = self.depth(axis, side)
             self.softer = torch.where((depth > 0) & (depth < 2 * spacing), SOFTER, self.softer)
         self.probes, self.weights, self.slopes = self._markers(torch.tensor([m.at for m in setup.markers]).double())
 
@@ -124,6 +119,14 @@ class Twin:
     def count(self) -> int:
         """Number of particles."""
         return len(self.positions)
+
+    def face(self, axis: int, side: int) -> float:
+        """Where a face of the body is along its axis [m]."""
+        return self.setup.origin[axis] + (self.setup.size[axis] if side > 0 else 0.0)
+
+    def depth(self, axis: int, side: int) -> Tensor:
+        """How far particles are in front of a face, within the body [N] m."""
+        return side * (self.face(axis, side) - self.positions[:, axis])
 
     @property
     def inside(self) -> Tensor:
@@ -159,7 +162,7 @@ class Twin:
             factor = torch.where(outer, factor * wanted / float(second[rim].sum()) / cut, factor)
         return factor
 
-    def _lattice(self, shift: tuple[float, float, float]) -> tuple[list[float], list[int]]:
+    def _lattice(self) -> tuple[list[float], list[int]]:
         """Lower corner and counts of a lattice around the body: on the faces of clamps and chambers where possible."""
         s, h = self.setup, self.spacing
         low, counts = [], []
@@ -171,7 +174,6 @@ class Twin:
             if not clamped and not s.cavities:
                 # Both faces are alike.
                 anchor = begin if exact else (begin + end) / 2 - h * math.ceil(s.size[axis] / h) / 2
-                anchor += shift[axis] * h
             before = math.ceil((anchor - begin) / h - 1e-6) if anchor > begin else 0
             first = anchor - h * max(before, 0)
             if first > begin + 1e-9:
@@ -318,12 +320,11 @@ class Twin:
             drag=drag.to(**like) if bool(self.air.any()) else None,
         )
 
-    def simulate(self, s: Scenario, *, safety: float = 0.9) -> Motion:
+    def simulate(self, s: Scenario) -> Motion:
         """Simulate a scenario.
 
         Args:
             s: What to simulate.
-            safety: Share of the largest stable substep.
 
         Raises:
             SimulationDiverged: if it breaks down.
@@ -332,12 +333,10 @@ class Twin:
         cell = 2 * self.spacing
         low = self.positions.amin(0) - 0.5
         high = self.positions.amax(0) + 0.5
-        simulator = Simulator(
-            cell=cell, dt="auto", low=low.tolist(), high=high.tolist(), formulation="total", safety=safety
-        )
+        simulator = Simulator(cell=cell, dt="auto", low=low.tolist(), high=high.tolist(), formulation="total")
         held = []
         for axis, side in self.faces:
-            face = self.setup.origin[axis] + (self.setup.size[axis] if side > 0 else 0.0)
+            face = self.face(axis, side)
             # The body is on the side away from the clamp; the first node in front of its face is held, too.
             held += [
                 Plane(axis=axis, offset=face - side * (0.51 - i) * cell, side=-side, adhesion=1e12) for i in range(3)

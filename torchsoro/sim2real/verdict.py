@@ -29,13 +29,11 @@ class Candidate:
         fit: The best of it.
         score: What it gains in ln of the likelihood, studentised, less what its parameters are worth.
         explained: Share of the misfit beyond noise and numerics that it takes away.
-        finished: Whether it was fitted to the end.
     """
 
     fit: Fit
     score: float
     explained: float
-    finished: bool
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -45,7 +43,7 @@ class Verdict:
     Attributes:
         kind: "explained", "nothing_missing", "unknown_physics" or "cannot_distinguish".
         nothing: The fit without any effect.
-        ranking: All effects, best first.
+        ranking: The effects that were fitted, best first.
         chosen: The effects that explain the difference: one, or several that cannot be told apart.
         excess: What is left over what noise and numerics explain, for the best effect: 1 if nothing is left.
     """
@@ -89,7 +87,7 @@ def judge(
         if mine:
             report(f"{effect.name}: would leave {min(m for m, _ in mine):.0f}")
     found = []
-    for effect, starts in _likely(problem, looks):
+    for effect, starts in _likely(looks):
         best: Fit | None = None
         for start in starts:
             try:
@@ -99,14 +97,14 @@ def judge(
                 continue
             best = fit if best is None or fit.misfit < best.misfit else best
         if best is not None:
-            found.append(rate(best, nothing, finished=True))
+            found.append(rate(best, nothing))
             report(f"{effect.name}: misfit {best.misfit:.0f}, {tell(best)}")
-    found.sort(key=lambda c: (-c.finished, -c.score))
+    found.sort(key=lambda c: -c.score)
     return decide(nothing, found)
 
 
 def _likely(
-    problem: Problem, looks: Sequence[tuple[float, Hypothesis, np.ndarray]]
+    looks: Sequence[tuple[float, Hypothesis, np.ndarray]],
 ) -> list[tuple[Hypothesis, list[np.ndarray]]]:
     """The effects that look best, and where to begin: at the best look, and at the best one elsewhere or otherwise."""
     likely: dict[str, tuple[Hypothesis, list[np.ndarray]]] = {}
@@ -131,7 +129,7 @@ def tell(fit: Fit) -> str:
     return ", ".join(parts)
 
 
-def rate(fit: Fit, nothing: Fit, *, finished: bool) -> Candidate:
+def rate(fit: Fit, nothing: Fit) -> Candidate:
     """Score an effect.
 
     Residuals of a wrong model are neither white nor of the variance that was thought: the gain in misfit counts in
@@ -141,11 +139,8 @@ def rate(fit: Fit, nothing: Fit, *, finished: bool) -> Candidate:
     count = fit.samples / inflation
     spread = max(1.0, fit.misfit / fit.samples)
     gain = (nothing.misfit - fit.misfit) / (2 * spread * inflation)
-    floor = float(fit.samples)
-    explained = (nothing.misfit - fit.misfit) / max(nothing.misfit - floor, 1.0)
-    return Candidate(
-        fit=fit, score=gain - 0.5 * fit.unknowns * math.log(count), explained=min(explained, 1.0), finished=finished
-    )
+    explained = (nothing.misfit - fit.misfit) / max(nothing.misfit - fit.samples, 1.0)
+    return Candidate(fit=fit, score=gain - 0.5 * fit.unknowns * math.log(count), explained=min(explained, 1.0))
 
 
 def correlation(fit: Fit) -> float:
@@ -173,6 +168,6 @@ def decide(nothing: Fit, found: Sequence[Candidate]) -> Verdict:
     left = best.fit.misfit / best.fit.samples
     if left > BEYOND and best.explained < 1 - ENOUGH / 2:
         return Verdict(kind="unknown_physics", nothing=nothing, ranking=tuple(found), excess=left)
-    close = tuple(c for c in found if c.finished and c.score > best.score - MARGIN)
+    close = tuple(c for c in found if c.score > best.score - MARGIN)
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
     return Verdict(kind=kind, nothing=nothing, ranking=tuple(found), chosen=close, excess=left)
