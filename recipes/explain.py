@@ -19,12 +19,14 @@ import torch
 import tyro
 
 from torchsoro.settings import plain_errors
+from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
-from torchsoro.sim2real.numerics import choose_spacing, measure
+from torchsoro.sim2real.numerics import WALLS, choose_twin, measure
 from torchsoro.sim2real.report import Explanation, lead, write
+from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.twin import Twin
 from torchsoro.sim2real.verdict import judge
 from torchsoro.storage import atomic_write
@@ -44,10 +46,12 @@ class Options:
     """The trial.toml to predict; with a pressure.csv beside it where the body has a chamber."""
     budget: float = 20.0
     """Time that the explanation may take, about [minutes]; sets how fine the twin is."""
-    spacing: float = 0.0
-    """Distance of the twin's particles [m] instead."""
-    device: str = "cpu"
-    """"cpu" or "cuda"."""
+    edge: float = 0.0
+    """Edge of the twin's cells [m] instead."""
+    walls: int = WALLS
+    """Cells through each wall around a chamber, at least."""
+    threads: int = 0
+    """That simulate side by side; 0 for as many as there are processors."""
 
 
 def predicted(options: Options) -> None:
@@ -79,21 +83,25 @@ def main(options: Options) -> Explanation | None:
     begin = time.perf_counter()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    experiment = read_experiment(options.experiment)
+    experiment, confused = reordered(read_experiment(options.experiment))
+    if confused:
+        print(confused)
     trials = [t for t in experiment.trials if t.recording is not None]
     kept = [t for t in experiment.heldout if t.recording is not None]
-    if not kept and len(trials) > 2:
-        trials, kept = trials[:-1], trials[-1:]
-    spacing = options.spacing or choose_spacing(experiment.setup, len(trials), 60 * options.budget)
-    twin = Twin(experiment.setup, spacing=spacing, device=options.device)
-    print(f"twin: {twin.count} particles, {1e3 * spacing:.2f} mm apart")
-    numerics = measure(experiment, twin, trials)
-    problem = Problem(experiment, twin, trials=trials, numerics=numerics.deviation)
+    if options.edge > 0:
+        twin = Twin(experiment.setup, edge=options.edge, walls=options.walls)
+    else:
+        twin = choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
+    print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
+    ensemble = Ensemble(twin, options.threads or THREADS)
+    numerics = measure(experiment, ensemble, trials)
+    problem = Problem(experiment, twin, trials=trials, numerics=numerics.deviation, ensemble=ensemble)
     print(
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
         + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)
     )
-    verdict = judge(problem)
+    verdict = judge(problem, kept=kept, budget=60 * options.budget)
+    problem = verdict.problem
     best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
     everything = [*trials, *kept]
     found = Explanation(
@@ -105,9 +113,14 @@ def main(options: Options) -> Explanation | None:
         heldout=tuple(t.name for t in kept),
         seconds=time.perf_counter() - begin,
     )
-    settings = {"experiment": str(options.experiment), "budget_minutes": options.budget, "spacing_m": spacing}
+    settings = {
+        "experiment": str(options.experiment),
+        "budget_minutes": options.budget,
+        "edge_m": twin.edge,
+        "walls": twin.walls,
+    }
     write(found, everything, options.out, settings)
-    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, spacing)
+    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, twin)
     print(f"{verdict.kind}: {lead(found)}\n{found.seconds:.0f} s; {options.out / 'report.html'}")
     return found
 

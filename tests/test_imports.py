@@ -43,14 +43,17 @@ archive
 robot
 results
 sim2real.recording
-sim2real.experiment sim2real.scenario
+sim2real.experiment sim2real.scenario sim2real.grid
 sim2real.twin
+sim2real.ensemble
 sim2real.hypothesis sim2real.residual
 sim2real.body_effects
 sim2real.outer_effects
 sim2real.library
+sim2real.likelihood
 sim2real.fit
-sim2real.heldout sim2real.model sim2real.numerics sim2real.verdict
+sim2real.heldout sim2real.model sim2real.numerics
+sim2real.verdict
 sim2real.report
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

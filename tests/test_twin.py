@@ -1,4 +1,4 @@
-"""The twin of an experiment: its body, markers, loads, and what hypotheses change of them."""
+"""The twin of an experiment: its grid, body, markers, loads, motion, and what hypotheses change of them."""
 
 from __future__ import annotations
 
@@ -10,16 +10,24 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.optimize import curve_fit
 from test_experiment import experiment
 
-from torchsoro.loads import PointMass, attach
+from torchsoro import Body, Solid
+from torchsoro.actuation import Waveform
+from torchsoro.contact import Plane
+from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import Boundary, Cavity, Load, read_experiment
+from torchsoro.sim2real.grid import Axis, divide
 from torchsoro.sim2real.library import library
-from torchsoro.sim2real.scenario import together
 from torchsoro.sim2real.twin import Twin
+from torchsoro.simulator import Simulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
+EDGE = 0.008
+CHAMBER = ((0.01, 0.006, 0.007), (0.03, 0.014, 0.012))
 
 
 @pytest.fixture
@@ -27,127 +35,120 @@ def trial(tmp_path):
     return read_experiment(experiment(tmp_path)).trials[0]
 
 
-def changed(trial, **changes):
-    return dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **changes))
+def changed(trial, pressure=None, **changes):
+    return dataclasses.replace(trial, pressure=pressure, setup=dataclasses.replace(trial.setup, **changes))
 
 
-@pytest.mark.parametrize("size", [(0.04, 0.02, 0.02), (0.041, 0.0187, 0.0213), (0.0395, 0.02, 0.0175)])
-@pytest.mark.parametrize("spacing", [0.0025, 0.003])
-def test_the_body_has_its_mass_and_centre(trial, size, spacing):
-    t = changed(trial, size=size, clamps=())
-    twin = Twin(t.setup, spacing=spacing)
-    mass = twin.body(twin.scenario(t)).mass.double()
-    assert float(mass.sum()) == pytest.approx(1000 * math.prod(size), rel=1e-5)
-    center = (mass[:, None] * twin.positions).sum(0) / mass.sum()
-    # A cut particle's mass is at its middle, at most half a spacing beside its own.
-    assert (center - torch.tensor(t.setup.center)).abs().max() < 1e-5 + 0.01 * spacing
+def hollow(trial, pascal=2e3, **changes):
+    """With a chamber that is filled in 10 ms."""
+    wave = Waveform(
+        time=torch.tensor([0.0, 0.01, 1.0], dtype=torch.float64),
+        pressure=torch.tensor([[0.0, pascal, pascal]], dtype=torch.float64),
+    )
+    return changed(trial, wave, cavities=(Cavity(name="c", box=CHAMBER),), **changes)
 
 
-def test_a_clamped_body_goes_on_behind_the_clamp(trial):
-    twin = Twin(trial.setup, spacing=0.0025)
-    assert float(twin.positions[:, 0].min()) == pytest.approx(-0.01 + 0.00125)
-    mass = twin.body(twin.scenario(trial)).mass.double()
-    assert float(mass[twin.inside].sum()) == pytest.approx(1000 * 0.04 * 0.02 * 0.02, rel=1e-5)
+# The grid ---------------------------------------------------------------------------------------------------------
+
+
+@settings(deadline=None, max_examples=40)
+@given(
+    st.lists(st.floats(0.1, 1.0), min_size=1, max_size=4), st.lists(st.integers(1, 4), min_size=4, max_size=4),
+    st.floats(0.05, 0.6), st.lists(st.floats(0.0, 1.0), min_size=5, max_size=5),
+)  # fmt: skip
+def test_splines_are_exact_for_parabolas(lengths, least, edge, shares):
+    breaks = [0.0, *np.cumsum(lengths)]
+    axis = Axis(divide(breaks, least, edge))
+    assert set(np.round(breaks, 9)) <= set(np.round(axis.planes, 9))
+    x = np.array(shares) * breaks[-1]
+    weights, slopes = axis.at(x, axis.cell(x))
+    np.testing.assert_allclose(weights.sum(-1), 1.0)
+    nodes = axis.cell(x)[:, None] + np.arange(3)
+    np.testing.assert_allclose((weights * axis.places[nodes]).sum(-1), x, atol=1e-9)
+    np.testing.assert_allclose((slopes * axis.places[nodes]).sum(-1), 1.0, atol=1e-8)
+    # Products of knots are the coefficients of x^2.
+    square = axis.knots[1:-2] * axis.knots[2:-1]
+    np.testing.assert_allclose((weights * square[nodes]).sum(-1), x**2, atol=1e-9)
+
+
+def test_a_body_has_its_mass_centre_and_walls(trial):
+    t = hollow(trial)
+    twin = Twin(t.setup, edge=EDGE, walls=2)
+    solid = math.prod(t.setup.size) - 0.02 * 0.008 * 0.005
+    assert float(twin.volumes.sum()) == pytest.approx(solid, rel=1e-12)
+    mass = twin.nodal(1000.0 * twin.volumes)
+    assert float(mass.sum()) == pytest.approx(1000 * solid)
+    whole, hole = math.prod(t.setup.size), 0.02 * 0.008 * 0.005
+    middle = (whole * np.array(t.setup.center) - hole * np.mean(CHAMBER, axis=0)) / solid
+    np.testing.assert_allclose(((mass[:, None] * twin.places).sum(0) / mass.sum()).numpy(), middle)
+    assert Ensemble(twin).volumes[0] == pytest.approx(hole)
+    _, _, _, axes, areas, _ = twin.grid.walls()
+    for axis, area in enumerate((0.008 * 0.005, 0.02 * 0.005, 0.02 * 0.008)):
+        assert areas[axes == axis].sum() == pytest.approx(0.0, abs=1e-12)
+        assert np.abs(areas[axes == axis]).sum() == pytest.approx(2 * area)
+    areas = [twin.grid.facing(n).sum() for n in np.eye(3)]
+    np.testing.assert_allclose(areas, [0.02 * 0.02, 0.04 * 0.02, 0.04 * 0.02])
 
 
 def test_markers_follow_an_affine_motion(trial):
     markers = [dataclasses.replace(trial.setup.markers[0], name=f"m{i}", at=at) for i, at in enumerate(
         [(0.04, 0.01, 0.02), (0.04, 0.0, 0.0), (0.021, 0.013, 0.026), (0.013, 0.007, 0.011)]
     )]  # fmt: skip
-    twin = Twin(dataclasses.replace(trial.setup, markers=tuple(markers)), spacing=0.0025)
-    A = torch.tensor([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]], dtype=torch.float64)
-    moved = twin.positions @ A.T
-    at = torch.tensor([m.at for m in markers], dtype=torch.float64)
-    torch.testing.assert_close(torch.einsum("mkc,mk->mc", moved[twin.probes], twin.weights), at @ A.T)
-    gradient = torch.einsum("mkc,mkd->mcd", moved[twin.probes], twin.slopes)
-    torch.testing.assert_close(gradient, A.expand(4, 3, 3))
+    twin = Twin(dataclasses.replace(trial.setup, markers=tuple(markers)), edge=EDGE)
+    A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]])
+    moved = twin.grid.places @ A.T
+    nodes, values = twin.marks()
+    at = np.array([m.at for m in markers])
+    # One of them is above the body and moves with its surface as if it were tied to it.
+    np.testing.assert_allclose(np.einsum("mkc,mk->mc", moved[nodes], values[..., 0]), at @ A.T, atol=1e-12)
+    np.testing.assert_allclose(
+        np.einsum("mkc,mkd->mcd", moved[nodes], values[..., 1:]), np.tile(A, (4, 1, 1)), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("place", [(0.03, 0.01, 0.01), (0.04, 0.02, 0.02), (0.0391, 0.0012, 0.0197)])
 def test_what_is_attached_is_centred_on_its_place(trial, place):
-    twin = Twin(trial.setup, spacing=0.0025)
-    middle = torch.tensor(place, dtype=torch.float64)
-    group, share = twin.around(middle)
-    assert float(share.sum()) == pytest.approx(1.0) and bool((share >= 0).all())
-    # Particles lie within the body: half a spacing short of its faces.
-    off = (share @ twin.positions[group] - middle).abs().max()
-    assert off <= 0.5001 * 0.0025
+    twin = Twin(trial.setup, edge=EDGE)
+    share = twin.at(torch.tensor([place], dtype=torch.float64))[0]
+    assert bool((share >= 0).all())
+    torch.testing.assert_close(share @ twin.places, torch.tensor(place, dtype=torch.float64))
 
 
 def test_a_load_acts_in_the_middle_of_its_box(trial):
     box = ((0.03, 0.006, 0.012), (0.04, 0.013, 0.02))
     t = changed(trial, loads=(Load(box=box, force=(0.0, 0.0, -0.1)),))
-    twin = Twin(t.setup, spacing=0.0025)
-    force = twin.scenario(t).loads[0]
-    center = force.share @ twin.positions[force.particles]
-    torch.testing.assert_close(center, torch.tensor([0.035, 0.0095, 0.016], dtype=torch.float64), atol=1e-6, rtol=0)
+    push = Twin(t.setup, edge=EDGE)
+    push = push.scenario(t).pushes[0].share @ push.places
+    torch.testing.assert_close(push, torch.tensor([0.035, 0.0095, 0.016], dtype=torch.float64))
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"clamps": (((-0.001, 0.005, -0.001), (0.0001, 0.021, 0.021)),)}, "wanted one that holds a whole face"),
-        ({"planes": (Boundary(point=(0, 0, 0), normal=(0, 1, 1)),)}, "wanted one along x, y or z"),
+        ({"clamps": (((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)),)}, "wanted one that holds a part of the body"),
+        ({"planes": (Boundary(point=(0, 0, 0), normal=(0, 0, 0)),)}, "wanted one that is not zero"),
         ({"mesh": Path("body.stl")}, "wanted a box"),
-        (
-            {"cavities": (Cavity(name="c", box=((0.01, 0.01, 0.01), (0.011, 0.011, 0.011))),)},
-            "narrower than a particle",
-        ),
+        ({"cavities": (Cavity(name="c", box=((0.01, 0.0, 0.01), (0.02, 0.01, 0.015))),)}, "within the body"),
+        ({"loads": (Load(box=((0.1, 0, 0), (0.2, 0.1, 0.1)), force=(0, 0, 1)),)}, "wanted a box that meets it"),
     ],
 )
 def test_what_the_twin_cannot_do_is_refused(trial, changes, message):
     t = changed(trial, **changes)
     with pytest.raises(ValueError, match=message):
-        Twin(t.setup, spacing=0.0025).scenario(t)
+        Twin(t.setup, edge=EDGE).scenario(t)
 
 
-@pytest.mark.parametrize("effect", library(), ids=lambda e: e.name)
-def test_effects_are_nothing_at_zero(trial, effect):
-    t = changed(
-        trial,
-        loads=(Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1)),),
-        planes=(Boundary(point=(0.0, 0.0, -0.01), normal=(0.0, 0.0, 1.0), friction=0.4),),
-    )
-    twin = Twin(t.setup, spacing=0.005)
-    scenario = twin.scenario(t)
-    if not effect.applies(scenario, twin):
-        pytest.skip("needs a chamber")
-    values = torch.zeros(1, len(effect.quantities), dtype=torch.float64)
-    if effect.local:
-        values = torch.cat([values, torch.tensor([[0.02, 0.01, 0.01]], dtype=torch.float64)], 1)
-    same = effect(scenario, values, twin)
-    assert len(effect.quantities) <= 3
-    for name in ("stiffness", "density", "poisson_ratio", "viscosity", "gravity", "velocity"):
-        one, other = getattr(same, name), getattr(scenario, name)
-        assert torch.equal(one.broadcast_to(torch.broadcast_shapes(one.shape, other.shape)), other.expand_as(one)), name
-    assert same.duration == scenario.duration
-    weight = twin.body(scenario).mass
-    for load in same.loads[len(scenario.loads) :]:
-        assert not isinstance(load, PointMass)
-        attached = attach(twin.body(scenario), [load])
-        assert torch.equal(attached.body.mass, weight)
-        for added in (attached.spring, attached.drag):
-            assert added is None or not bool(added.any())
+# Motion -----------------------------------------------------------------------------------------------------------
 
 
-def test_trials_in_a_batch_move_as_alone(trial):
-    twin = Twin(trial.setup, spacing=0.005)
-    loaded = changed(trial, loads=(Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.05)),))
-    scenarios = [twin.scenario(trial), twin.scenario(loaded)]
-    tether = next(e for e in library() if e.name == "tether")
-    values = torch.tensor([[0.0, 0.0, 0.04, 0.01, 0.02], [3.0, 0.1, 0.04, 0.01, 0.02]], dtype=torch.float64)
-    varied = [tether(s, values, twin) for s in scenarios]
-    whole = together(varied, 2)
-    assert whole is not None
-    for part, alone in zip(twin.simulate(whole).parts(2), map(twin.simulate, varied), strict=True):
-        torch.testing.assert_close(part.place, alone.place, atol=1e-7, rtol=0)
+def run(t, edge=EDGE, walls=2, **changes):
+    twin = Twin(t.setup, edge=edge, walls=walls)
+    return Ensemble(twin)([twin.scenario(t).replace(**changes)])[0].alone()
 
 
 @pytest.mark.parametrize("across", [3, 4])
 def test_a_clamped_bar_has_the_frequency_of_its_length(trial, across):
     from structures import timoshenko
-
-    from torchsoro import Solid
 
     length, width = 0.1, 0.025
     t = changed(
@@ -160,14 +161,165 @@ def test_a_clamped_bar_has_the_frequency_of_its_length(trial, across):
         gravity=(0.0, 0.0, -1.0),
         duration=0.5,
     )
-    motion = Twin(t.setup, spacing=width / across / 2)
-    motion = motion.simulate(motion.scenario(t))
-    z, time = (motion.place[:, 0, 2] - motion.place[0, 0, 2]).numpy(), motion.time.numpy()
+    motion = run(t, edge=width / across)
+    z = motion.place[:, 0, 2] - motion.place[0, 0, 2]
     exact = timoshenko(length, width, Solid(youngs_modulus=1e5, poisson_ratio=0.0, density=1000.0))
     fitted, _ = curve_fit(
         lambda t, c, a, w, p: c + a * np.cos(w * t + p),
-        time,
+        motion.time,
         z / abs(z).max(),
         p0=(-0.5, 0.5, 2 * math.pi * exact, 0.0),
     )
     assert abs(fitted[2]) / (2 * math.pi) == pytest.approx(exact, rel=0.006)
+
+
+@pytest.mark.parametrize("stiffening", [0.0, 4.0])
+def test_moves_as_the_particles_of_the_simulator_do(trial, stiffening):
+    """Same laws, other shape functions: a viscoelastic bar that swings far."""
+    t = changed(trial, prony=((0.5, 0.01), (0.2, 0.002)), duration=0.15, gravity=(0.0, 0.0, -20.0))
+    law = torch.tensor([stiffening, stiffening / 2], dtype=torch.float64)
+    motion = run(t, edge=0.005, stiffening=law)
+    h, low, size = 0.00125, np.array(t.setup.origin), np.array(t.setup.size)
+    axes = [a + h * (np.arange(round(s / h)) + 0.5) for a, s in zip(low, size, strict=True)]
+    axes[0] = np.concatenate([low[0] - h * (np.arange(4)[::-1] + 0.5), axes[0]])
+    x = torch.from_numpy(np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)).float()
+    ones = torch.ones(len(x))
+    mu, bulk = t.setup.youngs_modulus / 2.6, t.setup.youngs_modulus / (3 * (1 - 2 * 0.3))
+    body = Body(
+        position=x, mass=1000 * h**3 * ones, volume=h**3 * ones, bulk=bulk * ones, shear=mu * ones,
+        chamber=-ones.int(), stiffening=law.float().expand(len(x), 2),
+    )  # fmt: skip
+    tip = int((x - torch.tensor(t.setup.markers[0].at)).norm(dim=-1).argmin())
+    twin = Twin(t.setup, edge=0.005)
+    scenario = twin.scenario(t)
+    with torch.no_grad():
+        seen = Simulator(cell=2 * h, dt="auto", low=(-0.5,) * 3, high=(0.5,) * 3, formulation="total")(
+            body,
+            duration=0.15,
+            prony=scenario.prony,
+            gravity=t.setup.gravity,
+            # Nodes half a cell in front of the clamp are held, too, as a node there is in the wall.
+            planes=[Plane(axis=0, offset=(0.51 - i) * 2 * h, side=1, adhesion=1e12) for i in range(3)],
+            sample_every=2.5e-3,
+            probes=torch.tensor([tip]),
+        )
+    other = seen.position[:, 0, 2].numpy() - float(x[tip, 2])
+    mine = motion.place[:, 0, 2] - motion.place[0, 0, 2]
+    # Holding more of it makes the simulator's bar shorter by 0.29 cells of 40 mm / 2.5 mm.
+    assert np.abs(mine - other).max() < 0.08 * np.abs(mine).max()
+    assert np.abs(mine).max() > 0.003
+
+
+def test_a_free_body_keeps_its_momentum_and_falls(trial):
+    t = changed(trial, clamps=(), velocity=(0.3, 0.0, 0.5), angular_velocity=(0.0, 20.0, 0.0), duration=0.1)
+    markers = tuple(
+        dataclasses.replace(
+            t.setup.markers[0], name=str(i), at=tuple(t.setup.origin[a] + s * t.setup.size[a] for a, s in enumerate(c))
+        )
+        for i, c in enumerate(np.ndindex(2, 2, 2))
+    )
+    motion = run(changed(t, markers=markers))
+    middle = motion.place.mean(1)
+    fall = (
+        np.array(t.setup.center)
+        + motion.time[:, None] * [0.3, 0, 0.5]
+        - 9.81 / 2 * motion.time[:, None] ** 2 * [0, 0, 1]
+    )
+    np.testing.assert_allclose(middle, fall, atol=3e-4)
+    # It has turned by two rad, and stays as large as it was.
+    edge = motion.place[:, 4] - motion.place[:, 0]
+    assert math.atan2(-edge[-1, 2], edge[-1, 0]) == pytest.approx(2.0, abs=0.02)
+    np.testing.assert_allclose(np.linalg.norm(edge, axis=-1), t.setup.size[0], rtol=0.01)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_a_block_slides_as_far_as_friction_lets_it(trial, tilt):
+    """On a plane, level or not, which is the same to the block if gravity is as steep to it."""
+    turn = np.array([[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]])
+    low = np.array(trial.setup.origin)
+    t = changed(
+        trial,
+        clamps=(),
+        gravity=(0.0, 0.0, -9.81),
+        velocity=(0.5, 0.0, 0.0),
+        youngs_modulus=1e6,
+        prony=((1.0, 0.001),),
+        planes=(Boundary(point=tuple(low), normal=(0.0, 0.0, 1.0), friction=0.3),),
+        duration=0.3,
+    )
+    motion = run(t)
+    way = motion.place[-1, 0, 0] - motion.place[0, 0, 0]
+    assert way == pytest.approx(0.5**2 / (2 * 0.3 * 9.81), rel=0.05)
+    if tilt:
+        # A plane through the body's lowest edge that it is pushed on from above at an angle.
+        normal = turn @ [0, 0, 1]
+        steep = changed(t, planes=(Boundary(point=tuple(low), normal=tuple(normal), friction=0.3),), velocity=(0, 0, 0))
+        seen = run(steep).place
+        offset = normal @ low
+        assert (seen[:, 0] @ normal - offset).min() > -1e-4
+
+
+def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
+    t = hollow(trial, duration=0.2, gravity=(0.0, 0.0, 0.0))
+    grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).place for k in (0.0, 2e4)]
+    moved = [np.abs(p[-1] - p[0]).max() for p in grown]
+    assert moved[0] > 1.2 * moved[1] > 1e-5
+    # Pressure acts from inside: the forces on the whole body add up to nothing.
+    free = run(changed(t, t.pressure, clamps=(), duration=0.05))
+    assert abs((free.place[-1] - free.place[0]).mean(0)[0]) < 2e-4
+
+
+def test_variations_move_as_alone(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    loaded = changed(trial, loads=(Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.05)),))
+    tether = next(e for e in library() if e.name == "tether")
+    rows = [[0.0, 0.0, 0.0, 0.04, 0.01, 0.02], [3.0, 0.1, 0.001, 0.04, 0.01, 0.02]]
+    values = torch.tensor(rows * 10, dtype=torch.float64)  # more than one group of lanes
+    varied = [tether(twin.scenario(t), values, twin) for t in (trial, loaded)]
+    ensemble = Ensemble(twin)
+    for part, scenario in zip(ensemble(varied), (trial, loaded), strict=True):
+        for row in range(2):
+            alone = ensemble([tether(twin.scenario(scenario), values[row : row + 1], twin)])[0]
+            np.testing.assert_allclose(part.place[row], alone.place[0], atol=2e-6)
+            np.testing.assert_allclose(part.place[18 + row], part.place[row], atol=1e-6)
+
+
+def test_a_variation_that_breaks_down_is_said_to_be_unsound(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    s = twin.scenario(trial)
+    wild = s.replace(velocity=s.velocity + torch.tensor([0.0, 1e5])[:, None, None] * torch.ones(1, twin.grid.nodes, 3))
+    assert Ensemble(twin)([wild])[0].sound.tolist() == [True, False]
+
+
+# Hypotheses -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("effect", library(), ids=lambda e: type(e).__name__)
+def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
+    free = type(effect).__name__ == "InitialTilt"
+    load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
+    stick = "stick" if type(effect).__name__ == "Slip" else 0.4
+    t = hollow(
+        trial,
+        loads=(load,),
+        planes=(Boundary(point=(0.0, 0.0, trial.setup.origin[2] - 1e-4), normal=(0.0, 0.0, 1.0), friction=stick),),
+        duration=0.05,
+        **({"clamps": ()} if free else {}),
+    )
+    twin = Twin(t.setup, edge=EDGE, walls=2)
+    scenario = twin.scenario(t)
+    assert effect.applies(scenario, twin) and len(effect.quantities) <= 3
+    count = len(effect.quantities)
+    zero = torch.zeros(1, count, dtype=torch.float64)
+    some = torch.tensor(effect.looks(twin)[-1][:1, :count]) * torch.tensor([q.scale for q in effect.quantities])
+    if effect.local:
+        place = torch.tensor([[0.035, 0.01, 0.015]], dtype=torch.float64)
+        zero, some = torch.cat([zero, place], 1), torch.cat([some, place], 1)
+    if effect.name == "softening":  # a range has no zero
+        zero[:, 1] = -5.0
+    still, same, other = (
+        m.place for m in Ensemble(twin)([scenario, effect(scenario, zero, twin), effect(scenario, some, twin)])
+    )
+    np.testing.assert_allclose(same, still, atol=1e-8)
+    if effect.name != "adhesion":  # nothing lifts off
+        assert np.abs(other - still).max() > 6e-8

@@ -9,17 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.loads import Drag, Force, Spring
 from torchsoro.material import Prony
 from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
-from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.scenario import Scenario, Tie
 from torchsoro.sim2real.twin import Twin
-
-
-def solid_factor(twin: Twin, factor: Tensor) -> Tensor:
-    """A factor [B] or [B, N] for particles of the solid, 1 for air."""
-    wide = factor if factor.shape[-1:] == (twin.count,) else factor.unsqueeze(-1)
-    return torch.where(twin.air, 1.0, wide)
 
 
 class Modulus(Hypothesis):
@@ -35,7 +28,7 @@ class Modulus(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """E exp(a)."""
-        return scenario.replace(stiffness=scenario.stiffness * solid_factor(twin, values[:, 0].exp()))
+        return scenario.replace(stiffness=scenario.stiffness * values[:, :1].exp())
 
 
 class Viscoelastic(Hypothesis):
@@ -70,6 +63,30 @@ class Viscoelastic(Hypothesis):
         return scenario.prony is None or scenario.prony.elements < 5
 
 
+class Stiffening(Hypothesis):
+    """The solid stiffens with stretch: mu (1 + a x + a^2 x^2), x = I1b - 3, the first terms of Gent's 1 / (1 - a x)."""
+
+    name, seam = "stiffening", "stress at large strain"
+    quantities = (Quantity("coefficient", "1", 0.3, 0.0, 10.0),)
+    starts = ((1.0,), (3.0,))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """With both terms."""
+        return scenario.replace(stiffening=scenario.stiffening + torch.cat([values, values**2], -1))
+
+
+class Softening(Hypothesis):
+    """Stress is lower below the largest stretch so far (Mullins)."""
+
+    name, seam = "softening", "stress below the largest stretch so far"
+    quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))
+    starts = tuple((d, r) for d in (1.0, 3.0) for r in (-7.0, -5.0, -3.0))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Depth and range."""
+        return scenario.replace(softening=torch.stack([values[:, 0], values[:, 1].exp()], -1))
+
+
 class Density(Hypothesis):
     """The solid is heavier or lighter than believed."""
 
@@ -83,7 +100,7 @@ class Density(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Density times exp(a)."""
-        return scenario.replace(density=scenario.density * solid_factor(twin, values[:, 0].exp()))
+        return scenario.replace(density=scenario.density * values[:, :1].exp())
 
 
 class PoissonRatio(Hypothesis):
@@ -102,83 +119,104 @@ class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 
     name, seam = "soft_side", "Young's modulus over the body"
-    quantities = tuple(Quantity(f"slope_{axis}", "1 over the body", 0.2, -5.0, 5.0) for axis in "xyz")
+    quantities = tuple(Quantity(f"slope_{axis}", "1 over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
     def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
-        """The slopes, and what of the modulus is lost from the stiffest to the softest corner of the steepest axis."""
-        lost = 1 - math.exp(-float(np.abs(values).max()))
+        """The slopes, and what a soft half has less than the other, which looks alike: 1 - exp(-2/3 of the slope)."""
+        lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
         return {**super().told(values, scenario), "fraction": (lost, "1")}
+
+    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
+        """Middle of the soft half."""
+        steepest = int(np.abs(values[:3]).argmax())
+        middle = np.array(twin.setup.center)
+        middle[steepest] -= np.sign(values[steepest]) * 0.27 * twin.setup.size[steepest]
+        return middle
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """E exp(a . xi), xi from -1/2 to 1/2 over the body's box."""
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
-        xi = ((twin.positions - low) / size - 0.5).clamp(-0.5, 0.5)
-        return scenario.replace(stiffness=scenario.stiffness * solid_factor(twin, (values @ xi.T).exp()))
+        xi = (twin.positions - low) / size - 0.5
+        return scenario.replace(stiffness=scenario.stiffness * (values @ xi.T).exp())
+
+
+class PrintOffset(Hypothesis):
+    """The chamber lies off its place across the body: walls on one side are thicker, on the other thinner."""
+
+    name, seam = "print_offset", "thickness of the walls"
+    quantities = tuple(Quantity(f"offset_{i}_m", "m", 3e-4, -10.0, 10.0) for i in ("first", "second"))
+    starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Stiffness and mass of walls grow with their thickness, the shape stays."""
+        s, x = twin.setup, twin.positions
+        longest = int(np.argmax(s.size))
+        factor = torch.ones(len(values), twin.count, dtype=torch.float64)
+        for k, axis in enumerate(a for a in range(3) if a != longest):
+            low = min(c.box[0][axis] for c in s.cavities)
+            high = max(c.box[1][axis] for c in s.cavities)
+            begin, end = low - s.origin[axis], s.origin[axis] + s.size[axis] - high
+            shift = values[:, k : k + 1]
+            below, above = (x[:, axis] < low).double(), (x[:, axis] > high).double()
+            factor = factor * (1 + below * shift / begin - above * shift / end).clamp(min=0.1)
+        return scenario.replace(stiffness=scenario.stiffness * factor, density=scenario.density * factor)
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a chamber."""
+        return scenario.pressure is not None
 
 
 class AttachedMass(Hypothesis):
     """A point mass, with its weight, somewhere on the body."""
 
-    name, seam, local = "attached_mass", "mass of the particles at a place", True
+    name, seam, local = "attached_mass", "mass at a place", True
     quantities = (Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),)
-    starts = ((0.5,), (1.5,), (4.0,))
+    starts = ((0.5,), (2.0,), (6.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Mass spread around the place."""
-        share = shares(values[:, 1:], twin)
-        return scenario.replace(density=scenario.density + values[:, :1] * share / twin.spacing**3)
+        """Mass at the place."""
+        return scenario.replace(mass=scenario.mass + values[:, :1] * twin.at(values[:, 1:]))
 
 
 class LoadInertia(Hypothesis):
     """A load that was taken for a dead force is a mass: it has inertia, too."""
 
-    name, seam = "load_inertia", "mass of the particles under a load"
+    name, seam = "load_inertia", "mass under a load"
     quantities = (Quantity("share", "1", 0.2, 0.0, 7.5),)
     starts = ((1.0,), (2.5,), (5.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """A share of the force becomes the weight of a mass."""
-        density, loads = scenario.density, []
+        mass, pushes = scenario.mass, []
         size = scenario.gravity.norm(dim=-1).amax()
-        for load in scenario.loads:
-            if isinstance(load, Force) and load.share is not None:
-                weight = torch.zeros(twin.count, dtype=torch.float64)
-                weight[load.particles] = load.share
-                mass = values[:, :1] * load.value.norm(dim=-1).amax() / size
-                density = density + mass * weight / twin.spacing**3
-                rest = (1 - values[:, 0]).reshape(-1, *[1] * load.value.ndim)
-                load = dataclasses.replace(load, value=load.value * rest)
-            loads.append(load)
-        return scenario.replace(density=density, loads=tuple(loads))
+        for push in scenario.pushes:
+            mass = mass + values * push.force.norm(dim=-1).amax() / size * push.share
+            pushes.append(dataclasses.replace(push, force=push.force * (1 - values)))
+        return scenario.replace(mass=mass, pushes=tuple(pushes))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a load."""
-        return any(isinstance(load, Force) for load in scenario.loads)
+        """With loads that are there from the start and point down, as weights do."""
+        g = scenario.gravity.reshape(-1, 3)[0]
+        down = [float(p.force @ g) > 0.99 * float(p.force.norm() * g.norm()) for p in scenario.pushes]
+        return bool(down) and all(down) and all(p.start == 0 for p in scenario.pushes)
 
 
 class Tether(Hypothesis):
-    """A spring and a dashpot hold a place of the body, as a tube does."""
+    """A spring, a dashpot and a mass at a place of the body, as a tube is."""
 
-    name, seam, local = "tether", "spring and drag at a place", True
+    name, seam, local = "tether", "spring, drag and mass at a place", True
     quantities = (
         Quantity("stiffness_n_m", "N/m", 2.0, 0.0, 1000.0),
         Quantity("damping_n_s_m", "N s/m", 0.05, 0.0, 1000.0),
+        Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),
     )
-    starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Attached at the place in the undeformed body."""
-        share, everyone = shares(values[:, 2:], twin), torch.arange(twin.count)
-        spring = Spring(particles=everyone, stiffness=values[:, 0], share=share)
-        dashpot = Drag(particles=everyone, coefficient=values[:, 1], share=share)
-        return scenario.replace(loads=(*scenario.loads, spring, dashpot))
-
-
-def shares(places: Tensor, twin: Twin) -> Tensor:
-    """What is at places [B, 3] m, over the particles [B, N], sums of 1."""
-    found = torch.zeros(len(places), twin.count, dtype=torch.float64)
-    for row, place in enumerate(places.detach().double()):
-        group, share = twin.around(place)
-        found[row, group] = share
-    return found
+        """The spring is at rest in the undeformed body."""
+        share = twin.at(values[:, 3:])
+        spring = Tie(share=share, stiffness=values[:, 0])
+        drag = scenario.drag + values[:, 1:2] * share
+        mass = scenario.mass + values[:, 2:3] * share
+        return scenario.replace(springs=(*scenario.springs, spring), drag=drag, mass=mass)

@@ -1,36 +1,27 @@
-"""Fitting an effect to recordings: Gauss-Newton on the twin, along with measurement errors, modulus and pressure."""
+"""Fitting effects to recordings: Gauss-Newton on the twin, along with measurement errors, modulus and pressure.
+
+Searches ask for simulations and wait; those of all searches are simulated together (:meth:`Problem.fit`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
-import math
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from scipy.optimize import lsq_linear
 
 from torchsoro.errors import SimulationDiverged
-from torchsoro.sim2real.body_effects import Modulus
-from torchsoro.sim2real.experiment import Experiment, Trial
+from torchsoro.kernels.lanes import LANES
 from torchsoro.sim2real.hypothesis import Hypothesis
-from torchsoro.sim2real.outer_effects import PressureGain
-from torchsoro.sim2real.residual import Band, Camera, Priors, estimate_noise
-from torchsoro.sim2real.scenario import Scenario, together
-from torchsoro.sim2real.twin import Motion, Twin
+from torchsoro.sim2real.likelihood import Effects, Likelihood, Request
+from torchsoro.sim2real.twin import Motion
 
 STEP = 0.05  # of a scale, for differences
 FIRST = 0.5  # the longest step of a search, in shares of what is there plus two scales
 
-
-@dataclass(frozen=True, kw_only=True)
-class Beliefs:
-    """What a setup's numbers are good for: standard deviations of ln of the modulus and of the pressure."""
-
-    modulus: float = 0.1
-    pressure: float = 0.05
+Search = Generator[Request, list[Motion], "Point | None"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,7 +42,7 @@ class Fit:
         point: All that was fitted by simulating, in scales.
     """
 
-    effects: tuple[Hypothesis, ...]
+    effects: Effects
     values: tuple[np.ndarray, ...]
     covariances: tuple[np.ndarray, ...]
     belief: np.ndarray
@@ -64,343 +55,9 @@ class Fit:
     point: np.ndarray
 
     @property
-    def deviations(self) -> tuple[np.ndarray, ...]:
-        """Standard deviations of the values."""
-        return tuple(np.sqrt(np.maximum(np.diag(c), 0)) for c in self.covariances)
-
-    @property
     def name(self) -> str:
         """Of the effects."""
         return " + ".join(e.name for e in self.effects) or "nothing"
-
-
-class Problem:
-    """Recordings, a twin and its error: what is needed to fit.
-
-    Args:
-        experiment: What to explain.
-        twin: Its body.
-        trials: To fit; those with a recording if None.
-        numerics: The twin's own error for each trial [M, A] m; none if None.
-        beliefs: See there.
-        priors: Of measurement errors.
-        noise: [m]; that of the setup, or estimated, if None.
-        report: Called with a line after each simulation.
-    """
-
-    def __init__(
-        self,
-        experiment: Experiment,
-        twin: Twin,
-        *,
-        trials: Sequence[Trial] | None = None,
-        numerics: Sequence[np.ndarray] | None = None,
-        beliefs: Beliefs | None = None,
-        priors: Priors | None = None,
-        noise: float | None = None,
-        report: Callable[[str], None] = lambda line: None,
-    ) -> None:
-        self.experiment, self.twin, self.report = experiment, twin, report
-        self.trials = tuple(experiment.trials if trials is None else trials)
-        recordings = [t.recording for t in self.trials if t.recording is not None]
-        self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
-        shape = recordings[0].place.shape[1:]
-        self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
-        self.camera = Camera(experiment.setup, self.trials, priors)
-        self.bands = [Band(r, self.noise, n) for r, n in zip(recordings, self.numerics, strict=True)]
-        self.scenarios = [twin.scenario(t) for t in self.trials]
-        beliefs = beliefs or Beliefs()
-        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), beliefs.modulus)]
-        if experiment.setup.cavities:
-            self.common.append((PressureGain(), beliefs.pressure))
-        self.simulations, self.seconds = 0, 0.0
-
-    # Simulating -------------------------------------------------------------------------------------------------
-
-    def scales(self, effects: Sequence[Hypothesis]) -> np.ndarray:
-        """Of all that is fitted by simulating: modulus, pressure, the effects, places."""
-        found = [deviation for _, deviation in self.common]
-        for effect in effects:
-            found += [q.scale for q in effect.quantities]
-            found += [0.1 * s for s in self.twin.setup.size] if effect.local else []
-        return np.array(found)
-
-    def bounds(self, effects: Sequence[Hypothesis]) -> tuple[np.ndarray, np.ndarray]:
-        """Of the unknowns, in scales."""
-        low, high = [-6.0] * len(self.common), [6.0] * len(self.common)
-        for effect in effects:
-            low += [q.least for q in effect.quantities]
-            high += [q.most for q in effect.quantities]
-            if effect.local:
-                s = self.twin.setup
-                low += [10 * o / z for o, z in zip(s.origin, s.size, strict=True)]
-                high += [10 * o / z + 10 for o, z in zip(s.origin, s.size, strict=True)]
-        return np.array(low), np.array(high)
-
-    def vary(self, scenario: Scenario, effects: Sequence[Hypothesis], points: np.ndarray) -> Scenario:
-        """A scenario at points [B, K], in scales."""
-        values = torch.from_numpy(points * self.scales(effects))
-        at = 0
-        for effect, _ in self.common:
-            scenario = effect(scenario, values[:, at : at + 1], self.twin)
-            at += 1
-        for effect in effects:
-            count = len(effect.quantities) + 3 * effect.local
-            part = values[:, at : at + count]
-            at += count
-            if bool((part[:, : len(effect.quantities)] != 0).any()):
-                scenario = effect(scenario, part, self.twin)
-        return scenario
-
-    def simulate(self, effects: Sequence[Hypothesis], points: np.ndarray) -> list[Motion]:
-        """Motions of all trials at points [B, K], each with a leading batch.
-
-        Raises:
-            SimulationDiverged: if one breaks down.
-        """
-        begin = time.perf_counter()
-        varied = [self.vary(s, effects, points) for s in self.scenarios]
-        whole = together(varied, len(points))
-        if whole is None:
-            found = [self.twin.simulate(s) for s in varied]
-        else:
-            found = self.twin.simulate(whole).parts(len(varied))
-        spent = time.perf_counter() - begin
-        self.simulations += len(points) * len(found)
-        self.seconds += spent
-        names = " + ".join(e.name for e in effects) or "nothing"
-        self.report(f"{names}: {len(points) * len(found)} simulations, {spent:.1f} s")
-        return found
-
-    # Fitting ----------------------------------------------------------------------------------------------------
-
-    def base(self, known: Fit | None = None) -> Point:
-        """Where effects are looked at from: what is believed, or a fit without effects, with derivatives."""
-        at = np.zeros(len(self.common)) if known is None else known.point
-        errors = np.zeros(len(self.camera.deviations)) if known is None else known.errors
-        ones = np.ones(len(at))
-        return self._linearise((), at, errors, ones, np.arange(len(at)), 1e9 * ones)
-
-    def look(self, effect: Hypothesis, base: Point) -> list[tuple[float, np.ndarray]]:
-        """How much an effect may explain, from one simulation of each of its looks and straight lines between.
-
-        Args:
-            effect: Which.
-            base: From where.
-
-        Returns:
-            For each look, best first: the misfit that it would leave, and the point to begin a search with, in scales.
-
-        Raises:
-            SimulationDiverged: if a look breaks down.
-        """
-        low, high = self.bounds([effect])
-        count, kinds = len(self.common), len(effect.quantities)
-        looks = effect.looks(self.twin)
-        points = np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in looks])
-        motions = self.simulate([effect], points)
-        left = [
-            np.concatenate(self.residual([m.alone(k) for m in motions], base.errors)[0]) for k in range(len(points))
-        ]
-        own = {type(effect)}
-        prior = [0.0 if type(e) in own else 1.0 for e, _ in self.common]
-        prior = np.concatenate([prior, 1 / self.camera.deviations])
-        known, at = np.concatenate([base.at, base.errors]), 0
-        ranked = []
-        for directions in looks:
-            n = len(directions)
-            slopes = np.stack([base.r - r for r in left[at : at + n]], 1)
-            if effect.joint:
-                # What adds up: any strength within bounds.
-                begin, reach = base.r, self._reach(directions[:, :kinds], low[count:], high[count:])
-                offset = np.zeros(n)
-            else:
-                begin, reach, offset = left[at], (np.array([-0.5]), np.array([0.5])), np.ones(1)
-            at += n
-            J = np.concatenate([slopes, base.columns, base.J], 1)
-            rows = np.concatenate([np.zeros((len(prior), n)), np.diag(prior)], 1)
-            free = np.full(len(prior), np.inf)
-            found = lsq_linear(
-                np.concatenate([J, rows]),
-                np.concatenate([begin, -prior * known]),
-                bounds=(np.concatenate([reach[0], -free]), np.concatenate([reach[1], free])),
-            )
-            strength = (offset + found.x[:n]) @ directions[:, :kinds]
-            if not effect.joint and kinds > 1:
-                # A relaxation time does not grow with the strength.
-                strength[1:] = directions[0, 1:kinds]
-            start = np.concatenate([base.at + found.x[n : n + count], strength, directions[0, kinds:]])
-            ranked.append((2 * float(found.cost), np.clip(start, low, high)))
-        return sorted(ranked, key=lambda look: look[0])
-
-    @staticmethod
-    def _reach(directions: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far directions may be scaled within bounds, and within eight times themselves."""
-        least, most = [], []
-        for d in directions:
-            k = int(np.flatnonzero(d)[0])
-            ends = sorted((low[k] / d[k], high[k] / d[k]))
-            least.append(max(ends[0], -8.0))
-            most.append(min(ends[1], 8.0))
-        return np.array(least), np.array(most)
-
-    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Whitened residuals of all trials, and their derivatives by the measurement errors."""
-        left, slopes = [], []
-        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
-            assert trial.recording is not None
-            seen, by = self.camera.see(motion, i, errors)
-            left.append(band.whiten(trial.recording.place - seen))
-            slopes.append(band.whiten(by))
-        return left, slopes
-
-    def measure(
-        self, motions: Sequence[Motion], errors: np.ndarray
-    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """The best measurement errors for motions: misfit with their priors, errors, residual, slopes."""
-        weight = 1 / self.camera.deviations
-        best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
-        for _ in range(8):
-            left, slopes = self.residual(motions, errors)
-            r, J = np.concatenate(left), np.concatenate(slopes)
-            misfit = float(r @ r + ((errors * weight) ** 2).sum())
-            if misfit < best[0]:
-                gained = best[0] - misfit
-                best = (misfit, errors, r, J)
-                if gained < 0.05:
-                    break
-            else:  # too far
-                errors = (errors + best[1]) / 2
-                continue
-            H = J.T @ J + np.diag(weight**2)
-            errors = errors + np.linalg.solve(H, J.T @ r - weight**2 * errors)
-        return best
-
-    def fit(
-        self,
-        effects: Sequence[Hypothesis] = (),
-        start: np.ndarray | None = None,
-        *,
-        errors: np.ndarray | None = None,
-        rounds: int = 25,
-    ) -> Fit:
-        """Fit effects, with modulus, pressure and measurement errors at their beliefs.
-
-        Args:
-            effects: None, one or two.
-            start: Where to begin, in scales; all zero if None.
-            errors: Measurement errors to begin with.
-            rounds: Steps at most, each a simulation of all trials. Derivatives, a simulation for each unknown, are
-                taken at the first point, at the last, and where a step gains little.
-
-        Raises:
-            SimulationDiverged: if the first point breaks down.
-        """
-        size = len(self.scales(effects))
-        low, high = self.bounds(effects)
-        at = np.zeros(size) if start is None else np.clip(np.asarray(start, float), low, high)
-        errors = np.zeros(len(self.camera.deviations)) if errors is None else errors
-        priors = np.zeros(size)
-        # The effect "modulus" is the modulus without its prior; beside it the common one has nothing to do.
-        own = {type(effect) for effect in effects}
-        held = np.zeros(size, dtype=bool)
-        for i, (effect, _) in enumerate(self.common):
-            priors[i] = 1.0
-            held[i] = type(effect) in own
-            at[i] = 0.0 if held[i] else at[i]
-        places = np.array([False] * len(self.common) + [p for e in effects for p in _marks(e)])
-        damping, moving = 1e-2, np.flatnonzero(~held)
-        current = self._linearise(effects, at, errors, priors, moving, high)
-        anew = True  # whether the derivatives are those of this point
-        for _ in range(rounds):
-            step = self._step(current, priors, held, places, low, high, damping)
-            try:
-                ahead = self._linearise(effects, current.at + step, current.errors, priors, moving[:0], high)
-            except SimulationDiverged:
-                ahead = None
-            gained = 0.0 if ahead is None else current.misfit - ahead.misfit
-            if ahead is not None and gained > 0:
-                columns = _corrected(current, ahead)
-                current, damping = dataclasses.replace(ahead, columns=columns), max(damping / 5, 1e-4)
-                settled, anew = anew and gained < max(0.5, 1e-3 * ahead.misfit), False
-                if settled:
-                    break
-            elif anew:
-                if damping > 10:
-                    break
-                damping *= 10
-                continue
-            # Derivatives that were carried along have done what they can.
-            if gained < 0.05 * current.misfit:
-                current, anew = self._linearise(effects, current.at, current.errors, priors, moving, high), True
-        if not anew:
-            current = self._linearise(effects, current.at, current.errors, priors, moving, high)
-        return self._report(effects, current, priors, held)
-
-    def _linearise(self, effects, at, errors, priors, moving, high) -> Point:
-        """The misfit at a point, and derivatives by the unknowns ``moving``."""
-        steps = np.where(at + STEP > high, -STEP, STEP)
-        motions = self.simulate(effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps]))
-        base = [m.alone(0) for m in motions]
-        misfit, errors, r, J = self.measure(base, errors)
-        columns = np.zeros((len(r), len(at)))
-        for k, i in enumerate(moving, start=1):
-            left, _ = self.residual([m.alone(k) for m in motions], errors)
-            columns[:, i] = (r - np.concatenate(left)) / steps[i]
-        misfit += float(((at * priors) ** 2).sum())
-        return Point(misfit=misfit, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
-
-    def _step(self, point: Point, priors, held, places, low, high, damping) -> np.ndarray:
-        """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""
-        weight, fixed, step = 1 / self.camera.deviations, held.copy(), np.zeros_like(point.at)
-        most = np.where(places, 1.5, FIRST * np.abs(point.at) + 2.0)
-        for _ in range(len(step)):
-            free = ~fixed
-            whole = np.concatenate([point.columns[:, free], point.J], 1)
-            prior = np.concatenate([priors[free] ** 2, weight**2])
-            H = whole.T @ whole + np.diag(prior)
-            n = int(free.sum())
-            H[np.arange(n), np.arange(n)] *= 1 + damping
-            H[np.arange(n), np.arange(n)] += 1e-6
-            g = whole.T @ point.r - prior * np.concatenate([point.at[free], point.errors])
-            step = np.zeros_like(point.at)
-            step[free] = np.linalg.solve(H, g)[:n]
-            step = np.clip(step, -most, most)
-            ahead = point.at + step
-            beyond = free & (((ahead < low) & (point.at <= low)) | ((ahead > high) & (point.at >= high)))
-            if not beyond.any():
-                break
-            fixed |= beyond
-        return np.clip(point.at + step, low, high) - point.at
-
-    def _report(self, effects, point: Point, priors, held) -> Fit:
-        left, _ = self.residual(point.motions, point.errors)
-        weight = 1 / self.camera.deviations
-        whole = np.concatenate([point.columns[:, ~held], point.J], 1)
-        H = whole.T @ whole + np.diag(np.concatenate([priors[~held] ** 2 + 1e-9, weight**2]))
-        size, n = len(point.at), int((~held).sum())
-        covariance = np.zeros((size, size))
-        covariance[np.ix_(~held, ~held)] = np.linalg.pinv(H)[:n, :n]
-        scales = self.scales(effects)
-        values, covariances, k = [], [], len(self.common)
-        for effect in effects:
-            count = len(effect.quantities) + 3 * effect.local
-            values.append(point.at[k : k + count] * scales[k : k + count])
-            covariances.append((covariance * np.outer(scales, scales))[k : k + count, k : k + count])
-            k += count
-        return Fit(
-            effects=tuple(effects),
-            values=tuple(values),
-            covariances=tuple(covariances),
-            belief=(point.at * scales)[: len(self.common)],
-            errors=point.errors,
-            misfit=point.misfit,
-            samples=sum(b.count for b in self.bands),
-            unknowns=size - len(self.common),
-            seen=tuple(self.camera.see(m, i, point.errors)[0] for i, m in enumerate(point.motions)),
-            whitened=tuple(left),
-            point=point.at,
-        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -416,9 +73,285 @@ class Point:
     motions: list[Motion]
 
 
+class Problem(Likelihood):
+    """What effects are fitted to; see :class:`Likelihood` for its arguments."""
+
+    eager = False  # whether derivatives come with every step
+
+    # Looking ----------------------------------------------------------------------------------------------------
+
+    def base(self, known: Fit | None = None) -> Point:
+        """Where effects are looked at from: what is believed, or a fit without effects, with derivatives.
+
+        Raises:
+            SimulationDiverged: if it breaks down.
+        """
+        at = np.zeros(len(self.common)) if known is None else known.point
+        errors = np.zeros(len(self.camera.deviations)) if known is None else known.errors
+        held = np.zeros(len(at), bool)
+        return self._whole(self._linearise((), at, errors, held, np.arange(len(at)), 1e9 + 0 * at))
+
+    def look(self, effects: Sequence[Hypothesis], base: Point) -> list[list[tuple[float, np.ndarray]]]:
+        """How much effects may explain, from one simulation of each of their looks and straight lines between.
+
+        Args:
+            effects: Which.
+            base: From where.
+
+        Returns:
+            For each, its looks, best first: the misfit that it would leave, and the point to begin a search with, in
+            scales. Looks that break down are left out.
+        """
+        looks = [effect.looks(self.twin) for effect in effects]
+        requests = [
+            ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in mine]))
+            for e, mine in zip(effects, looks, strict=True)
+        ]
+        simulated = self.simulate(requests)
+        return [self._rank(e, mine, motions, base) for e, mine, motions in zip(effects, looks, simulated, strict=True)]
+
+    def _rank(
+        self, effect: Hypothesis, looks: list[np.ndarray], motions: list[Motion], base: Point
+    ) -> list[tuple[float, np.ndarray]]:
+        low, high = self.bounds((effect,))
+        count, kinds = len(self.common), len(effect.quantities)
+        held = np.array([isinstance(e, type(effect)) for e, _ in self.common])
+        believed, slope = self.belief(base.at, held)
+        prior = np.concatenate([slope, 1 / self.camera.deviations])
+        known = np.concatenate([np.where(slope > 0, believed / np.where(slope > 0, slope, 1), 0), base.errors])
+        sound = np.all([m.sound for m in motions], axis=0)
+        ranked, at = [], 0
+        for directions in looks:
+            n = len(directions)
+            mine = range(at, at + n)
+            at += n
+            if not sound[list(mine)].all():
+                continue
+            left = [self.residual([m.alone(k) for m in motions], base.errors)[0] for k in mine]
+            slopes = np.stack([base.r - r for r in left], 1)
+            if effect.joint:
+                # What adds up: any strength within bounds.
+                begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:])
+                offset = np.zeros(n)
+            else:
+                begin, reach, offset = left[0], (np.array([-0.5]), np.array([0.5])), np.ones(1)
+            J = np.concatenate([slopes, base.columns, base.J], 1)
+            rows = np.concatenate([np.zeros((len(prior), n)), np.diag(prior)], 1)
+            free = np.full(len(prior), np.inf)
+            H = np.concatenate([J, rows])
+            target = np.concatenate([begin, -prior * known])
+            # Normal equations: a few dozen unknowns and thousands of samples.
+            scale = np.sqrt((H**2).sum(0)) + 1e-300
+            ridge = np.concatenate([H / scale, 1e-4 * np.eye(len(scale))])
+            root = np.asarray(np.linalg.qr(ridge, mode="r"))
+            inner = np.linalg.solve(root.T, (H / scale).T @ target)
+            found = lsq_linear(
+                root,
+                inner,
+                bounds=(np.concatenate([reach[0], -free]) * scale, np.concatenate([reach[1], free]) * scale),
+            )
+            x = found.x / scale
+            cost = 2 * float(found.cost) + float(target @ target - inner @ inner)
+            strength = (offset + x[:n]) @ directions[:, :kinds]
+            if not effect.joint and kinds > 1:
+                # A relaxation time does not grow with the strength.
+                strength[1:] = directions[0, 1:kinds]
+            common = base.at + x[n : n + count]
+            for i in np.flatnonzero(held):  # the effect takes over what the belief held
+                strength[0] += common[i] * self.common[i][1] / effect.quantities[0].scale
+                common[i] = 0.0
+            start = np.concatenate([common, strength, directions[0, kinds:]])
+            ranked.append((cost, np.clip(start, low, high)))
+        return sorted(ranked, key=lambda look: look[0])
+
+    # Fitting ----------------------------------------------------------------------------------------------------
+
+    def fit(
+        self,
+        tasks: Sequence[tuple[Effects, np.ndarray | None]],
+        *,
+        errors: np.ndarray | None = None,
+        rounds: int = 25,
+        settle: bool = True,
+    ) -> list[Fit | None]:
+        """Fit effects, with modulus, pressure and measurement errors at their beliefs; all tasks side by side.
+
+        Args:
+            tasks: Effects (none, one or two) and where to begin, in scales; all zero if None.
+            errors: Measurement errors to begin with.
+            rounds: Steps at most, each a simulation of all trials. Derivatives, a simulation for each unknown, are
+                taken at the first point, at the last, and where a step gains little.
+            settle: Take them at the last point; without it, intervals are rough.
+
+        Returns:
+            A fit of each; None where the first point breaks down.
+        """
+        given = np.zeros(len(self.camera.deviations)) if errors is None else errors
+        searches = [self._search(effects, start, given, rounds, settle) for effects, start in tasks]
+        ends: list[Point | None] = [None] * len(tasks)
+        asked = {i: next(search) for i, search in enumerate(searches)}
+        while asked:
+            order = list(asked)
+            # Derivatives are for nothing where lanes would be empty.
+            wide = sum(1 + len(self.scales(tasks[i][0])) for i in order) * len(self.trials)
+            self.eager = wide <= LANES * self.ensemble.threads
+            answers = self.simulate([asked[i] for i in order])
+            for i, motions in zip(order, answers, strict=True):
+                try:
+                    asked[i] = searches[i].send(motions)
+                except StopIteration as end:
+                    ends[i] = end.value
+                    del asked[i]
+        return [
+            None if end is None else self._report(effects, end) for (effects, _), end in zip(tasks, ends, strict=True)
+        ]
+
+    def _whole(self, search: Search) -> Point:
+        """Run one search by itself."""
+        asked = next(search)
+        try:
+            while True:
+                asked = search.send(self.simulate([asked])[0])
+        except StopIteration as end:
+            if end.value is None:
+                raise SimulationDiverged(
+                    step=0, time=0.0, particle=0, quantity="the believed motion is not finite", batch=0,
+                    remedy="a setup whose body bears its loads",
+                ) from None  # fmt: skip
+            return end.value
+
+    def _held(self, effects: Effects) -> np.ndarray:
+        """The effect "modulus" is the modulus without its belief; beside it the common one has nothing to do."""
+        held = [any(isinstance(e, type(common)) for e in effects) for common, _ in self.common]
+        return np.array(held + [False] * (len(self.scales(effects)) - len(held)))
+
+    def _search(
+        self, effects: Effects, start: np.ndarray | None, errors: np.ndarray, rounds: int, settle: bool
+    ) -> Search:
+        low, high = self.bounds(effects)
+        at = np.zeros(len(low)) if start is None else np.clip(np.asarray(start, float), low, high)
+        held = self._held(effects)
+        at = np.where(held, 0.0, at)
+        places = np.array([False] * len(self.common) + [p for e in effects for p in _marks(e)])
+        damping, moving = 1e-2, np.flatnonzero(~held)
+        current = yield from self._linearise(effects, at, errors, held, moving, high)
+        if current is None:
+            return None
+        anew = True  # whether the derivatives are those of this point
+        for _ in range(rounds):
+            step = self._step(current, held, places, low, high, damping)
+            eager = self.eager
+            ahead = yield from self._linearise(
+                effects, current.at + step, current.errors, held, moving if eager else moving[:0], high
+            )
+            gained = 0.0 if ahead is None else current.misfit - ahead.misfit
+            if ahead is not None and gained > 0:
+                if not eager:
+                    ahead = dataclasses.replace(ahead, columns=_corrected(current, ahead))
+                settled = anew and gained < max(0.5, 1e-3 * ahead.misfit)
+                current, damping, anew = ahead, max(damping / 5, 1e-4), eager
+                if settled:
+                    break
+            elif anew:
+                if damping > 10:
+                    break
+                damping *= 10
+                continue
+            # Derivatives that were carried along have done what they can.
+            if not anew and gained < 0.3 * current.misfit:
+                fresh = yield from self._linearise(effects, current.at, current.errors, held, moving, high)
+                if fresh is None:
+                    break
+                current, anew = fresh, True
+        if settle and not anew:
+            fresh = yield from self._linearise(effects, current.at, current.errors, held, moving, high)
+            current = fresh or current
+        return current
+
+    def _linearise(self, effects, at, errors, held, moving, high) -> Search:
+        """The misfit at a point, and derivatives by the unknowns ``moving``; None if it breaks down."""
+        steps = np.where(at + STEP > high, -STEP, STEP)
+        motions = yield effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
+        if not np.all([m.sound for m in motions]):
+            return None
+        base = [m.alone(0) for m in motions]
+        misfit, errors, r, J = self.measure(base, errors)
+        columns = np.zeros((len(r), len(at)))
+        for k, i in enumerate(moving, start=1):
+            left, _ = self.residual([m.alone(k) for m in motions], errors)
+            columns[:, i] = (r - left) / steps[i]
+        misfit += float((self.belief(at, held)[0] ** 2).sum())
+        return Point(misfit=misfit, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
+
+    def _step(self, point: Point, held, places, low, high, damping) -> np.ndarray:
+        """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""
+        weight, fixed, step = 1 / self.camera.deviations, held.copy(), np.zeros_like(point.at)
+        believed, slope = self.belief(point.at, held)
+        most = np.where(places, 1.5, FIRST * np.abs(point.at) + 2.0)
+        for _ in range(len(step)):
+            free = ~fixed
+            whole = np.concatenate([point.columns[:, free], point.J], 1)
+            prior = np.concatenate([slope[free] ** 2, weight**2])
+            H = whole.T @ whole + np.diag(prior)
+            n = int(free.sum())
+            H[np.arange(n), np.arange(n)] *= 1 + damping
+            H[np.arange(n), np.arange(n)] += 1e-6
+            pull = np.concatenate([slope[free] * believed[free], weight**2 * point.errors])
+            step = np.zeros_like(point.at)
+            step[free] = np.linalg.solve(H, whole.T @ point.r - pull)[:n]
+            step = np.clip(step, -most, most)
+            ahead = point.at + step
+            beyond = free & (((ahead < low) & (point.at <= low)) | ((ahead > high) & (point.at >= high)))
+            if not beyond.any():
+                break
+            fixed |= beyond
+        return np.clip(point.at + step, low, high) - point.at
+
+    def _report(self, effects: Effects, point: Point) -> Fit:
+        held = self._held(effects)
+        _, slope = self.belief(point.at, held)
+        whole = np.concatenate([point.columns[:, ~held], point.J], 1)
+        prior = np.concatenate([slope[~held] ** 2 + 1e-9, self.camera.deviations**-2])
+        size, n = len(point.at), int((~held).sum())
+        covariance = np.zeros((size, size))
+        covariance[np.ix_(~held, ~held)] = np.linalg.pinv(whole.T @ whole + np.diag(prior))[:n, :n]
+        scales = self.scales(effects)
+        values, covariances, k = [], [], len(self.common)
+        for effect in effects:
+            count = len(effect.quantities) + 3 * effect.local
+            values.append(point.at[k : k + count] * scales[k : k + count])
+            covariances.append((covariance * np.outer(scales, scales))[k : k + count, k : k + count])
+            k += count
+        cuts = np.cumsum([b.count for b in self.bands])[:-1]
+        return Fit(
+            effects=effects,
+            values=tuple(values),
+            covariances=tuple(covariances),
+            belief=(point.at * scales)[: len(self.common)],
+            errors=point.errors,
+            misfit=point.misfit,
+            samples=self.samples,
+            unknowns=size - len(self.common),
+            seen=tuple(self.camera.see(m, i, point.errors)[0] for i, m in enumerate(point.motions)),
+            whitened=tuple(np.split(point.r, cuts)),
+            point=point.at,
+        )
+
+
 def _marks(effect: Hypothesis) -> list[bool]:
     """Which of an effect's unknowns are its place."""
     return [False] * len(effect.quantities) + [True] * (3 * effect.local)
+
+
+def _reach(directions: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far directions may be scaled within bounds, and within eight times themselves."""
+    least, most = [], []
+    for d in directions:
+        k = int(np.flatnonzero(d)[0])
+        ends = sorted((low[k] / d[k], high[k] / d[k]))
+        least.append(max(ends[0], -8.0))
+        most.append(min(ends[1], 8.0))
+    return np.array(least), np.array(most)
 
 
 def _corrected(before: Point, after: Point) -> np.ndarray:

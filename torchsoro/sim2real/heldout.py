@@ -9,6 +9,7 @@ import numpy as np
 
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.twin import Motion
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,11 +38,25 @@ def predict(problem: Problem, fit: Fit, trials: Sequence[Trial], *, believed: bo
         trials: With recordings; those of the problem or others.
         believed: Simulate the setup as it is believed, but see it with the fit's measurement errors.
     """
-    there = Problem(problem.experiment, problem.twin, trials=trials, noise=problem.noise, report=problem.report)
-    effects = () if believed else fit.effects
-    point = np.zeros(len(there.common)) if believed else fit.point
-    motions = there.simulate(effects, point[None])
-    count, known = len(there.trials), fit.errors[len(problem.trials) :]
+    return predict_all(problem, [fit], trials, believed=believed)[0]
+
+
+def predict_all(
+    problem: Problem, fits: Sequence[Fit], trials: Sequence[Trial], *, believed: bool = False
+) -> list[list[Prediction]]:
+    """:func:`predict` for several fits, simulated together; nothing is predicted where it breaks down."""
+    there = problem.only(trials, slips=())
+    still = np.zeros((1, len(there.common)))
+    simulated = there.simulate([((), still) if believed else (fit.effects, fit.point[None]) for fit in fits])
+    return [
+        _seen(problem, there, fit, motions) if all(m.sound.all() for m in motions) else []
+        for fit, motions in zip(fits, simulated, strict=True)
+    ]
+
+
+def _seen(problem: Problem, there: Problem, fit: Fit, motions: Sequence[Motion]) -> list[Prediction]:
+    count = len(there.trials)
+    known = fit.errors[len(problem.trials) :][: len(there.camera.deviations) - count]
     found = []
     for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
         assert trial.recording is not None

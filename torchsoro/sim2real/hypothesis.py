@@ -84,6 +84,15 @@ class Hypothesis(nn.Module):
         """
         return {q.name: (float(v), q.unit) for q, v in zip(self.quantities, values, strict=True)}
 
+    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
+        """Where it acts [3] m, if anywhere; values [K] with the place of a local effect.
+
+        Args:
+            values: In the units of ``quantities``, then the place.
+            twin: The body.
+        """
+        return values[len(self.quantities) :] if self.local else None
+
     def looks(self, twin: Twin) -> list[np.ndarray]:
         """What to look at first: alternatives, each with directions [D, K] in scales, which add up.
 

@@ -8,7 +8,10 @@ from torchsoro.sim2real.body_effects import (
     LoadInertia,
     Modulus,
     PoissonRatio,
+    PrintOffset,
+    Softening,
     SoftSide,
+    Stiffening,
     Tether,
     Viscoelastic,
 )
@@ -20,6 +23,8 @@ from torchsoro.sim2real.outer_effects import (
     Friction,
     GravityTilt,
     InitialMotion,
+    InitialTilt,
+    Leak,
     PressureGain,
     PressureLag,
     Slip,
@@ -30,7 +35,8 @@ from torchsoro.sim2real.outer_effects import (
 def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
-        *(Viscoelastic, Modulus, SoftSide, Density, PoissonRatio, AttachedMass, Tether, LoadInertia, FluidDrag),
-        *(PressureLag, PressureGain, AirStiffness, Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion),
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density, PoissonRatio),
+        *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness),
+        *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialTilt),
     )
     return tuple(kind() for kind in kinds)

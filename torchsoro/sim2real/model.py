@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from torchsoro.sim2real.body_effects import Modulus
+from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import Setup, Trial, read_tables, read_trial, setup_of
 from torchsoro.sim2real.fit import Fit
 from torchsoro.sim2real.hypothesis import Hypothesis
@@ -31,7 +32,8 @@ class Model:
     Attributes:
         tables: Of the setup, as believed.
         setup: The same, read.
-        spacing: Of the twin's particles [m].
+        edge: Of the twin's cells [m].
+        walls: Of them through each wall, at least.
         ln_modulus: What the modulus is off.
         ln_pressure: What the pressure is off.
         effects: What was missing, with its values [K], places included.
@@ -39,7 +41,8 @@ class Model:
 
     tables: dict[str, Any]
     setup: Setup
-    spacing: float
+    edge: float
+    walls: int
     ln_modulus: float
     ln_pressure: float
     effects: tuple[tuple[Hypothesis, np.ndarray], ...]
@@ -55,17 +58,24 @@ class Model:
         return scenario
 
 
-def write_model(path: Path, setup: Path, fit: Fit, spacing: float) -> None:
+def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
     """Write a setup with a fit's findings.
 
     Args:
         path: Of the model; its folder exists.
         setup: The setup.toml that was believed, which is copied.
         fit: What was found.
-        spacing: Of the twin's particles [m].
+        twin: It was found with.
     """
     belief = [*fit.belief.tolist(), 0.0][:2]
-    lines = [_HEAD, setup.read_text(encoding="utf-8").rstrip(), "", "[model]", f"spacing = {spacing!r}"]
+    lines = [
+        _HEAD,
+        setup.read_text(encoding="utf-8").rstrip(),
+        "",
+        "[model]",
+        f"edge = {twin.edge!r}",
+        f"walls = {twin.walls}",
+    ]
     lines += [f"ln_modulus = {belief[0]!r}", f"ln_pressure = {belief[1]!r}"]
     for effect, values in zip(fit.effects, fit.values, strict=True):
         lines += ["", "[[effect]]", f"name = {json.dumps(effect.name)}"]
@@ -90,7 +100,7 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     """
     tables = read_tables(path)
     numbers, rows = tables.pop("model", None), tables.pop("effect", [])
-    wanted = {"spacing", "ln_modulus", "ln_pressure"}
+    wanted = {"edge", "walls", "ln_modulus", "ln_pressure"}
     if not isinstance(numbers, dict) or set(numbers) != wanted:
         raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
     known = {e.name: e for e in (library() if effects is None else effects)}
@@ -119,16 +129,17 @@ def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarr
         Columns of a markers.csv.
 
     Raises:
-        ValueError: if the trial cannot be read.
-        SimulationDiverged: if the simulation breaks down.
+        ValueError: if the trial cannot be read, or the simulation breaks down.
     """
     if trial.name != "trial.toml":
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
-    twin = Twin(told.setup, spacing=model.spacing)
-    motion = twin.simulate(model.apply(twin.scenario(told), twin)).alone()
-    columns = {"time_s": motion.time.numpy()}
+    twin = Twin(told.setup, edge=model.edge, walls=model.walls)
+    motion = Ensemble(twin)([model.apply(twin.scenario(told), twin)])[0].alone()
+    if not motion.sound:
+        raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
+    columns = {"time_s": motion.time}
     for m, marker in enumerate(told.setup.markers):
         for axis in told.setup.axes:
-            columns[f"{marker.name}_{'xyz'[axis]}_m"] = motion.place[:, m, axis].numpy()
+            columns[f"{marker.name}_{'xyz'[axis]}_m"] = motion.place[:, m, axis]
     return columns

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchsoro.actuation import Waveform
-from torchsoro.loads import Drag
 from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
-from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.scenario import Ground, Scenario
 from torchsoro.sim2real.twin import Twin
 
 
@@ -43,6 +43,24 @@ def _chambers(supply: Waveform) -> Tensor:
     return supply.pressure if supply.pressure.ndim > 1 else supply.pressure.unsqueeze(0)
 
 
+def lagged(scenario: Scenario, tau: Tensor) -> Waveform:
+    """The exact answer of a first-order lag [B] s to a piecewise linear supply."""
+    supply = scenario.pressure
+    assert supply is not None
+    # Even, fine samples: the lag's own exponentials are not piecewise linear.
+    time = torch.arange(0.0, scenario.duration + 4e-3, 2e-3, dtype=torch.float64)
+    p = Waveform(time=supply.time.double(), pressure=_chambers(supply).double()).at(time)
+    p = p.expand(len(tau), *p.shape[-2:])
+    ratio = 2e-3 / tau.clamp(min=1e-9)[:, None]
+    keep, early = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
+    found = [p[..., 0]]
+    for k in range(1, len(time)):
+        # Exact for a supply that changes linearly in a sample.
+        found.append(keep * found[-1] + (early - keep) * p[..., k - 1] + (1 - early) * p[..., k])
+    late = torch.where(tau[:, None, None] > 0, torch.stack(found, -1), p)
+    return Waveform(time=time, pressure=late)
+
+
 class PressureLag(Hypothesis):
     """The line fills and empties with a lag: tau p' = p_supply - p."""
 
@@ -51,24 +69,8 @@ class PressureLag(Hypothesis):
     starts = ((1.0,), (3.0,), (8.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """The exact answer of a first-order lag to the piecewise linear supply."""
-        supply = scenario.pressure
-        assert supply is not None
-        # Even, fine samples: the lag's own exponentials are not piecewise linear.
-        time = torch.arange(0.0, scenario.duration + 4e-3, 2e-3, dtype=torch.float64)
-        p = Waveform(time=supply.time.double(), pressure=_chambers(supply).double()).at(time)
-        tau = values[:, 0].clamp(min=1e-9)[:, None]
-        ratio = 2e-3 / tau
-        keep = torch.exp(-ratio)
-        early = -torch.expm1(-ratio) / ratio
-        p = p.expand(len(values), *p.shape[-2:])
-        found = [p[..., 0]]
-        for k in range(1, len(time)):
-            # Exact for a supply that changes linearly in a sample.
-            found.append(keep * found[-1] + (early - keep) * p[..., k - 1] + (1 - early) * p[..., k])
-        lagging = torch.stack(found, -1)
-        pressure = torch.where(values[:, 0, None, None] > 0, lagging, p)
-        return scenario.replace(pressure=Waveform(time=time, pressure=pressure))
+        """Late."""
+        return scenario.replace(pressure=lagged(scenario, values[:, 0]))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a chamber."""
@@ -91,18 +93,35 @@ class AirStiffness(Hypothesis):
         return scenario.pressure is not None
 
 
-class FluidDrag(Hypothesis):
-    """The surrounding fluid slows the whole body, in proportion to its velocity."""
+class Leak(Hypothesis):
+    """A part of the supply is lost behind a line that fills slowly: tau p' = (1 - a) p_supply - p."""
 
-    name, seam = "drag", "drag of the whole body"
-    quantities = (Quantity("rate", "1/s", 0.5, 0.0, 200.0),)
-    starts = ((1.0,), (4.0,), (12.0,))
+    name, seam = "leak", "chamber pressure"
+    quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
+    starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Force -rate m v, evenly over the mass."""
-        mass = torch.where(twin.inside, twin.share, 0.0) * scenario.density.reshape(-1, twin.count)[0] * twin.spacing**3
-        drag = Drag(particles=torch.arange(twin.count), coefficient=values[:, 0] * mass.sum(), share=mass / mass.sum())
-        return scenario.replace(loads=(*scenario.loads, drag))
+        """Less pressure, later."""
+        assert scenario.pressure is not None
+        less = _chambers(scenario.pressure) * (1 - values[:, 0])[:, None, None]
+        scenario = scenario.replace(pressure=dataclasses.replace(scenario.pressure, pressure=less))
+        return scenario.replace(pressure=lagged(scenario, values[:, 1]))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a chamber."""
+        return scenario.pressure is not None
+
+
+class FluidDrag(Hypothesis):
+    """The surrounding fluid slows the body, with the square of the velocity, on the area that moves through it."""
+
+    name, seam = "drag", "drag of what surrounds the body"
+    quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 1000.0),)
+    starts = ((1.0,), (5.0,), (25.0,))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Force rho c_d / 2 A v |v| along each axis."""
+        return scenario.replace(fluid=scenario.fluid + values[:, 0])
 
 
 class Slip(Hypothesis):
@@ -121,13 +140,11 @@ class Slip(Hypothesis):
         if not bool(values.any()):
             return scenario
         most = 1 / values[:, 0].clamp(min=1e-3)
-        return scenario.replace(
-            planes=tuple(dataclasses.replace(p, friction=most) if p.sticks else p for p in scenario.planes)
-        )
+        return _planes(scenario, lambda g: {"friction": most if g.friction is None else g.friction})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane that sticks."""
-        return any(p.sticks for p in scenario.planes)
+        return any(g.friction is None for g in scenario.grounds)
 
 
 class Friction(Hypothesis):
@@ -139,37 +156,33 @@ class Friction(Hypothesis):
 
     def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The coefficient."""
-        believed = next(float(torch.as_tensor(p.friction).reshape(-1)[0]) for p in scenario.planes if not p.sticks)  # pyright: ignore[reportArgumentType]
+        believed = next(float(g.friction.reshape(-1)[0]) for g in scenario.grounds if g.friction is not None)
         return {"coefficient": (believed * math.exp(values[0]), "1")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Coefficient times exp(a)."""
         factor = values[:, 0].exp()
-        return scenario.replace(
-            planes=tuple(
-                p if p.sticks else dataclasses.replace(p, friction=p.friction * factor) for p in scenario.planes
-            )  # pyright: ignore[reportOperatorIssue]
-        )
+        return _planes(scenario, lambda g: {"friction": None if g.friction is None else g.friction * factor})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane that has a coefficient."""
-        return any(not p.sticks for p in scenario.planes)
+        return any(g.friction is not None for g in scenario.grounds)
 
 
 class Adhesion(Hypothesis):
     """Planes hold the body back as it lifts off."""
 
     name, seam = "adhesion", "adhesion of the planes"
-    quantities = (Quantity("traction", "Pa", 200.0, 0.0, 1000.0),)
-    starts = ((1.0,), (5.0,))
+    quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0),)
+    starts = ((0.5,), (2.0,), (8.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Traction to overcome."""
-        return scenario.replace(planes=tuple(dataclasses.replace(p, adhesion=values[:, 0]) for p in scenario.planes))
+        return _planes(scenario, lambda g: {"adhesion": g.adhesion + values[:, 0]})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane."""
-        return bool(scenario.planes)
+        return bool(scenario.grounds)
 
 
 class WallOffset(Hypothesis):
@@ -181,12 +194,16 @@ class WallOffset(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Moved along the normal."""
-        planes = [dataclasses.replace(p, offset=p.offset + p.side * values[:, 0]) for p in scenario.planes]
-        return scenario.replace(planes=tuple(planes))
+        return _planes(scenario, lambda g: {"offset": g.offset + values[:, 0]})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane."""
-        return bool(scenario.planes)
+        return bool(scenario.grounds)
+
+
+def _planes(scenario: Scenario, change: Callable[[Ground], dict[str, Tensor | None]]) -> Scenario:
+    """A scenario with other numbers for its planes."""
+    return scenario.replace(grounds=tuple(dataclasses.replace(g, **change(g)) for g in scenario.grounds))
 
 
 class GravityTilt(Hypothesis):
@@ -207,15 +224,7 @@ class GravityTilt(Hypothesis):
         first, second = (a for a in range(3) if a != axis)
         turn = torch.zeros(len(values), 3, dtype=torch.float64)
         turn[:, first], turn[:, second] = values[:, 0], values[:, 1]
-        angle = turn.norm(dim=-1, keepdim=True).clamp(min=1e-12)
-        k = turn / angle
-        g = g.expand(len(values), 3)
-        turned = (
-            g * angle.cos()
-            + torch.cross(k, g, dim=-1) * angle.sin()
-            + k * (k * g).sum(-1, keepdim=True) * (1 - angle.cos())
-        )
-        return scenario.replace(gravity=turned)
+        return scenario.replace(gravity=turned(g, turn))
 
 
 class InitialMotion(Hypothesis):
@@ -231,8 +240,38 @@ class InitialMotion(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Of the whole body; for a clamped one, as of its farthest points, less near the clamp."""
-        velocity = scenario.velocity
-        shape = torch.ones(twin.count, dtype=torch.float64)
+        shape = torch.ones(twin.grid.nodes, dtype=torch.float64)
         for axis, side in twin.faces:
-            shape = shape * (twin.depth(axis, side) / twin.setup.size[axis]).clamp(0, 1) ** 2
-        return scenario.replace(velocity=velocity + values[:, None, :] * shape[:, None])
+            shape = shape * (twin.depth(twin.places, axis, side) / twin.setup.size[axis]).clamp(0, 1) ** 2
+        return scenario.replace(velocity=scenario.velocity + values[:, None, :] * shape[:, None])
+
+
+class InitialTilt(Hypothesis):
+    """A free body is turned at the start."""
+
+    name, seam = "initial_tilt", "direction of the body at the start"
+    quantities = tuple(Quantity(f"about_{axis}", "rad", 0.03, -20.0, 20.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """The turn, and its size."""
+        return {**super().told(values, scenario), "angle_rad": (float(np.linalg.norm(values)), "rad")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Turned about its centre; what is behind a plane then is moved out."""
+        arms = twin.places - torch.tensor(twin.setup.center, dtype=torch.float64)
+        moved = turned(arms, values[:, None]) - arms
+        return scenario.replace(displacement=scenario.displacement + moved)
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a body that nothing holds."""
+        return not twin.held.any()
+
+
+def turned(v: Tensor, turn: Tensor) -> Tensor:
+    """Vectors [..., 3] rotated by vectors [..., 3] rad."""
+    angle = turn.norm(dim=-1, keepdim=True)
+    k = turn / angle.clamp(min=1e-12)
+    v, k = torch.broadcast_tensors(v, k)
+    along = (k * v).sum(-1, keepdim=True)
+    return v * angle.cos() + torch.cross(k, v, dim=-1) * angle.sin() + k * along * (1 - angle.cos())

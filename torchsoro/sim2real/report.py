@@ -21,8 +21,7 @@ from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.heldout import Prediction
 from torchsoro.sim2real.numerics import Numerics
-from torchsoro.sim2real.scenario import Scenario
-from torchsoro.sim2real.verdict import Candidate, Verdict
+from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
@@ -57,9 +56,9 @@ class Explanation:
         return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.nothing
 
 
-def effect_rows(candidate: Candidate, weight: float, scenario: Scenario) -> list[dict[str, Any]]:
+def effect_rows(candidate: Candidate, weight: float, problem: Problem) -> list[dict[str, Any]]:
     """The effects of a candidate, as in explanation.json; intervals by the law of errors, within bounds."""
-    wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
+    wide, rows, scenario = float(norm.ppf((1 + LEVEL) / 2)), [], problem.scenarios[0]
     fit = candidate.fit
     spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
@@ -75,12 +74,13 @@ def effect_rows(candidate: Candidate, weight: float, scenario: Scenario) -> list
             for quantity in effect.quantities:
                 if quantity.name == name:
                     parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
+        place = effect.place(values, problem.twin)
         rows.append(
             {
                 "name": effect.name,
                 "parameters": parameters,
                 "confidence": weight,
-                "location_m": [float(v) for v in values[count:]] if effect.local else None,
+                "location_m": None if place is None else [float(v) for v in place],
                 "time_window_s": None,
             }
         )
@@ -97,10 +97,9 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
     def errors(predictions: Sequence[Prediction]) -> dict[str, Any]:
         return {p.trial: {"all": p.total, **dict(zip(names, map(float, p.error), strict=True))} for p in predictions}
 
-    kept = set(e.heldout)
     return {
         "verdict": v.kind,
-        "effects": effect_rows(v.chosen[0], float(weights[0]), problem.scenarios[0]) if v.chosen else [],
+        "effects": effect_rows(v.chosen[0], float(weights[0]), problem) if v.chosen else [],
         "set": [c.fit.name for c in v.chosen],
         "ranking": [
             {
@@ -108,7 +107,11 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "score": c.score,
                 "explained": c.explained,
                 "misfit": c.fit.misfit,
-                "effects": effect_rows(c, 0.0, problem.scenarios[0]),
+                "samples": c.fit.samples,
+                "unknowns": c.fit.unknowns,
+                "alike": correlation(c.fit),
+                "heldout_over_nothing": None if math.isnan(c.kept) else c.kept,
+                "effects": effect_rows(c, 0.0, problem),
             }
             for c in v.ranking
         ],
@@ -117,9 +120,10 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
             "numerics_m": {
                 t.name: float(np.sqrt((n**2).mean())) for t, n in zip(problem.trials, problem.numerics, strict=True)
             },
-            "spacings_m": list(e.numerics.spacings),
-            "cells_through_thinnest_wall": e.numerics.cells,
+            "edges_m": list(e.numerics.edges),
+            "cells_through_thinnest_wall": e.numerics.walls,
             "excess": v.excess,
+            "nothing": {"misfit": v.nothing.misfit, "samples": v.nothing.samples, "alike": correlation(v.nothing)},
         },
         "nuisance": {
             "ln_modulus": float(e.best.belief[0]),
@@ -128,12 +132,8 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         },
         "error_before": errors(e.before),
         "error_after": errors(e.after),
-        "heldout": [
-            {"trial": b.trial, "before": b.total, "after": a.total}
-            for b, a in zip(e.before, e.after, strict=True)
-            if b.trial in kept
-        ],
-        "cost": {"simulations": problem.simulations, "seconds": e.seconds},
+        "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
+        "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),
         "settings": dict(settings),
     }
@@ -142,12 +142,12 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
 def lead(e: Explanation) -> str:
     """The answer in plain words."""
     v = e.verdict
-    held = [(b.total, a.total) for b, a in zip(e.before, e.after, strict=True) if b.trial in e.heldout]
+    held = list(v.heldout.values())
     gain = ""
     if held:
         before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
         gain = (
-            f" On the trials that were not used ({', '.join(e.heldout)}) the error is {1e3 * after:.2f} mm instead of "
+            f" On trials that were left out ({', '.join(v.heldout)}) the error is {1e3 * after:.2f} mm instead of "
             f"{1e3 * before:.2f} mm."
         )
     if v.kind == "nothing_missing":
@@ -163,7 +163,7 @@ def lead(e: Explanation) -> str:
             else ""
         )
         return f"Something is missing that is none of the known effects.{tried}{gain}"
-    parts = "; ".join(_said(c, e.problem.scenarios[0]) for c in v.chosen)
+    parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
         return f"One of these is missing, and this recording cannot tell which: {parts}.{gain}"
     second = next((c for c in v.ranking if c is not v.chosen[0]), None)
@@ -176,9 +176,9 @@ def lead(e: Explanation) -> str:
     return f"Missing is {parts}.{gain}{lost}"
 
 
-def _said(candidate: Candidate, scenario: Scenario) -> str:
+def _said(candidate: Candidate, problem: Problem) -> str:
     parts = []
-    for row in effect_rows(candidate, 0.0, scenario):
+    for row in effect_rows(candidate, 0.0, problem):
         numbers = ", ".join(
             f"{name} {p['value']:.3g} {p['unit']} (90 %: {p['low']:.3g} to {p['high']:.3g})"
             for name, p in row["parameters"].items()
@@ -216,7 +216,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
             "score": c.score,
             "of the difference [%]": 100 * c.explained,
             "misfit / samples": c.fit.misfit / c.fit.samples,
-            "parameters": _said(c, e.problem.scenarios[0]),
+            "parameters": _said(c, e.problem),
         }
         for c in e.verdict.ranking
     ]
@@ -238,10 +238,10 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     page.section("What is not physics")
     noise = data["noise"]
     page.text(
-        f"Noise {1e3 * noise['standard_deviation_m']:.3f} mm. The simulation's own error, from twins of "
-        f"{', '.join(f'{1e3 * s:.2f}' for s in e.numerics.spacings)} mm between particles: "
+        f"Noise {1e3 * noise['standard_deviation_m']:.3f} mm. The simulation's own error, from twins with cells of "
+        f"{', '.join(f'{1e3 * s:.2f}' for s in e.numerics.edges)} mm: "
         + ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
-        + f". {e.numerics.cells:.1f} cells through the thinnest wall."
+        + f". {e.numerics.walls} cells through the thinnest wall."
     )
     deviations = dict(zip(e.problem.camera.names, e.problem.camera.deviations, strict=True))
     page.table(
@@ -250,7 +250,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
             for name, value in data["nuisance"].items()
         ]
     )
-    page.text(f"{e.problem.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")
+    page.text(f"{e.problem.tally.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")
     page.save(out / "report.html")
 
 
@@ -297,7 +297,7 @@ def draw_where(e: Explanation, trials: Sequence[Trial]) -> Figure:
             label = ("before", "after")[number]
             panel.scatter(1e3 * at[:, i], 1e3 * at[:, j], s=sizes, color=color, alpha=0.55, label=label)
         for c in e.verdict.chosen:
-            for row in effect_rows(c, 0.0, e.problem.scenarios[0]):
+            for row in effect_rows(c, 0.0, e.problem):
                 if row["location_m"] is not None:
                     place = 1e3 * np.array(row["location_m"])
                     panel.plot(place[i], place[j], "x", ms=11, mew=2.5, color="#a3154a", label=row["name"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,12 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import solve_triangular
+from scipy.optimize import linear_sum_assignment
 
-from torchsoro.sim2real.experiment import Setup, Trial
+from torchsoro.sim2real.experiment import Experiment, Setup, Trial
 from torchsoro.sim2real.recording import Recording
 from torchsoro.sim2real.twin import Motion
 
-CORRELATION = 0.03  # s over which the twin's own error lasts
+CORRELATION = 0.03  # s over which the twin's own error lasts, and a part of the noise
+LASTING = 0.25  # of the variance of the noise
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,38 +31,64 @@ class Priors:
         metres: The same where the recording is in metres.
         rotation: Of the recording's frame about each axis [rad].
         place: Of a marker, along each axis [m].
+        slip: Of a marker that has slipped, along each axis [m].
     """
 
     clock: float = 0.01
-    rate: float = 0.002
+    rate: float = 0.005
     scale: float = 0.02
-    metres: float = 0.002
+    metres: float = 0.01
     rotation: float = 0.01
     place: float = 0.0007
+    slip: float = 0.003
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slip:
+    """A marker that moves on the body during a recording.
+
+    Attributes:
+        trial: Its name.
+        marker: Number of the marker.
+        start: When [s], by the recording's clock; it is over 10 ms later.
+    """
+
+    trial: str
+    marker: int
+    start: float
+
+    def course(self, time: np.ndarray) -> np.ndarray:
+        """Share of the way [T]."""
+        return np.clip((time - self.start) / 0.01, 0.0, 1.0)
 
 
 class Camera:
     """From motions of all trials to what would have been recorded, and its derivatives by the measurement errors.
 
     The errors are one vector: a clock offset for each trial; clock rate, ln of the scale, rotation about x, y, z; then
-    the displacement of each marker in the undeformed body.
+    the displacement of each marker in the undeformed body; then of each slip, as recorded.
 
     Args:
         setup: Of the experiment.
         trials: With recordings.
         priors: Of the errors.
+        slips: Markers that have slipped.
     """
 
-    def __init__(self, setup: Setup, trials: Sequence[Trial], priors: Priors | None = None) -> None:
+    def __init__(
+        self, setup: Setup, trials: Sequence[Trial], priors: Priors | None = None, slips: Sequence[Slip] = ()
+    ) -> None:
         priors = priors or Priors()
-        self.setup, self.trials = setup, tuple(trials)
+        self.setup, self.trials, self.slips = setup, tuple(trials), tuple(slips)
         self.markers = len(setup.markers)
         scale = priors.scale if setup.kind == "video" else priors.metres
         common = [priors.rate, scale, *[priors.rotation] * 3, *[priors.place] * (3 * self.markers)]
+        common += [priors.slip] * (3 * len(slips))
         self.deviations = np.array([priors.clock] * len(trials) + common)
         self.names = [f"clock_{t.name}_s" for t in trials]
         self.names += ["clock_rate", "ln_scale", *(f"rotation_{a}_rad" for a in "xyz")]
         self.names += [f"{m.name}_{a}_m" for m in setup.markers for a in "xyz"]
+        self.names += [f"slip_{s.trial}_{setup.markers[s.marker].name}_{a}_m" for s in slips for a in "xyz"]
 
     def see(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """What trial ``number`` would have recorded.
@@ -76,7 +105,8 @@ class Camera:
         assert recording is not None
         count = len(self.trials)
         rate, ln_scale = errors[count : count + 2]
-        turn, place = errors[count + 2 : count + 5], errors[count + 5 :].reshape(self.markers, 3)
+        own_errors = count + 5 + 3 * self.markers
+        turn, place = errors[count + 2 : count + 5], errors[count + 5 : own_errors].reshape(self.markers, 3)
         clock = recording.time - errors[number]
         own = np.clip(clock / (1 + rate), 0.0, float(motion.time[-1]))
         x, v, gradient = _at(motion, own)
@@ -96,17 +126,23 @@ class Camera:
         moved = scale * np.einsum("ia,tmaj->tmij", R, gradient)
         for m in range(self.markers):
             by[:, m, :, count + 5 + 3 * m : count + 8 + 3 * m] = moved[:, m]
+        for k, slip in enumerate(self.slips):
+            if slip.trial == self.trials[number].name:
+                first, course = own_errors + 3 * k, slip.course(recording.time)
+                seen[:, slip.marker] += course[:, None] * errors[first : first + 3]
+                for axis in range(3):
+                    by[:, slip.marker, axis, first + axis] = course
         axes = list(self.setup.axes)
         return seen[:, :, axes], by[:, :, axes]
 
 
 def _at(motion: Motion, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places, velocities and deformation gradients at times."""
-    t = motion.time.numpy()
-    spline = CubicHermiteSpline(t, motion.place.numpy(), motion.velocity.numpy())
+    t = motion.time
+    spline = CubicHermiteSpline(t, motion.place, motion.velocity)
     at = np.clip(np.searchsorted(t, time, side="right") - 1, 0, len(t) - 2)
     share = ((time - t[at]) / (t[at + 1] - t[at]))[:, None, None, None]
-    gradient = motion.gradient.numpy()
+    gradient = motion.gradient
     return spline(time), spline(time, 1), (1 - share) * gradient[at] + share * gradient[at + 1]
 
 
@@ -121,7 +157,7 @@ def _rotation(turn: np.ndarray) -> np.ndarray:
 
 
 class Band:
-    """How far residuals may be off: white noise, and what the twin's numerics get wrong, which lasts for a while.
+    """How far residuals may be off: noise, and what the twin's numerics get wrong; both may last for a while.
 
     Args:
         recording: Of the trial.
@@ -130,27 +166,101 @@ class Band:
     """
 
     def __init__(self, recording: Recording, noise: float, numerics: np.ndarray) -> None:
-        self.channels = []
         lag = np.abs(recording.time[:, None] - recording.time[None, :])
         alike = np.exp(-lag / CORRELATION)
+        self.channels: list[tuple[np.ndarray, list[tuple[int, int]], np.ndarray]] = []
+        known: dict[tuple[bytes, float], int] = {}
         for m, a in np.ndindex(*numerics.shape):
             rows = np.flatnonzero(recording.seen[:, m, a])
-            covariance = noise**2 * np.eye(len(rows)) + numerics[m, a] ** 2 * alike[np.ix_(rows, rows)]
-            self.channels.append((m, a, rows, np.linalg.cholesky(covariance)))
-        self.count = sum(len(rows) for _, _, rows, _ in self.channels)
+            key = rows.tobytes(), float(numerics[m, a])
+            if key in known:
+                self.channels[known[key]][1].append((m, a))
+                continue
+            known[key] = len(self.channels)
+            lasting = LASTING * noise**2 + numerics[m, a] ** 2
+            covariance = (1 - LASTING) * noise**2 * np.eye(len(rows)) + lasting * alike[np.ix_(rows, rows)]
+            root = np.linalg.cholesky(covariance)
+            self.channels.append((rows, [(m, a)], solve_triangular(root, np.eye(len(rows)), lower=True)))
+        self.count = sum(len(rows) * len(pairs) for rows, pairs, _ in self.channels)
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Divide by what may be: [T, M, A, ...] to [samples, ...], of variance 1 if nothing is wrong."""
         parts = []
-        for m, a, rows, root in self.channels:
-            v = values[rows, m, a]
-            parts.append(solve_triangular(root, v.reshape(len(rows), -1), lower=True).reshape(v.shape))
+        for rows, pairs, inverse in self.channels:
+            v = np.stack([values[rows, m, a] for m, a in pairs])
+            flat = inverse @ v.reshape(len(pairs), len(rows), -1)
+            parts.append(flat.reshape(-1, *values.shape[3:]))
         return np.concatenate(parts)
 
-    @property
-    def logarithm(self) -> float:
-        """Ln of the determinant of the covariance."""
-        return 2 * sum(float(np.log(np.diag(root)).sum()) for *_, root in self.channels)
+
+def find_slips(trials: Sequence[Trial], bands: Sequence[Band], left: Sequence[np.ndarray]) -> list[Slip]:
+    """The marker whose slipping would explain most of what is left, if that is half of it all.
+
+    Args:
+        trials: With recordings.
+        bands: How far residuals may be off, of each trial.
+        left: Residuals of each trial [T, M, A] m, not whitened.
+    """
+    markers = left[0].shape[1]
+    gains = np.zeros((len(trials), markers))
+    starts = np.zeros((len(trials), markers))
+    excess = 0.0
+    for i, (trial, band, r) in enumerate(zip(trials, bands, left, strict=True)):
+        assert trial.recording is not None
+        time = trial.recording.time
+        tried = np.linspace(time[0], time[-1], 62)[1:-1]
+        courses = np.stack([Slip(trial=trial.name, marker=0, start=t).course(time) for t in tried], -1)
+        found = np.zeros((markers, len(tried)))
+        for rows, pairs, inverse in band.channels:
+            steps = inverse @ courses[rows]
+            ones = (inverse @ np.ones(len(rows)))[:, None]
+            # Apart from where the marker is from the start on.
+            steps = steps - ones * (ones.T @ steps) / float((ones**2).sum())
+            for m, a in pairs:
+                white = inverse @ r[rows, m, a]
+                excess += float(white @ white) - len(rows)
+                white = white - ones[:, 0] * float(ones[:, 0] @ white) / float((ones**2).sum())
+                found[m] += (steps.T @ white) ** 2 / ((steps**2).sum(0) + 1e-9)
+        gains[i], starts[i] = found.max(1), tried[found.argmax(1)]
+    marker = int(gains.sum(0).argmax())
+    if gains[:, marker].sum() < max(100.0, 0.5 * excess):
+        return []
+    return [
+        Slip(trial=t.name, marker=marker, start=float(starts[i, marker]) - 0.005)
+        for i, t in enumerate(trials)
+        if gains[i, marker] > 30
+    ]
+
+
+def reordered(experiment: Experiment) -> tuple[Experiment, str]:
+    """The experiment with the columns of markers that were confused put right, and what was, in words.
+
+    Only where recordings begin with the body as it is stated, and the stated order is far off.
+    """
+    setup = experiment.setup
+    recordings = [t.recording for t in experiment.trials if t.recording is not None]
+    stated = np.array([m.at for m in setup.markers])[:, list(setup.axes)]
+    first = [np.nanmean(r.place[:5], axis=0) for r in recordings if np.isfinite(r.place[:5]).any(0).all()]
+    if not first:
+        return experiment, ""
+    away = np.linalg.norm(stated[:, None] - np.mean(first, axis=0)[None], axis=-1)
+    _, order = linear_sum_assignment(away)
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    if not len(moved) or away[moved, order[moved]].sum() > 0.4 * away[moved, moved].sum():
+        return experiment, ""
+
+    def right(trial: Trial) -> Trial:
+        if trial.recording is None:
+            return trial
+        return dataclasses.replace(
+            trial, recording=dataclasses.replace(trial.recording, place=trial.recording.place[:, order])
+        )
+
+    names = ", ".join(setup.markers[i].name for i in moved)
+    put = dataclasses.replace(
+        experiment, trials=tuple(map(right, experiment.trials)), heldout=tuple(map(right, experiment.heldout))
+    )
+    return put, f"columns of {names} were confused"
 
 
 def estimate_noise(recordings: Sequence[Recording]) -> float:

@@ -1,4 +1,4 @@
-"""The twin: a setup's body as particles, and what acts on it, as one scenario that hypotheses may change."""
+"""The twin: a setup's body on a grid that fits it, and what acts on it, as one scenario that hypotheses may change."""
 
 from __future__ import annotations
 
@@ -7,25 +7,14 @@ import itertools
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.contact import Plane
-from torchsoro.loads import Force
-from torchsoro.material import VOID_DRAG, Body, Gas, Prony, Solid
+from torchsoro.material import Prony
 from torchsoro.sim2real.experiment import Boundary, Box, Setup, Trial
-from torchsoro.sim2real.scenario import Scenario
-from torchsoro.simulator import Simulator
-
-BEHIND = 4  # layers of particles behind the face of a clamp, two cells
-# Nodes in a clamp are held half a cell in front of its face, and the strain of a spline rises only slowly from there: a
-# bar acts as one that is 0.29 cells shorter. The first cell in front of a clamp is softer by this factor, which gives
-# bars of 3 to 6 cells across the frequency of their true length.
-SOFTER = 0.61
-FILLER = 3e3  # of chambers [Pa], as in Gas
-# Of chambers [kg/m3]: a thousandth of the body, but the filler's waves are no faster than those of a soft solid.
-AIR = 8.0
-SAMPLE = 2.5e-3  # s between two samples, between which motion is a cubic
+from torchsoro.sim2real.grid import Axis, Grid, divide
+from torchsoro.sim2real.scenario import Ground, Push, Scenario
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,19 +26,14 @@ class Motion:
         place: [..., S, M, 3] m.
         velocity: [..., S, M, 3] m/s.
         gradient: Deformation gradient at the markers [..., S, M, 3, 3].
-        dt: Substep [s].
+        dt: Largest substep [s].
     """
 
-    time: Tensor
-    place: Tensor
-    velocity: Tensor
-    gradient: Tensor
+    time: np.ndarray
+    place: np.ndarray
+    velocity: np.ndarray
+    gradient: np.ndarray
     dt: float
-
-    def parts(self, count: int) -> list[Motion]:
-        """Equal parts of a batch."""
-        cut = {name: getattr(self, name).chunk(count) for name in ("place", "velocity", "gradient")}
-        return [dataclasses.replace(self, **{name: c[i] for name, c in cut.items()}) for i in range(count)]
 
     def alone(self, number: int = 0) -> Motion:
         """One of a batch."""
@@ -59,340 +43,164 @@ class Motion:
             self, place=self.place[number], velocity=self.velocity[number], gradient=self.gradient[number]
         )
 
+    @property
+    def sound(self) -> np.ndarray:
+        """Which of a batch did not break down, bool [...]."""
+        return np.asarray((np.isfinite(self.place) & (np.abs(self.place) < 1e3)).all((-3, -2, -1)))
+
 
 class Twin:
-    """A body of particles on a lattice, clamped, with chambers, and markers that move with it.
-
-    Boxes are filled exactly: a particle on a face that is no lattice plane has the share of mass that lies within the
-    body, and the share of stiffness that gives it the bending stiffness of the box.
+    """A body on a grid, clamped, with chambers, and markers that move with it.
 
     Args:
         setup: What is believed.
-        spacing: Of the particles, half a cell [m].
-        device: To simulate on.
+        edge: Of a cell, about [m]; walls around chambers, and chambers, have more cells if they need them.
+        walls: Cells through each wall around a chamber, at least.
+        across: Cells across a body without a chamber, at least.
 
     Raises:
-        ValueError: for a clamp that is not a whole face, a plane that is not parallel to the axes, a chamber that does
-            not fit, or a body with a mesh.
+        ValueError: for a clamp that holds no part of a face, a chamber that does not lie inside the body, or a body
+            with a mesh.
     """
 
-    def __init__(
-        self,
-        setup: Setup,
-        *,
-        spacing: float,
-        device: str | torch.device = "cpu",
-    ) -> None:
+    def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
         if setup.mesh is not None:
             raise ValueError(f"setup: body of {setup.mesh.name}, wanted a box")
-        self.setup, self.spacing = setup, spacing
-        self.device = torch.device(device)
-        self.faces = [_face(box, setup) for box in setup.clamps]
-        low, counts = self._lattice()
-        self.low, self.counts = low, counts
-        axes = [a + (torch.arange(n, dtype=torch.float64) + 0.5) * spacing for a, n in zip(low, counts, strict=True)]
-        places = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        body = [list(setup.origin), [o + s for o, s in zip(setup.origin, setup.size, strict=True)]]
-        for axis, side in self.faces:  # what a clamp holds goes on behind it
-            body[side > 0][axis] += side * BEHIND * spacing
-        share = _overlap(places, spacing, (tuple(body[0]), tuple(body[1])))  # type: ignore[arg-type]
-        chamber = torch.full((len(places),), -1, dtype=torch.int32)
-        for number, cavity in enumerate(setup.cavities):
-            within = _overlap(places, spacing, cavity.box) > 0.5
-            if not bool(within.any()):
+        self.setup, self.edge, self.walls = setup, edge, walls
+        axes = []
+        for axis in range(3):
+            begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
+            inner = sorted({c.box[side][axis] for c in setup.cavities for side in (0, 1)})
+            if inner and not begin < inner[0] < inner[-1] < end:
                 raise ValueError(
-                    f"chamber {cavity.name!r}: narrower than a particle of {spacing:g} m, wanted a finer twin"
+                    f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
+                    f"{end:g} m, within the body"
                 )
-            chamber[within] = number
-        keep = share > 1e-3
-        self.positions, self.chamber = places[keep], chamber[keep]
-        self.air = self.chamber >= 0
-        self.share = torch.where(self.air, 1.0, share[keep])
-        self.stiff = torch.where(self.air, 1.0, share[keep] * self._bending())
-        self.softer = torch.ones_like(self.share)
-        for axis, side in self.faces:
-            depth = self.depth(axis, side)
-            self.softer = torch.where((depth > 0) & (depth < 2 * spacing), SOFTER, self.softer)
-        self.probes, self.weights, self.slopes = self._markers(torch.tensor([m.at for m in setup.markers]).double())
+            breaks = [begin, *inner, end]
+            # Two walls that share a node would pull at each other across the chamber.
+            least = [walls] * (len(breaks) - 1) if inner else [across]
+            axes.append(Axis(divide(breaks, least, edge)))
+        x, y, z = axes
+        self.grid = Grid((x, y, z), [c.box for c in setup.cavities])
+        self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]
+        self.held = np.zeros(self.grid.nodes, bool)
+        tiny = 1e-9
+        for low, high in setup.clamps:
+            on = ((self.grid.places > np.array(low) - tiny) & (self.grid.places < np.array(high) + tiny)).all(-1)
+            self.held |= on
+        if setup.clamps and not self.held.any():
+            raise ValueError(f"clamp: boxes {setup.clamps}, wanted one that holds a part of the body")
 
     @property
     def count(self) -> int:
-        """Number of particles."""
-        return len(self.positions)
-
-    def face(self, axis: int, side: int) -> float:
-        """Where a face of the body is along its axis [m]."""
-        return self.setup.origin[axis] + (self.setup.size[axis] if side > 0 else 0.0)
-
-    def depth(self, axis: int, side: int) -> Tensor:
-        """How far particles are in front of a face, within the body [N] m."""
-        return side * (self.face(axis, side) - self.positions[:, axis])
+        """Number of points."""
+        return len(self.grid.points)
 
     @property
-    def inside(self) -> Tensor:
-        """Particles of the body proper: not behind a clamp, no air; bool [N]."""
+    def positions(self) -> Tensor:
+        """Points of the body [P, 3] m."""
+        return torch.from_numpy(self.grid.points)
+
+    @property
+    def volumes(self) -> Tensor:
+        """Of the points [P] m3."""
+        return torch.from_numpy(self.grid.volumes)
+
+    @property
+    def places(self) -> Tensor:
+        """Of the nodes [n, 3] m; values there of a linear field are its coefficients."""
+        return torch.from_numpy(self.grid.places)
+
+    def depth(self, places: Tensor, axis: int, side: int) -> Tensor:
+        """How far places [..., 3] are in front of a face, within the body [m]."""
+        face = self.setup.origin[axis] + (self.setup.size[axis] if side > 0 else 0.0)
+        return side * (face - places[..., axis])
+
+    def nodal(self, amounts: Tensor) -> Tensor:
+        """Amounts [..., P] at the points, over the nodes [..., n]."""
+        return torch.from_numpy(self.grid.collect(amounts.numpy()))
+
+    def at(self, places: Tensor) -> Tensor:
+        """Shares of the nodes [B, n] of what is attached at places [B, 3] m, the nearest of the body."""
         low = torch.tensor(self.setup.origin, dtype=torch.float64)
-        size = torch.tensor(self.setup.size, dtype=torch.float64)
-        x = self.positions
-        rim = 0.4999 * self.spacing  # the middle of a cut particle may lie outside
-        return ((x > low - rim) & (x < low + size + rim)).all(-1) & ~self.air
+        inside = torch.minimum(torch.maximum(places, low), low + torch.tensor(self.setup.size, dtype=torch.float64))
+        nodes, weights, _ = (torch.from_numpy(a) for a in self.grid.stencil(inside.numpy()))
+        return torch.zeros(len(places), self.grid.nodes, dtype=torch.float64).scatter_add(1, nodes, weights)
 
-    def _bending(self) -> Tensor:
-        """Factor for the stiffness of outer particles that are cut on both sides alike [N].
-
-        The stiffness of a cut particle acts in its middle, outside of the body, and would stiffen a bar of seven and a
-        half layers by 4 %.
-        """
-        factor = torch.ones(len(self.positions), dtype=torch.float64)
-        h = self.spacing
-        for axis in range(3):
-            begin, size = self.setup.origin[axis], self.setup.size[axis]
-            z = (self.positions[:, axis] - begin - size / 2) / h
-            half = size / h / 2
-            outer = z.abs() + 0.5 > half + 1e-6
-            if any(a == axis for a, _ in self.faces) or not bool(outer.any()):
-                continue
-            layers = torch.unique(z.round(decimals=6))
-            rim = layers.abs() + 0.5 > half + 1e-6
-            if int(rim.sum()) != 2 or abs(float(layers.sum())) > 1e-6:
-                continue
-            second = layers**2 + 1 / 12
-            cut = float(half + 0.5 - layers.abs().max())
-            wanted = (2 * half) ** 3 / 12 - float(second[~rim].sum())
-            factor = torch.where(outer, factor * wanted / float(second[rim].sum()) / cut, factor)
-        return factor
-
-    def _lattice(self) -> tuple[list[float], list[int]]:
-        """Lower corner and counts of a lattice around the body: on the faces of clamps and chambers where possible."""
-        s, h = self.setup, self.spacing
-        low, counts = [], []
-        for axis in range(3):
-            clamped = [side for a, side in self.faces if a == axis]
-            begin, end = s.origin[axis], s.origin[axis] + s.size[axis]
-            anchor = end if 1 in clamped else begin
-            exact = abs(s.size[axis] / h - round(s.size[axis] / h)) < 1e-6
-            if not clamped and not s.cavities:
-                # Both faces are alike.
-                anchor = begin if exact else (begin + end) / 2 - h * math.ceil(s.size[axis] / h) / 2
-            before = math.ceil((anchor - begin) / h - 1e-6) if anchor > begin else 0
-            first = anchor - h * max(before, 0)
-            if first > begin + 1e-9:
-                first -= h
-            if -1 in clamped:
-                first = begin - BEHIND * h
-            if 1 in clamped:
-                end = end + BEHIND * h
-                # Whole cells from the clamp.
-                layers = math.ceil((end - first) / h - 1e-6)
-                first -= (layers % 2) * h
-            low.append(first)
-            counts.append(math.ceil((end - first) / h - 1e-6))
-        return low, counts
-
-    def _markers(self, at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Eight particles around or beside each marker [M, 8], their weights, and the slopes of those [M, 8, 3]."""
-        nx, ny, nz = self.counts
-        number = torch.full((nx * ny * nz,), -1, dtype=torch.int64)
-        low = torch.tensor(self.low, dtype=torch.float64)
-        grid = ((self.positions - low) / self.spacing - 0.5).round().long()
-        number[(grid[:, 0] * ny + grid[:, 1]) * nz + grid[:, 2]] = torch.arange(len(grid))
-        corners = torch.tensor(list(itertools.product((0, 1), repeat=3)))
-        there = number.view(nx, ny, nz)
-        probes, weights, slopes = [], [], []
-        for point in at:
-            exact = (point - low) / self.spacing - 0.5
-            corner = exact.floor().long()
-            for axis, n in enumerate(self.counts):
-                corner[axis] = corner[axis].clamp(0, n - 2)
-            # A cell of eight particles that are there, the nearest.
-            best, far = None, math.inf
-            for offset in itertools.product((0, -1, 1, -2, 2), repeat=3):
-                c = corner + torch.tensor(offset)
-                if bool((c < 0).any()) or bool((c > torch.tensor(self.counts) - 2).any()):
-                    continue
-                ids = there[tuple((c + corners).T)]
-                if bool((ids < 0).any()) or bool(self.air[ids].any()):
-                    continue
-                away = float(((c + 0.5 - exact) ** 2).sum())
-                if away < far:
-                    best, far = (c, ids), away
-            if best is None:
-                raise ValueError(f"marker at {point.tolist()} m: no part of the body beside it")
-            c, ids = best
-            t = exact - c
-            factor = torch.where(corners == 1, t, 1 - t)
-            sign = torch.where(corners == 1, 1.0, -1.0).double() / self.spacing
-            probes.append(ids)
-            weights.append(factor.prod(-1))
-            slopes.append(
-                torch.stack([sign[:, a] * factor[:, [b for b in range(3) if b != a]].prod(-1) for a in range(3)], -1)
-            )
-        return torch.stack(probes), torch.stack(weights), torch.stack(slopes)
-
-    def group(self, box: Box) -> tuple[Tensor, Tensor]:
-        """Particles of a box and their shares, whose centre is that of the box.
-
-        Raises:
-            ValueError: if the body has no particle there.
-        """
-        weight = torch.where(self.air, 0.0, _overlap(self.positions, self.spacing, box) * self.share)
-        middle = torch.tensor([(a + b) / 2 for a, b in zip(*box, strict=True)], dtype=torch.float64)
-        return self._centred(weight, middle, f"box = {box}")
-
-    def around(self, place: Tensor, radius: float | None = None) -> tuple[Tensor, Tensor]:
-        """Solid particles within a radius [m] (1.5 spacings if None) of a place, and their shares, centred on it."""
-        radius = 1.5 * self.spacing if radius is None else radius
-        off = (self.positions - place).norm(dim=-1)
-        near = torch.where(self.inside, off, torch.inf)
-        reach = max(radius, float(near.min()) + 0.8 * self.spacing)
-        weight = (1 - (off / reach) ** 2).clamp(min=0) * self.inside
-        return self._centred(weight * self.share, place, f"place = {place.tolist()}")
-
-    def _centred(self, weight: Tensor, middle: Tensor, what: str) -> tuple[Tensor, Tensor]:
-        """Shares near to the weights, not negative, whose centre is as near to the middle as possible."""
-        group = (weight > 0).nonzero().squeeze(1)
-        if len(group) == 0:
-            raise ValueError(f"{what}: no part of the body, wanted a place within it")
-        w, x = weight[group] / weight[group].sum(), (self.positions[group] - middle) / self.spacing
-        for _ in range(50):
-            lever = torch.cat([torch.ones_like(x[:, :1]), x], 1)
-            lack = torch.tensor([1.0, 0, 0, 0], dtype=torch.float64) - w @ lever
-            if float(lack.abs().max()) < 1e-9:
-                break
-            w = (w * (1 + lever @ torch.linalg.pinv(lever.T @ (w[:, None] * lever)) @ lack)).clamp(min=0)
-        return group, w / w.sum()
+    def marks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes [M, 27] of the markers, and weights and slopes [M, 27, 4]: they move with the nearest surface point."""
+        at = np.array([m.at for m in self.setup.markers], float)
+        low = np.array(self.setup.origin)
+        on = np.clip(at, low, low + np.array(self.setup.size))
+        nodes, weights, slopes = self.grid.stencil(on)
+        off = np.einsum("mka,ma->mk", slopes, at - on)
+        return nodes, np.concatenate([(weights + off)[..., None], slopes], -1)
 
     def scenario(self, trial: Trial) -> Scenario:
         """What is believed about a trial."""
         s = trial.setup
-        solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
         prony = None
         if s.prony:
             pairs = torch.tensor(s.prony, dtype=torch.float64)
             prony = Prony(moduli=pairs[:, 0].clone(), times=pairs[:, 1].clone())
-        loads = []
-        for load in s.loads:
-            particles, share = self.group(load.box)
-            force = torch.tensor(load.force, dtype=torch.float64)
-            if load.start > 0:
-                times = torch.tensor([load.start - 1e-6, load.start], dtype=torch.float64)
-                loads.append(Force(particles=particles, value=torch.stack([0 * force, force]), time=times, share=share))
-            else:
-                loads.append(Force(particles=particles, value=force, share=share))
         center = torch.tensor(s.center, dtype=torch.float64)
-        spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.count, 3)
-        start = torch.tensor(s.velocity, dtype=torch.float64) + torch.cross(spin, self.positions - center, dim=-1)
-        filler = FILLER * 2 * (1 + s.poisson_ratio)
+        spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.grid.nodes, 3)
+        nodes = self.grid.nodes
         return Scenario(
-            stiffness=torch.where(self.air, filler, solid.youngs_modulus * self.stiff * self.softer),
+            stiffness=torch.full((self.count,), s.youngs_modulus, dtype=torch.float64),
             poisson_ratio=torch.tensor(s.poisson_ratio, dtype=torch.float64),
-            density=torch.where(self.air, AIR, solid.density * self.share),
+            density=torch.full((self.count,), s.density, dtype=torch.float64),
             prony=prony,
-            viscosity=torch.zeros(self.count, dtype=torch.float64),
+            stiffening=torch.zeros(2, dtype=torch.float64),
+            softening=torch.tensor([0.0, 1.0], dtype=torch.float64),
             air_stiffness=torch.tensor([c.air_stiffness for c in s.cavities], dtype=torch.float64),
             pressure=trial.pressure,
             gravity=torch.tensor(s.gravity, dtype=torch.float64),
-            velocity=start,
-            planes=tuple(_plane(p) for p in s.planes),
-            loads=tuple(loads),
+            displacement=torch.zeros(nodes, 3, dtype=torch.float64),
+            velocity=torch.tensor(s.velocity, dtype=torch.float64) + torch.cross(spin, self.places - center, dim=-1),
+            mass=torch.zeros(nodes, dtype=torch.float64),
+            drag=torch.zeros(nodes, dtype=torch.float64),
+            fluid=torch.zeros((), dtype=torch.float64),
+            grounds=tuple(_ground(p) for p in s.planes),
+            pushes=tuple(
+                Push(
+                    share=torch.from_numpy(self.grid.within(load.box)),
+                    force=torch.tensor(load.force, dtype=torch.float64),
+                    start=load.start,
+                )
+                for load in s.loads
+            ),
+            springs=(),
             duration=s.duration,
         )
 
-    def body(self, s: Scenario) -> Body:
-        """Particles of a scenario, float32."""
-        nu = s.poisson_ratio.unsqueeze(-1)
-        volume = self.spacing**3
-        bulk, shear = s.stiffness / (3 * (1 - 2 * nu)), s.stiffness / (2 * (1 + nu))
-        if self.setup.cavities:
-            lost = s.air_stiffness[..., self.chamber.clamp(min=0).long()]
-            bulk = torch.where(self.air, lost, bulk)
-        drag = torch.where(self.air, VOID_DRAG * AIR * volume, 0.0)
-        like = {"dtype": torch.float32, "device": self.device}
-        return Body(
-            position=self.positions.to(**like),
-            mass=(s.density * volume).to(**like),
-            volume=torch.full((self.count,), volume, **like),
-            bulk=bulk.to(**like),
-            shear=shear.to(**like),
-            chamber=self.chamber.to(self.device),
-            velocity=s.velocity.to(**like),
-            viscosity=torch.where(self.air, Gas().viscosity, s.viscosity).to(**like),
-            drag=drag.to(**like) if bool(self.air.any()) else None,
-        )
 
-    def simulate(self, s: Scenario) -> Motion:
-        """Simulate a scenario.
-
-        Args:
-            s: What to simulate.
-
-        Raises:
-            SimulationDiverged: if it breaks down.
-        """
-        body = self.body(s)
-        cell = 2 * self.spacing
-        low = self.positions.amin(0) - 0.5
-        high = self.positions.amax(0) + 0.5
-        simulator = Simulator(cell=cell, dt="auto", low=low.tolist(), high=high.tolist(), formulation="total")
-        held = []
-        for axis, side in self.faces:
-            face = self.face(axis, side)
-            # The body is on the side away from the clamp; the first node in front of its face is held, too.
-            held += [
-                Plane(axis=axis, offset=face - side * (0.51 - i) * cell, side=-side, adhesion=1e12) for i in range(3)
-            ]
-        count = math.ceil(s.duration / SAMPLE)
-        with torch.no_grad():
-            seen = simulator(
-                body,
-                duration=count * SAMPLE,
-                prony=s.prony,
-                pressure=s.pressure,
-                gravity=s.gravity,
-                planes=(*held, *s.planes),
-                loads=[dataclasses.replace(load, particles=load.particles.to(self.device)) for load in s.loads],
-                sample_every=SAMPLE,
-                probes=self.probes.flatten(),
-            )
-        shape = (*seen.position.shape[:-2], len(self.setup.markers), 8, 3)
-        x, v = (t.double().cpu().reshape(shape) for t in (seen.position, seen.velocity))
-        return Motion(
-            time=seen.time.cpu(),
-            place=torch.einsum("...mkc,mk->...mc", x, self.weights),
-            velocity=torch.einsum("...mkc,mk->...mc", v, self.weights),
-            gradient=torch.einsum("...mkc,mkd->...mcd", x, self.slopes),
-            dt=seen.dt,
-        )
-
-
-def _overlap(places: Tensor, spacing: float, box: Box) -> Tensor:
-    """Share of each particle's cube that lies in a box [N]."""
-    low, high = (torch.tensor(corner, dtype=torch.float64) for corner in box)
-    begin, end = torch.maximum(places - spacing / 2, low), torch.minimum(places + spacing / 2, high)
-    return ((end - begin) / spacing).clamp(min=0).prod(-1)
-
-
-def _face(box: Box, setup: Setup) -> tuple[int, int]:
-    """Axis and side of the face of the body that a clamp covers."""
+def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
+    """Axis and side of the face of the body that a clamp covers; None if it holds another part."""
     low, high = box
     thin = 1e-9
-    for axis in range(3):
+    for axis, side in itertools.product(range(3), (-1, 1)):
         others = [a for a in range(3) if a != axis]
         begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
         covers = all(
             low[a] <= setup.origin[a] + thin and high[a] >= setup.origin[a] + setup.size[a] - thin for a in others
         )
-        if covers and low[axis] <= begin + thin < high[axis] < end:
-            return axis, -1
-        if covers and begin < low[axis] < end - thin <= high[axis]:
-            return axis, 1
-    raise ValueError(f"clamp: box = {box}, wanted one that holds a whole face of the body")
+        face = end if side > 0 else begin
+        if covers and low[axis] <= face + thin and high[axis] >= face - thin:
+            return axis, side
+    return None
 
 
-def _plane(plane: Boundary) -> Plane:
+def _ground(plane: Boundary) -> Ground:
     normal = torch.tensor(plane.normal, dtype=torch.float64)
-    unit = normal / normal.norm()
-    axis = int(unit.abs().argmax())
-    if float(unit.abs()[axis]) < 1 - 1e-9:
-        raise ValueError(f"plane: normal = {plane.normal}, wanted one along x, y or z (tilt gravity instead)")
-    return Plane(axis=axis, offset=plane.point[axis], side=1 if float(unit[axis]) > 0 else -1, friction=plane.friction)
+    size = float(normal.norm())
+    if not size > 0 or not math.isfinite(size):
+        raise ValueError(f"plane: normal = {plane.normal}, wanted one that is not zero")
+    unit = normal / size
+    zero = torch.zeros((), dtype=torch.float64)
+    return Ground(
+        normal=unit,
+        offset=unit @ torch.tensor(plane.point, dtype=torch.float64),
+        friction=None if isinstance(plane.friction, str) else zero + plane.friction,
+        adhesion=zero,
+    )

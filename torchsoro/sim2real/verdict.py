@@ -1,24 +1,51 @@
-"""From recordings to a verdict: screen all effects, fit the likely ones, and say what can be said."""
+"""From recordings to a verdict: look at all effects, fit the likely ones, and say what can be said."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from torchsoro.errors import SimulationDiverged
+from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.heldout import predict_all
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
+from torchsoro.sim2real.residual import find_slips
 
-KEPT = 5  # effects that are fitted, of those that look best
-STARTS = 2  # of each, from looks that differ
-MARGIN = 6.0  # of the score, within which two effects are not told apart
-ALARM = 12.0  # of the score, below which nothing is missing
-ENOUGH = 0.5  # of the misfit that an explanation takes away, at least
-BEYOND = 4.0  # times what noise and numerics explain, above which something is left
+KEPT = 6  # searches that are led to their end, of those that do best at first
+STARTS = 3  # of each effect, from looks that differ
+FAR = 3.0  # times what noise and numerics explain, above which searches begin with the beginning
+EARLY = (0.12, 0.35)  # of the trials
+BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
+TRIED = 4  # rounds of searches before the best are chosen
+FAINT = 4.0  # of the score that a look promises, below which nothing is fitted
+ROUNDS = 12  # of a search
+
+
+Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """What decides; from a batch of cases with known answers that was made for this.
+
+    Attributes:
+        alarm: Score below which nothing is missing.
+        margin: Of the score, within which two effects are not told apart.
+        beyond: Times what noise and numerics explain, above which something is left.
+        share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
+        lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
+    """
+
+    alarm: float = 20.0
+    margin: float = 6.0
+    beyond: float = 4.0
+    share: float = 0.75
+    lost: float = 0.93
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,13 +54,17 @@ class Candidate:
 
     Attributes:
         fit: The best of it.
-        score: What it gains in ln of the likelihood, studentised, less what its parameters are worth.
+        score: What it gains in ln of the likelihood over nothing, less what its parameters are worth. Residuals of a
+            wrong model are neither white nor of the variance that was thought: the gain counts in units of what the
+            best effect leaves, and neighbouring samples that are alike count once.
         explained: Share of the misfit beyond noise and numerics that it takes away.
+        kept: Error on trials that were left out over that without an effect; not a number where none was.
     """
 
     fit: Fit
     score: float
     explained: float
+    kept: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,27 +73,40 @@ class Verdict:
 
     Attributes:
         kind: "explained", "nothing_missing", "unknown_physics" or "cannot_distinguish".
+        problem: With the slips of markers that were found.
         nothing: The fit without any effect.
         ranking: The effects that were fitted, best first.
         chosen: The effects that explain the difference: one, or several that cannot be told apart.
         excess: What is left over what noise and numerics explain, for the best effect: 1 if nothing is left.
+        heldout: Of trials that were left out, the error as believed and with the best effect [m].
     """
 
     kind: str
+    problem: Problem
     nothing: Fit
     ranking: tuple[Candidate, ...]
     chosen: tuple[Candidate, ...] = field(default=())
     excess: float = 1.0
+    heldout: dict[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def judge(
-    problem: Problem, effects: Sequence[Hypothesis] | None = None, *, report: Callable[[str], None] = print
+    problem: Problem,
+    effects: Sequence[Hypothesis] | None = None,
+    *,
+    kept: Sequence[Trial] = (),
+    thresholds: Thresholds | None = None,
+    budget: float = 600.0,
+    report: Callable[[str], None] = print,
 ) -> Verdict:
     """Find what was left out.
 
     Args:
         problem: Recordings and twin.
         effects: What is thought of; the library if None.
+        kept: Trials that are only predicted. Without any, one of three or more is predicted from the others.
+        thresholds: What decides.
+        budget: Time that this may take, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
     """
     effects = [
@@ -70,53 +114,113 @@ def judge(
         for effect in (library() if effects is None else effects)
         if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
     ]
-    nothing = problem.fit(rounds=8)
-    report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
-    bases = [problem.base()]
-    if nothing.misfit < 0.8 * bases[0].misfit:
-        bases.append(problem.base(nothing))
-    looks: list[tuple[float, Hypothesis, np.ndarray]] = []
-    for effect in effects:
-        mine: list[tuple[float, np.ndarray]] = []
-        for base in bases:
-            try:
-                mine += problem.look(effect, base)
-            except SimulationDiverged as error:
-                report(f"{effect.name}: {error}")
-        looks += [(misfit, effect, start) for misfit, start in mine]
-        if mine:
-            report(f"{effect.name}: would leave {min(m for m, _ in mine):.0f}")
-    found = []
-    for effect, starts in _likely(looks):
-        best: Fit | None = None
-        for start in starts:
-            try:
-                fit = problem.fit([effect], start, errors=nothing.errors, rounds=20)
-            except SimulationDiverged as error:
-                report(f"{effect.name}: {error}")
-                continue
-            best = fit if best is None or fit.misfit < best.misfit else best
-        if best is not None:
-            found.append(rate(best, nothing))
-            report(f"{effect.name}: misfit {best.misfit:.0f}, {tell(best)}")
-    found.sort(key=lambda c: -c.score)
-    return decide(nothing, found)
+    problem, nothing = _nothing(problem, [((), None)], report)
+    begin = problem.tally
+    each = begin.seconds / max(begin.simulations, 1) * len(problem.trials)
+    most = int(np.clip(0.3 * budget / (10 * each), KEPT, len(effects)))
+    carried: list[Task] = []
+    if nothing.misfit > FAR * nothing.samples:
+        # Nothing is linear here, but less is wrong at first, where a wrong frequency is not yet a wrong phase.
+        carried = _from_the_beginning(problem, effects, most)
+        problem, nothing = _nothing(problem, [((), None), *(t for t in carried if not t[0])], report)
+    tasks = [t for t in carried if t[0]]
+    if not tasks:
+        looks = _looks(problem, nothing, effects)
+        for effect in effects:
+            mine = [misfit for misfit, e, _ in looks if e is effect]
+            report(f"{effect.name}: would leave {min(mine):.0f}" if mine else f"{effect.name}: breaks down")
+        tasks = _likely(looks, nothing, most)
+    tried = []
+    if len(tasks) > KEPT:
+        tried = [f for f in problem.fit(tasks, errors=nothing.errors, rounds=TRIED, settle=False) if f is not None]
+        tried.sort(key=lambda fit: fit.misfit)
+        behind = tried[0].misfit + BEHIND * max(nothing.misfit - tried[0].misfit, 0.0)
+        tasks = [(f.effects, f.point) for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
+    best: dict[str, Fit] = {}
+    for fit in [*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]]:
+        if fit is not None and (fit.name not in best or fit.misfit < best[fit.name].misfit):
+            best[fit.name] = fit
+    found = rank(list(best.values()), nothing)
+    found, heldout = _proved(problem, nothing, found, kept)
+    for c in found:
+        report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
+    verdict = decide(problem, nothing, found, thresholds or Thresholds())
+    shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
+    return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
 
 
-def _likely(
-    looks: Sequence[tuple[float, Hypothesis, np.ndarray]],
-) -> list[tuple[Hypothesis, list[np.ndarray]]]:
-    """The effects that look best, and where to begin: at the best look, and at the best one elsewhere or otherwise."""
-    likely: dict[str, tuple[Hypothesis, list[np.ndarray]]] = {}
-    for _, effect, start in sorted(looks, key=lambda look: look[0]):
-        if effect.name not in likely and len(likely) < KEPT:
-            likely[effect.name] = (effect, [start])
-        elif effect.name in likely and len(likely[effect.name][1]) < STARTS:
+def _looks(problem: Problem, nothing: Fit, effects: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, np.ndarray]]:
+    """What each effect's looks would leave, and where to begin a search; from nothing, and from what is believed."""
+    bases = [problem.base(nothing)]
+    if nothing.misfit > FAR * nothing.samples:
+        bases.append(problem.base())
+    looks = []
+    for base in bases:
+        for effect, ranked in zip(effects, problem.look(effects, base), strict=True):
+            looks += [(misfit, effect, start) for misfit, start in ranked]
+    return looks
+
+
+def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: int) -> list[Task]:
+    """Where searches end that see more and more of the trials: that for nothing, and the best for each effect."""
+    carried: list[Task] = [((), None)]
+    for share in EARLY:
+        early = problem.early(share)
+        if min(len(t.recording.time) for t in early.trials if t.recording) < 8:
+            continue
+        still = [f for f in early.fit([t for t in carried if not t[0]], rounds=8) if f is not None]
+        if not still:
+            continue
+        nothing = still[0]
+        tasks = [*(t for t in carried if t[0]), *_likely(_looks(early, nothing, effects), nothing, most)]
+        ends = [f for f in early.fit(tasks, errors=nothing.errors, rounds=6, settle=False) if f is not None]
+        ends.sort(key=lambda fit: fit.misfit)
+        found: dict[str, Fit] = {}
+        for fit in ends:
+            found.setdefault(fit.name, fit)
+        carried = [((), nothing.point), *((f.effects, f.point) for f in found.values())]
+    return carried
+
+
+def _nothing(problem: Problem, tasks: Sequence[Task], report: Callable[[str], None]) -> tuple[Problem, Fit]:
+    """The fit without effects, and the problem with slips of markers where they explain most of what is left."""
+    while True:
+        ends = [f for f in problem.fit(tasks, rounds=8) if f is not None]
+        if not ends:
+            raise ValueError("setup: its simulation breaks down, wanted a body that bears what acts on it")
+        nothing = min(ends, key=lambda fit: fit.misfit)
+        report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
+        left = [t.recording.place - seen for t, seen in zip(problem.trials, nothing.seen, strict=True) if t.recording]
+        slips = [] if problem.slips else find_slips(problem.trials, problem.bands, left)
+        if not slips:
+            return problem, nothing
+        name = problem.experiment.setup.markers[slips[0].marker].name
+        report(f"marker {name} slips in trials {', '.join(s.trial for s in slips)}")
+        problem = problem.only(problem.trials, slips)
+
+
+def _likely(looks: Sequence[tuple[float, Hypothesis, np.ndarray]], nothing: Fit, most: int) -> list[Task]:
+    """Where to begin searches: each effect that promises something at its best look, then at others that differ."""
+    unit = max(1.0, nothing.misfit / nothing.samples) * correlation(nothing)
+    first: list[Task] = []
+    more: list[Task] = []
+    known: dict[str, list[np.ndarray]] = {}
+    for misfit, effect, start in sorted(looks, key=lambda look: look[0]):
+        faint = nothing.misfit - misfit < 2 * FAINT * unit
+        if faint and nothing.misfit < 2 * nothing.samples:
+            continue
+        mine = known.setdefault(effect.name, [])
+        if not mine:
+            first.append(((effect,), start))
+        elif len(mine) < STARTS:
             scale = np.where(np.abs(start) > 1, np.abs(start), 1.0)
-            known = likely[effect.name][1]
-            if all((np.abs(start - k) / scale).max() > 0.4 for k in known):
-                known.append(start)
-    return list(likely.values())
+            if not all((np.abs(start - k) / scale).max() > 0.4 for k in mine):
+                continue
+            more.append(((effect,), start))
+        else:
+            continue
+        mine.append(start)
+    return [*first, *more][:most]
 
 
 def tell(fit: Fit) -> str:
@@ -129,18 +233,23 @@ def tell(fit: Fit) -> str:
     return ", ".join(parts)
 
 
-def rate(fit: Fit, nothing: Fit) -> Candidate:
-    """Score an effect.
-
-    Residuals of a wrong model are neither white nor of the variance that was thought: the gain in misfit counts in
-    units of what is left, and neighbouring samples that are alike count once.
-    """
-    inflation = correlation(fit)
-    count = fit.samples / inflation
-    spread = max(1.0, fit.misfit / fit.samples)
-    gain = (nothing.misfit - fit.misfit) / (2 * spread * inflation)
-    explained = (nothing.misfit - fit.misfit) / max(nothing.misfit - fit.samples, 1.0)
-    return Candidate(fit=fit, score=gain - 0.5 * fit.unknowns * math.log(count), explained=min(explained, 1.0))
+def rank(fits: Sequence[Fit], nothing: Fit) -> list[Candidate]:
+    """Score fits, best first."""
+    if not fits:
+        return []
+    best = min(fits, key=lambda fit: fit.misfit)
+    alike = correlation(best)
+    unit = 2 * max(1.0, best.misfit / best.samples) * alike
+    worth = 0.5 * math.log(best.samples / alike)
+    found = [
+        Candidate(
+            fit=fit,
+            score=(nothing.misfit - fit.misfit) / unit - fit.unknowns * worth,
+            explained=(nothing.misfit - fit.misfit) / max(nothing.misfit - fit.samples, 1.0),
+        )
+        for fit in fits
+    ]
+    return sorted(found, key=lambda c: -c.score)
 
 
 def correlation(fit: Fit) -> float:
@@ -153,21 +262,48 @@ def correlation(fit: Fit) -> float:
     return (1 + rho) / (1 - rho)
 
 
-def decide(nothing: Fit, found: Sequence[Candidate]) -> Verdict:
+def _proved(
+    problem: Problem, nothing: Fit, found: list[Candidate], kept: Sequence[Trial]
+) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]]]:
+    """The candidates near the best with their error on trials left out; and by name, errors as believed and with it."""
+    near = [c for c in found[:3] if c.score > 0 and c.score > 0.5 * found[0].score]
+    fits, where, trials = [nothing, *(c.fit for c in near)], problem, list(kept)
+    if not kept:
+        if len(problem.trials) < 3:
+            return found, {}
+        trials, where = [problem.trials[-1]], problem.only(problem.trials[:-1])
+        errors = np.delete(nothing.errors, len(problem.trials) - 1)
+        again = where.fit([(f.effects, f.point) for f in fits], errors=errors, rounds=4)
+        fits = [new or old for new, old in zip(again, fits, strict=True)]
+        if any(new is None for new in again):
+            return found, {}
+    # Nothing is what is within beliefs.
+    fits[0] = dataclasses.replace(fits[0], point=np.clip(fits[0].point, -1, 1))
+    told = predict_all(where, fits, trials)
+    believed = predict_all(where, fits[:1], trials, believed=True)[0]
+    if not told[0] or not believed:
+        return found, {}
+    heldout = {
+        fit.name: {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
+        for fit, row in zip(fits, told, strict=True)
+    }
+    totals = [math.sqrt(sum(p.total**2 for p in row)) if row else math.inf for row in told]
+    proved = {id(c): t / totals[0] for c, t in zip(near, totals[1:], strict=True)}
+    return [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found], heldout
+
+
+def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], t: Thresholds) -> Verdict:
     """The verdict on a ranking."""
-    best = found[0] if found else None
+    believed = [c for c in found if not c.kept > t.lost]
+    best = believed[0] if believed else None
     excess = nothing.misfit / nothing.samples
-    if best is None or best.score < ALARM:
-        unseen = best is None or excess < BEYOND
-        return Verdict(
-            kind="nothing_missing" if unseen else "unknown_physics",
-            nothing=nothing,
-            ranking=tuple(found),
-            excess=excess,
-        )
+    common = {"problem": problem, "nothing": nothing, "ranking": tuple(found)}
+    if best is None or best.score < t.alarm:
+        unseen = best is None or excess < t.beyond
+        return Verdict(kind="nothing_missing" if unseen else "unknown_physics", excess=excess, **common)
     left = best.fit.misfit / best.fit.samples
-    if left > BEYOND and best.explained < 1 - ENOUGH / 2:
-        return Verdict(kind="unknown_physics", nothing=nothing, ranking=tuple(found), excess=left)
-    close = tuple(c for c in found if c.score > best.score - MARGIN)
+    if left > t.beyond and best.explained < t.share:
+        return Verdict(kind="unknown_physics", excess=left, **common)
+    close = tuple(c for c in believed if c.score > best.score - t.margin)
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
-    return Verdict(kind=kind, nothing=nothing, ranking=tuple(found), chosen=close, excess=left)
+    return Verdict(kind=kind, chosen=close, excess=left, **common)

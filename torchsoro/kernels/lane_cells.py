@@ -1,0 +1,232 @@
+"""What a cell of the lattice does in sixteen variations at once: gradients, stress, forces.
+
+A cell's eight points share its 27 nodes, and weights are products by axis: gradients are found, and forces summed, axis
+by axis. A node has 48 numbers: x of all lanes, y, z. Arrays are flat and taken apart by slices, within which the
+compiler sees that nothing overlaps; what it does not see through it does not do for all lanes at once. The stress laws
+are those of ``stress``, with ln J and J^(-2/3) as series.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+CRUSHED = 0.05  # least volume ratio that the stress laws feel
+
+fast = njit(fastmath=True, boundscheck=False, error_model="numpy", nogil=True, cache=True)
+f32 = np.float32
+
+
+@fast
+def gather(d, corner, sx, sy, Wx, Wy, Wz, Sx, Sy, Sz, Z, Y, G):
+    """Gradient of a nodal field at the eight points of a cell: G [8, derivative, 48]; Z and Y are for its own use."""
+    w00, w01, w02, w10, w11, w12 = Wz[0, 0], Wz[0, 1], Wz[0, 2], Wz[1, 0], Wz[1, 1], Wz[1, 2]
+    s00, s01, s02, s10, s11, s12 = Sz[0, 0], Sz[0, 1], Sz[0, 2], Sz[1, 0], Sz[1, 1], Sz[1, 2]
+    for i in range(3):
+        for j in range(3):
+            at = 48 * (corner + i * sx + j * sy)
+            a, o = d[at : at + 144], Z[192 * (3 * i + j) : 192 * (3 * i + j) + 192]
+            for q in range(48):
+                a0, a1, a2 = a[q], a[48 + q], a[96 + q]
+                o[q] = w00 * a0 + w01 * a1 + w02 * a2
+                o[48 + q] = w10 * a0 + w11 * a1 + w12 * a2
+                o[96 + q] = s00 * a0 + s01 * a1 + s02 * a2
+                o[144 + q] = s10 * a0 + s11 * a1 + s12 * a2
+    w00, w01, w02, w10, w11, w12 = Wy[0, 0], Wy[0, 1], Wy[0, 2], Wy[1, 0], Wy[1, 1], Wy[1, 2]
+    s00, s01, s02, s10, s11, s12 = Sy[0, 0], Sy[0, 1], Sy[0, 2], Sy[1, 0], Sy[1, 1], Sy[1, 2]
+    for i in range(3):
+        for z in range(2):
+            a = Z[576 * i + 48 * z : 576 * i + 48 * z + 528]
+            o = Y[576 * i + 144 * z : 576 * i + 144 * z + 432]
+            for q in range(48):
+                a0, a1, a2, b0, b1, b2 = a[q], a[192 + q], a[384 + q], a[96 + q], a[288 + q], a[480 + q]
+                o[q] = w00 * a0 + w01 * a1 + w02 * a2
+                o[48 + q] = s00 * a0 + s01 * a1 + s02 * a2
+                o[96 + q] = w00 * b0 + w01 * b1 + w02 * b2
+                o[288 + q] = w10 * a0 + w11 * a1 + w12 * a2
+                o[336 + q] = s10 * a0 + s11 * a1 + s12 * a2
+                o[384 + q] = w10 * b0 + w11 * b1 + w12 * b2
+    w00, w01, w02, w10, w11, w12 = Wx[0, 0], Wx[0, 1], Wx[0, 2], Wx[1, 0], Wx[1, 1], Wx[1, 2]
+    s00, s01, s02, s10, s11, s12 = Sx[0, 0], Sx[0, 1], Sx[0, 2], Sx[1, 0], Sx[1, 1], Sx[1, 2]
+    for r in range(4):
+        a, o = Y[144 * r : 144 * r + 1296], G[144 * r : 144 * r + 720]
+        for q in range(48):
+            a0, a1, a2 = a[q], a[576 + q], a[1152 + q]
+            o[q] = s00 * a0 + s01 * a1 + s02 * a2
+            o[576 + q] = s10 * a0 + s11 * a1 + s12 * a2
+            a0, a1, a2 = a[48 + q], a[624 + q], a[1200 + q]
+            o[48 + q] = w00 * a0 + w01 * a1 + w02 * a2
+            o[624 + q] = w10 * a0 + w11 * a1 + w12 * a2
+            a0, a1, a2 = a[96 + q], a[672 + q], a[1248 + q]
+            o[96 + q] = w00 * a0 + w01 * a1 + w02 * a2
+            o[672 + q] = w10 * a0 + w11 * a1 + w12 * a2
+
+
+@fast
+def scatter(f, corner, sx, sy, Wx, Wy, Wz, Sx, Sy, Sz, X, P):
+    """Add what the eight points of a cell hand to its nodes; P as G of :func:`gather`."""
+    u00, u01, u02, u10, u11, u12 = Wz[0, 0], Wz[0, 1], Wz[0, 2], Wz[1, 0], Wz[1, 1], Wz[1, 2]
+    t00, t01, t02, t10, t11, t12 = Sz[0, 0], Sz[0, 1], Sz[0, 2], Sz[1, 0], Sz[1, 1], Sz[1, 2]
+    for i in range(3):
+        w0, w1, s0, s1 = Wx[0, i], Wx[1, i], Sx[0, i], Sx[1, i]
+        for r in range(4):
+            p, o = P[144 * r : 144 * r + 720], X[144 * r : 144 * r + 144]
+            for q in range(48):
+                o[q] = s0 * p[q] + s1 * p[576 + q]
+                o[48 + q] = w0 * p[48 + q] + w1 * p[624 + q]
+                o[96 + q] = w0 * p[96 + q] + w1 * p[672 + q]
+        for j in range(3):
+            w0, w1, s0, s1 = Wy[0, j], Wy[1, j], Sy[0, j], Sy[1, j]
+            at = 48 * (corner + i * sx + j * sy)
+            o = f[at : at + 144]
+            for q in range(48):
+                a0 = w0 * X[q] + w1 * X[288 + q] + s0 * X[48 + q] + s1 * X[336 + q]
+                a1 = w0 * X[144 + q] + w1 * X[432 + q] + s0 * X[192 + q] + s1 * X[480 + q]
+                b0 = w0 * X[96 + q] + w1 * X[384 + q]
+                b1 = w0 * X[240 + q] + w1 * X[528 + q]
+                o[q] += u00 * a0 + u10 * a1 + t00 * b0 + t10 * b1
+                o[48 + q] += u01 * a0 + u11 * a1 + t01 * b0 + t11 * b1
+                o[96 + q] += u02 * a0 + u12 * a1 + t02 * b0 + t12 * b1
+
+
+@fast
+def solid(at, G, P, Q, own, law, stiffens, softens):
+    """From displacement gradients G [3, 48] to the first Piola stress P; Q [6, 16] is what the Maxwell elements add.
+
+    ``own`` are the point's shear and bulk modulus, and the largest x = I1b - 3 so far; ``law`` two coefficients of
+    stiffening, then depth d and range r of softening: below the largest x the deviatoric stress is 1 - d u / (1 + u)
+    of what it was, u = (largest - x) / r.
+    """
+    g, p = G[at : at + 144], P[at : at + 144]
+    one = f32(1)
+    third = f32(1 / 3)
+    for lane in range(16):
+        F00, F10, F20 = one + g[lane], g[16 + lane], g[32 + lane]
+        F01, F11, F21 = g[48 + lane], one + g[64 + lane], g[80 + lane]
+        F02, F12, F22 = g[96 + lane], g[112 + lane], one + g[128 + lane]
+        c00, c01, c02 = F11 * F22 - F12 * F21, F12 * F20 - F10 * F22, F10 * F21 - F11 * F20
+        c10, c11, c12 = F02 * F21 - F01 * F22, F00 * F22 - F02 * F20, F01 * F20 - F00 * F21
+        c20, c21, c22 = F01 * F12 - F02 * F11, F02 * F10 - F00 * F12, F00 * F11 - F01 * F10
+        J = F00 * c00 + F01 * c01 + F02 * c02
+        J = f32(0.5) * (J + f32(CRUSHED) + abs(J - f32(CRUSHED)))
+        # ln J = 2 artanh z and J^(-2/3) by series, which the compiler can do for all lanes at once.
+        z = (J - one) / (J + one)
+        z2 = z * z
+        log = (
+            f32(2)
+            * z
+            * (
+                one
+                + z2
+                * (
+                    f32(1 / 3)
+                    + z2 * (f32(1 / 5) + z2 * (f32(1 / 7) + z2 * (f32(1 / 9) + z2 * (f32(1 / 11) + z2 * f32(1 / 13)))))
+                )
+            )
+        )
+        y = f32(-2 / 3) * log
+        shrink = one + y * (
+            one
+            + y
+            * (
+                f32(1 / 2)
+                + y * (f32(1 / 6) + y * (f32(1 / 24) + y * (f32(1 / 120) + y * (f32(1 / 720) + y * f32(1 / 5040)))))
+            )
+        )
+        square = (
+            F00 * F00 + F01 * F01 + F02 * F02 + F10 * F10 + F11 * F11 + F12 * F12 + F20 * F20 + F21 * F21 + F22 * F22
+        )
+        factor, whole = one, one
+        x = shrink * square - f32(3)
+        x = f32(0.5) * (x + abs(x))
+        if stiffens:
+            factor = one + x * (law[lane] + law[16 + lane] * x)
+        if softens:
+            below = own[32 + lane] - x
+            below = f32(0.5) * (below + abs(below))
+            own[32 + lane] = x + below
+            whole = one - law[32 + lane] * below / (below + law[48 + lane])
+        q00, q11, q22, q01, q12, q02 = (
+            J * Q[lane] + factor,
+            J * Q[16 + lane] + factor,
+            J * Q[32 + lane] + factor,
+            J * Q[48 + lane],
+            J * Q[64 + lane],
+            J * Q[80 + lane],
+        )
+        A00, A01, A02 = (
+            F00 * q00 + F01 * q01 + F02 * q02,
+            F00 * q01 + F01 * q11 + F02 * q12,
+            F00 * q02 + F01 * q12 + F02 * q22,
+        )
+        A10, A11, A12 = (
+            F10 * q00 + F11 * q01 + F12 * q02,
+            F10 * q01 + F11 * q11 + F12 * q12,
+            F10 * q02 + F11 * q12 + F12 * q22,
+        )
+        A20, A21, A22 = (
+            F20 * q00 + F21 * q01 + F22 * q02,
+            F20 * q01 + F21 * q11 + F22 * q12,
+            F20 * q02 + F21 * q12 + F22 * q22,
+        )
+        along = (
+            F00 * A00 + F01 * A01 + F02 * A02 + F10 * A10 + F11 * A11 + F12 * A12 + F20 * A20 + F21 * A21 + F22 * A22
+        )
+        m = own[lane] * shrink * whole
+        beta = (own[16 + lane] * f32(0.5) * (J * (J - one) + log) - m * along * third) / J
+        p[lane], p[16 + lane], p[32 + lane] = m * A00 + beta * c00, m * A10 + beta * c10, m * A20 + beta * c20
+        p[48 + lane], p[64 + lane], p[80 + lane] = m * A01 + beta * c01, m * A11 + beta * c11, m * A21 + beta * c21
+        p[96 + lane], p[112 + lane], p[128 + lane] = m * A02 + beta * c02, m * A12 + beta * c12, m * A22 + beta * c22
+
+
+@fast
+def remember(at, G, T, Q, Z, series, law, stiffens, elements):
+    """What the Maxwell elements add, and their state of the next substep, as in ``total``.
+
+    S is the pull-back of the deviatoric stress over mu. Q = sum g (Z + b S), Z becomes a Z - b (1 - a) S; ``series``
+    has g, g b, a and b (1 - a) of each element [E * 64].
+    """
+    g = G[at : at + 144]
+    one = f32(1)
+    for lane in range(16):
+        F00, F10, F20 = one + g[lane], g[16 + lane], g[32 + lane]
+        F01, F11, F21 = g[48 + lane], one + g[64 + lane], g[80 + lane]
+        F02, F12, F22 = g[96 + lane], g[112 + lane], one + g[128 + lane]
+        C00, C11, C22 = (
+            F00 * F00 + F10 * F10 + F20 * F20,
+            F01 * F01 + F11 * F11 + F21 * F21,
+            F02 * F02 + F12 * F12 + F22 * F22,
+        )
+        C01, C12, C02 = (
+            F00 * F01 + F10 * F11 + F20 * F21,
+            F01 * F02 + F11 * F12 + F21 * F22,
+            F00 * F02 + F10 * F12 + F20 * F22,
+        )
+        k00, k11, k22 = C11 * C22 - C12 * C12, C00 * C22 - C02 * C02, C00 * C11 - C01 * C01
+        k01, k12, k02 = C02 * C12 - C01 * C22, C01 * C02 - C00 * C12, C01 * C12 - C02 * C11
+        J = F00 * (F11 * F22 - F12 * F21) + F01 * (F12 * F20 - F10 * F22) + F02 * (F10 * F21 - F11 * F20)
+        J = f32(0.5) * (J + f32(CRUSHED) + abs(J - f32(CRUSHED)))
+        trace = C00 + C11 + C22
+        factor = one
+        if stiffens:
+            z = (J - one) / (J + one)
+            z2 = z * z
+            y = f32(-4 / 3) * z * (one + z2 * (f32(1 / 3) + z2 * (f32(1 / 5) + z2 * f32(1 / 7))))
+            shrink = one + y * (one + y * (f32(1 / 2) + y * (f32(1 / 6) + y * (f32(1 / 24) + y * f32(1 / 120)))))
+            x = shrink * trace - f32(3)
+            x = f32(0.5) * (x + abs(x))
+            factor = one + x * (law[lane] + law[16 + lane] * x)
+        scale = -factor * trace / (f32(3) * J * J * J)
+        iso = factor / J
+        T[lane], T[16 + lane], T[32 + lane] = scale * k00 + iso, scale * k11 + iso, scale * k22 + iso
+        T[48 + lane], T[64 + lane], T[80 + lane] = scale * k01, scale * k12, scale * k02
+    for e in range(elements):
+        z, maxwell = Z[96 * e : 96 * e + 96], series[64 * e : 64 * e + 64]
+        for c in range(6):
+            h, s, q = z[16 * c : 16 * c + 16], T[16 * c : 16 * c + 16], Q[16 * c : 16 * c + 16]
+            if e == 0:
+                q[:] = f32(0)
+            for lane in range(16):
+                old, now = h[lane], s[lane]
+                q[lane] += maxwell[lane] * old + maxwell[16 + lane] * now
+                h[lane] = maxwell[32 + lane] * old - maxwell[48 + lane] * now

@@ -1,0 +1,237 @@
+"""A body between planes: cells that end where the body and its chambers do, and quadratic B-splines on them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from functools import cached_property
+
+import numpy as np
+
+GAUSS = 0.5 / math.sqrt(3.0)
+OUTER = 1.3  # outermost cells are wider than their neighbours, as a spline that ends there is steeper
+
+
+def divide(breaks: Sequence[float], least: Sequence[int], edge: float) -> np.ndarray:
+    """Planes of cells along an axis.
+
+    Args:
+        breaks: Where cells must end [m], increasing.
+        least: Cells in each interval between them, at least.
+        edge: Of a cell, about [m].
+
+    Returns:
+        Planes [cells + 1] m.
+    """
+    planes = [breaks[0]]
+    last = len(breaks) - 2
+    for i, (low, high) in enumerate(itertools.pairwise(breaks)):
+        count = max(least[i], round((high - low) / edge), 1)
+        width = np.ones(count)
+        width[0] *= OUTER if i == 0 else 1.0
+        width[-1] *= OUTER if i == last else 1.0
+        planes += list(low + (high - low) * np.cumsum(width) / width.sum())
+    return np.array(planes)
+
+
+class Axis:
+    """Quadratic B-splines along an axis, which end with the body.
+
+    Args:
+        planes: Of the cells [cells + 1] m.
+    """
+
+    def __init__(self, planes: np.ndarray) -> None:
+        self.planes = planes
+        self.cells = len(planes) - 1
+        self.nodes = self.cells + 2
+        self.knots = np.concatenate([[planes[0]] * 2, planes, [planes[-1]] * 2])
+        self.places = (self.knots[1:-2] + self.knots[2:-1]) / 2
+
+    def cell(self, x: np.ndarray) -> np.ndarray:
+        """Cell of each coordinate; the nearest if it is outside."""
+        return np.clip(np.searchsorted(self.planes, x, side="right") - 1, 0, self.cells - 1)
+
+    def at(self, x: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weights [..., 3] of the nodes of a cell, number ``cell`` and the next two, and their derivatives [1/m]."""
+        k1, k2, k3, k4 = (self.knots[cell + i] for i in range(1, 5))
+        one, two = (k3 - x) / (k3 - k2), (x - k2) / (k3 - k2)
+        first, last = one * (k3 - x) / (k3 - k1), two * (x - k2) / (k4 - k2)
+        down, up = -2 * one / (k3 - k1), 2 * two / (k4 - k2)
+        return np.stack([first, 1 - first - last, last], -1), np.stack([down, -down - up, up], -1)
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        """The two points of each cell [cells, 2] m."""
+        middle, width = (self.planes[1:] + self.planes[:-1]) / 2, np.diff(self.planes)
+        return middle[:, None] + width[:, None] * np.array([-GAUSS, GAUSS])
+
+    @cached_property
+    def table(self) -> tuple[np.ndarray, np.ndarray]:
+        """Weights and derivatives at the points of the cells, each [cells, 2, 3]."""
+        return self.at(self.points, np.arange(self.cells)[:, None])
+
+    @cached_property
+    def steep(self) -> float:
+        """The largest sum of N'^2 / N [1/m2] at a point: with it goes the fastest oscillation."""
+        weight, slope = self.table
+        return float((slope**2 / weight).sum(-1).max())
+
+
+class Grid:
+    """Three axes, and which of their cells are body.
+
+    Args:
+        axes: Along x, y and z.
+        holes: Boxes [low, high] m that are no body, whose faces lie on planes.
+    """
+
+    def __init__(self, axes: tuple[Axis, Axis, Axis], holes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> None:
+        self.axes = axes
+        self.counts = tuple(a.nodes for a in axes)
+        middles = np.meshgrid(*((a.planes[1:] + a.planes[:-1]) / 2 for a in axes), indexing="ij")
+        self.hole = np.full(middles[0].shape, -1)
+        for number, (low, high) in enumerate(holes):
+            inside = [(m > a) & (m < b) for m, a, b in zip(middles, low, high, strict=True)]
+            self.hole[inside[0] & inside[1] & inside[2]] = number
+        self.cells = np.argwhere(self.hole < 0)
+        parts = [a.points[self.cells[:, i]] for i, a in enumerate(axes)]
+        x, y, z = (
+            p[:, shape] for p, shape in zip(parts, ([0] * 4 + [1] * 4, [0, 0, 1, 1] * 2, [0, 1] * 4), strict=True)
+        )
+        self.points = np.stack([x, y, z], -1).reshape(-1, 3)
+        """Of the body [P, 3] m, cell by cell."""
+        size = np.prod([np.diff(a.planes)[self.cells[:, i]] for i, a in enumerate(axes)], axis=0)
+        self.volumes = np.repeat(size / 8, 8)
+        """Of the points [P] m3."""
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return math.prod(self.counts)
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Of the nodes [n, 3] m: values there of a linear field are its coefficients."""
+        return np.stack(np.meshgrid(*(a.places for a in self.axes), indexing="ij"), -1).reshape(-1, 3)
+
+    @property
+    def strides(self) -> tuple[int, int]:
+        """Between nodes along x and y."""
+        return self.counts[1] * self.counts[2], self.counts[2]
+
+    def corner(self, cells: np.ndarray) -> np.ndarray:
+        """Lowest node of cells [..., 3]."""
+        sx, sy = self.strides
+        return cells[..., 0] * sx + cells[..., 1] * sy + cells[..., 2]
+
+    def stencil(self, x: np.ndarray, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes [N, 27] of points [N, 3] m, weights, and slopes [N, 27, 3]; in given cells, or where they are."""
+        if cells is None:
+            cells = np.stack([a.cell(x[:, i]) for i, a in enumerate(self.axes)], -1)
+        w, s = zip(*(a.at(x[:, i], cells[:, i]) for i, a in enumerate(self.axes)), strict=True)
+        three = np.arange(3)
+        sx, sy = self.strides
+        offset = (three[:, None, None] * sx + three[None, :, None] * sy + three[None, None, :]).reshape(-1)
+
+        def product(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+            return np.einsum("ni,nj,nk->nijk", a, b, c).reshape(len(x), 27)
+
+        slopes = [product(s[0], w[1], w[2]), product(w[0], s[1], w[2]), product(w[0], w[1], s[2])]
+        return self.corner(cells)[:, None] + offset, product(*w), np.stack(slopes, -1)
+
+    def spread(self, x: np.ndarray, amounts: np.ndarray) -> np.ndarray:
+        """Amounts [..., N] at points [N, 3] m, over the nodes [..., n]."""
+        nodes, weights, _ = self.stencil(x)
+        flat = amounts.reshape(-1, amounts.shape[-1])
+        found = np.stack([np.bincount(nodes.ravel(), (weights * row[:, None]).ravel(), self.nodes) for row in flat])
+        return found.reshape(*amounts.shape[:-1], self.nodes)
+
+    @cached_property
+    def stencil_of_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes and weights of the body's points."""
+        nodes, weights, _ = self.stencil(self.points, np.repeat(self.cells, 8, axis=0))
+        return nodes, weights
+
+    def collect(self, amounts: np.ndarray) -> np.ndarray:
+        """Amounts [..., P] at the body's points, over the nodes [..., n]."""
+        nodes, weights = self.stencil_of_points
+        flat = amounts.reshape(-1, amounts.shape[-1])
+        found = np.stack([np.bincount(nodes.ravel(), (weights * row[:, None]).ravel(), self.nodes) for row in flat])
+        return found.reshape(*amounts.shape[:-1], self.nodes)
+
+    def within(self, box: tuple[Sequence[float], Sequence[float]]) -> np.ndarray:
+        """Shares [n] of what is spread evenly over a box.
+
+        Raises:
+            ValueError: if the body has no part there.
+        """
+        low, high = (np.array(corner, float) for corner in box)
+        begin = np.array([a.planes[0] for a in self.axes])
+        end = np.array([a.planes[-1] for a in self.axes])
+        low, high = np.maximum(low, begin), np.minimum(high, end)
+        if not (low < high).all():
+            raise ValueError(f"box = {box}: no part of the body, wanted a box that meets it")
+        share = (np.arange(6) + 0.5) / 6
+        x = np.stack(np.meshgrid(*(a + share * (b - a) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
+        x = x.reshape(-1, 3)
+        inside = self.hole[tuple(a.cell(x[:, i]) for i, a in enumerate(self.axes))] < 0
+        if not inside.any():
+            raise ValueError(f"box = {box}: within a chamber, wanted a box that meets the body")
+        return self.spread(x[inside], np.full(int(inside.sum()), 1 / int(inside.sum())))
+
+    def walls(self) -> tuple[np.ndarray, ...]:
+        """Points of the chambers' walls, four on each face of a cell.
+
+        Returns:
+            Nodes [W, 27], weights and two slopes along the wall [W, 27, 3], places [W, 3] m, axes [W], areas [W] m2,
+            positive if the chamber is on the lower side, and chambers [W].
+        """
+        rows = []
+        for cell in self.cells:
+            for axis, side in itertools.product(range(3), (-1, 1)):
+                beside = cell.copy()
+                beside[axis] += side
+                if not 0 <= beside[axis] < self.axes[axis].cells or self.hole[tuple(beside)] < 0:
+                    continue
+                one, two = (axis + 1) % 3, (axis + 2) % 3
+                face = self.axes[axis].planes[cell[axis] + (side > 0)]
+                area = float(np.diff(self.axes[one].planes)[cell[one]] * np.diff(self.axes[two].planes)[cell[two]])
+                for a, b in itertools.product(range(2), range(2)):
+                    place = np.zeros(3)
+                    place[axis] = face
+                    place[one], place[two] = self.axes[one].points[cell[one], a], self.axes[two].points[cell[two], b]
+                    rows.append((cell, place, axis, -side * area / 4, self.hole[tuple(beside)]))
+        if not rows:
+            none = np.zeros(0, int)
+            return np.zeros((0, 27), int), np.zeros((0, 27, 3)), np.zeros((0, 3)), none, np.zeros(0), none
+        cells, places, axes, areas, chambers = (np.array(column) for column in zip(*rows, strict=True))
+        nodes, weights, slopes = self.stencil(places, cells)
+        number = np.arange(len(rows))
+        values = np.stack([weights, slopes[number, :, (axes + 1) % 3], slopes[number, :, (axes + 2) % 3]], -1)
+        return nodes, values, places, axes, areas, chambers
+
+    @cached_property
+    def rim(self) -> np.ndarray:
+        """Nodes on the faces of the box [F]."""
+        index = np.stack(np.unravel_index(np.arange(self.nodes), self.counts), -1)
+        return np.flatnonzero(((index == 0) | (index == np.array(self.counts) - 1)).any(-1))
+
+    def facing(self, normal: np.ndarray) -> np.ndarray:
+        """Area [n] m2 of the nodes on the face of the box that faces a plane with this normal."""
+        axis = int(np.abs(normal).argmax())
+        one, two = sorted({0, 1, 2} - {axis})
+        layer = 0 if normal[axis] > 0 else self.counts[axis] - 1
+        parts = []
+        for a in (one, two):
+            own = self.axes[a]
+            share = np.zeros(own.nodes)
+            for cell in range(own.cells):
+                share[cell : cell + 3] += own.table[0][cell].sum(0) * np.diff(own.planes)[cell] / 2
+            parts.append(share)
+        area = np.zeros(self.counts)
+        at: list = [slice(None)] * 3
+        at[axis] = layer
+        area[tuple(at)] = np.outer(*parts)
+        return area.reshape(-1)

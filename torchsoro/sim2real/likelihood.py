@@ -1,0 +1,218 @@
+"""Recordings, a twin and its error: simulating with effects, and how far that is from what was recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+
+from torchsoro.sim2real.body_effects import Modulus
+from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.experiment import Experiment, Trial
+from torchsoro.sim2real.hypothesis import Hypothesis
+from torchsoro.sim2real.outer_effects import PressureGain
+from torchsoro.sim2real.residual import Band, Camera, Priors, Slip, estimate_noise
+from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.twin import Motion, Twin
+
+EDGE = 0.2  # of a belief's tolerance, over which it ends
+WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
+
+Effects = tuple[Hypothesis, ...]
+Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beliefs:
+    """What a setup's numbers are good for: tolerances of ln of the modulus and of the pressure."""
+
+    modulus: float = 0.1
+    pressure: float = 0.05
+
+
+@dataclass
+class Tally:
+    """What was spent on simulating."""
+
+    simulations: int = 0
+    seconds: float = 0.0
+
+
+class Likelihood:
+    """Recordings, a twin and its error: what a motion is worth.
+
+    Args:
+        experiment: What to explain.
+        twin: Its body.
+        trials: To fit; those with a recording if None.
+        numerics: The twin's own error for each trial [M, A] m; none if None.
+        beliefs: See there.
+        priors: Of measurement errors.
+        noise: [m]; that of the setup, or estimated, if None.
+        slips: Markers that have slipped.
+        ensemble: Of the twin, if there is one already.
+        report: Called with a line after each batch of simulations.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        twin: Twin,
+        *,
+        trials: Sequence[Trial] | None = None,
+        numerics: Sequence[np.ndarray] | None = None,
+        beliefs: Beliefs | None = None,
+        priors: Priors | None = None,
+        noise: float | None = None,
+        slips: Sequence[Slip] = (),
+        ensemble: Ensemble | None = None,
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.experiment, self.twin, self.report = experiment, twin, report
+        self.ensemble = ensemble or Ensemble(twin)
+        self.trials = tuple(experiment.trials if trials is None else trials)
+        recordings = [t.recording for t in self.trials if t.recording is not None]
+        self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
+        shape = recordings[0].place.shape[1:]
+        self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
+        self.priors, self.slips = priors, tuple(slips)
+        self.camera = Camera(experiment.setup, self.trials, priors, slips)
+        self.bands = [Band(r, self.noise, n) for r, n in zip(recordings, self.numerics, strict=True)]
+        self.samples = sum(b.count for b in self.bands)
+        self.scenarios = [twin.scenario(t) for t in self.trials]
+        self.beliefs = beliefs or Beliefs()
+        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.beliefs.modulus)]
+        if experiment.setup.cavities:
+            self.common.append((PressureGain(), self.beliefs.pressure))
+        self.tally = Tally()
+
+    def only(self, trials: Sequence[Trial], slips: Sequence[Slip] | None = None) -> Self:
+        """The same of other trials, or with other slips."""
+        numerics = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
+        common = np.mean(self.numerics, axis=0)
+        there = type(self)(
+            self.experiment,
+            self.twin,
+            trials=trials,
+            numerics=[numerics.get(t.name, np.asarray(common)) for t in trials],
+            beliefs=self.beliefs,
+            priors=self.priors,
+            noise=self.noise,
+            slips=self.slips if slips is None else slips,
+            ensemble=self.ensemble,
+            report=self.report,
+        )
+        there.tally = self.tally
+        return there
+
+    def early(self, share: float) -> Self:
+        """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase."""
+        cut = []
+        for t in self.trials:
+            assert t.recording is not None
+            end = share * t.setup.duration
+            held = t.recording.time <= end
+            recording = dataclasses.replace(t.recording, time=t.recording.time[held], place=t.recording.place[held])
+            cut.append(dataclasses.replace(t, setup=dataclasses.replace(t.setup, duration=end), recording=recording))
+        return self.only(cut)
+
+    # Simulating -------------------------------------------------------------------------------------------------
+
+    def scales(self, effects: Effects) -> np.ndarray:
+        """Of all that is fitted by simulating: modulus, pressure, the effects, places."""
+        found = [tolerance for _, tolerance in self.common]
+        for effect in effects:
+            found += [q.scale for q in effect.quantities]
+            found += [0.1 * s for s in self.twin.setup.size] if effect.local else []
+        return np.array(found)
+
+    def bounds(self, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
+        """Of the unknowns, in scales."""
+        low, high = [-6.0] * len(self.common), [6.0] * len(self.common)
+        for effect in effects:
+            low += [q.least for q in effect.quantities]
+            high += [q.most for q in effect.quantities]
+            if effect.local:
+                s = self.twin.setup
+                low += [10 * o / z for o, z in zip(s.origin, s.size, strict=True)]
+                high += [10 * o / z + 10 for o, z in zip(s.origin, s.size, strict=True)]
+        return np.array(low), np.array(high)
+
+    def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:
+        """A scenario at points [B, K], in scales."""
+        values = torch.from_numpy(points * self.scales(effects))
+        at = 0
+        for effect, _ in self.common:
+            scenario = effect(scenario, values[:, at : at + 1], self.twin)
+            at += 1
+        for effect in effects:
+            count = len(effect.quantities) + 3 * effect.local
+            part = values[:, at : at + count]
+            at += count
+            if effect.applies(scenario, self.twin) and bool((part[:, : len(effect.quantities)] != 0).any()):
+                scenario = effect(scenario, part, self.twin)
+        return scenario
+
+    def simulate(self, requests: Sequence[Request]) -> list[list[Motion]]:
+        """For each request, the motions of all trials, each with a leading batch; all at once."""
+        begin = time.perf_counter()
+        varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
+        found = self.ensemble(varied)
+        spent = time.perf_counter() - begin
+        count = len(self.scenarios)
+        simulations = count * sum(len(points) for _, points in requests)
+        self.tally.simulations += simulations
+        self.tally.seconds += spent
+        self.report(f"{simulations} simulations, {spent:.1f} s")
+        return [found[k : k + count] for k in range(0, len(found), count)]
+
+    # Residuals --------------------------------------------------------------------------------------------------
+
+    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residual of all trials, and its slopes by the measurement errors."""
+        left, slopes = [], []
+        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+            assert trial.recording is not None
+            seen, by = self.camera.see(motion, i, errors)
+            left.append(band.whiten(trial.recording.place - seen))
+            slopes.append(band.whiten(by))
+        return np.concatenate(left), np.concatenate(slopes)
+
+    def measure(
+        self, motions: Sequence[Motion], errors: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """The best measurement errors for motions: misfit with their priors, errors, residual, slopes."""
+        weight = 1 / self.camera.deviations
+        best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
+        for _ in range(6):
+            r, J = self.residual(motions, errors)
+            misfit = float(r @ r + ((errors * weight) ** 2).sum())
+            if misfit < best[0]:
+                gained = best[0] - misfit
+                best = (misfit, errors, r, J)
+                if gained < 0.05 + 1e-4 * misfit:
+                    break
+            else:  # too far
+                errors = (errors + best[1]) / 2
+                continue
+            H = J.T @ J + np.diag(weight**2)
+            errors = errors + np.linalg.solve(H, J.T @ r - weight**2 * errors)
+        return best
+
+    def belief(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of the beliefs at a point, and their slopes; none where ``held``.
+
+        Within its tolerance a number is nearly as good as another, beyond it is soon hard to believe.
+        """
+        n = len(self.common)
+        out = np.maximum(np.abs(at[:n]) - 1, 0) / EDGE
+        r, slope = np.zeros(len(at)), np.zeros(len(at))
+        r[:n] = np.sign(at[:n]) * np.hypot(WITHIN * at[:n], out)
+        slope[:n] = np.where(out > 0, 1 / EDGE, WITHIN)
+        return np.where(held, 0.0, r), np.where(held, 0.0, slope)
