@@ -292,3 +292,26 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     model.write_text(model.read_text().replace('name = "drag"', 'name = "wind"'))
     with pytest.raises(ValueError, match=r"name = 'wind', wanted one of"):
         read_model(model)
+
+
+def test_two_effects_are_found_where_one_does_not_do(made):
+    """A bar that is drawn by a fluid and let go with a velocity: neither alone explains it."""
+    twin, ensemble, record = made
+    one = record("drag", (600.0,))
+    thrown = effect("initial_motion")
+    values = torch.tensor([[0.0, 0.0, 0.25]], dtype=torch.float64)
+    trials = []
+    for trial in one.trials:
+        s = thrown(twin.scenario(trial), values, twin)
+        s = effect("drag")(s, torch.tensor([[600.0]], dtype=torch.float64), twin)
+        seen = Camera(one.setup, [trial]).see(ensemble([s])[0].alone(), 0, np.zeros(12))[0]
+        noise = 5e-5 * np.random.default_rng(5).normal(size=seen.shape)
+        trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=seen + noise)))
+    both = dataclasses.replace(one, trials=tuple(trials))
+    effects = [effect(name) for name in ("drag", "initial_motion", "gravity_tilt")]
+    told = judge(Problem(both, twin, ensemble=ensemble), effects, report=lambda line: None)
+    assert told.chosen and {e.name for e in told.chosen[0].fit.effects} == {"drag", "initial_motion"}
+    # Which of the numbers is which effect's does not depend on their order.
+    found = dict(zip((e.name for e in told.chosen[0].fit.effects), told.chosen[0].fit.values, strict=True))
+    assert found["drag"][0] == pytest.approx(600.0, rel=0.1)
+    assert found["initial_motion"][2] == pytest.approx(0.25, rel=0.05)

@@ -20,6 +20,7 @@ KEPT = 6  # searches that are led to their end, of those that do best at first
 STARTS = 3  # of each effect, from looks that differ
 FAR = 3.0  # times what noise and numerics explain, above which searches begin with the beginning
 EARLY = (0.12, 0.35)  # of the trials
+PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 TRIED = 4  # rounds of searches before the best are chosen
 FAINT = 4.0  # of the score that a look promises, below which nothing is fitted
@@ -140,6 +141,11 @@ def judge(
     for fit in [*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]]:
         if fit is not None and (fit.name not in best or fit.misfit < best[fit.name].misfit):
             best[fit.name] = fit
+    leading = min(best.values(), key=lambda fit: fit.misfit, default=None)
+    if leading is not None and leading.misfit > FAR * leading.samples and each < PAIRS * budget:
+        for fit in _pairs(problem, effects, list(best.values()), report):
+            if fit.name not in best or fit.misfit < best[fit.name].misfit:
+                best[fit.name] = fit
     found = rank(list(best.values()), nothing)
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
@@ -180,6 +186,32 @@ def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: i
             found.setdefault(fit.name, fit)
         carried = [((), nothing.point), *((f.effects, f.point) for f in found.values())]
     return carried
+
+
+def _pairs(
+    problem: Problem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
+) -> list[Fit]:
+    """Two effects together: each of the three that do best with every other, on more and more of the trials."""
+    singles = sorted(singles, key=lambda fit: fit.misfit)[:3]
+    tasks: list[Task] = []
+    for k, one in enumerate(singles):
+        known = {one.name, *(s.name for s in singles[:k])}
+        for other in effects:
+            if other.name not in known:
+                looks = other.looks(problem.twin)
+                for look in (looks[0], looks[-1]):
+                    tasks.append(((*one.effects, other), np.concatenate([one.point, look[0]])))
+    chosen: dict[str, Fit] = {}
+    for share, most in zip((*EARLY, 1.0), (24, 10, 5), strict=True):
+        where, whole = (problem.early(share), False) if share < 1 else (problem, True)
+        ends = where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole)
+        chosen = {}
+        for fit in sorted((f for f in ends if f is not None), key=lambda f: f.misfit):
+            chosen.setdefault(fit.name, fit)
+        best = ", ".join(f"{name} {fit.misfit:.0f}" for name, fit in [*chosen.items()][:4])
+        report(f"pairs, first {100 * share:.0f} % of the trials: {best}")
+        tasks = [(f.effects, f.point) for f in [*chosen.values()][:most]]
+    return [*chosen.values()]
 
 
 def _nothing(problem: Problem, tasks: Sequence[Task], report: Callable[[str], None]) -> tuple[Problem, Fit]:
