@@ -82,7 +82,6 @@ def main(options: Options) -> Explanation | None:
         raise ValueError("experiment: wanted a folder, or --predict")
     begin = time.perf_counter()
     torch.set_num_threads(1)
-    options.out.mkdir(parents=True, exist_ok=True)
     experiment, confused = reordered(read_experiment(options.experiment))
     if confused:
         print(confused)
@@ -119,6 +118,7 @@ def main(options: Options) -> Explanation | None:
         "edge_m": twin.edge,
         "walls": twin.walls,
     }
+    options.out.mkdir(parents=True, exist_ok=True)
     write(found, everything, options.out, settings)
     write_model(options.out / "model.toml", options.experiment / "setup.toml", best, twin)
     print(f"{verdict.kind}: {lead(found)}\n{found.seconds:.0f} s; {options.out / 'report.html'}")

@@ -83,9 +83,15 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path):
         ('kind = "video"', 'kind = "film"', r"kind = 'film', wanted one of 'mocap', 'video'"),
         ('name = "tip"', 'name = "end"', r"columns time_s, tip_x_m, tip_z_m, wanted also end_x_m, end_z_m"),
         ("box = [[-0.001, -0.001, -0.001],", "box = [[0.1, 0.1, 0.1],", r"wanted the lower corner first"),
+        ("size = [0.04, 0.02, 0.02]", "size = [100, 30, 30]", r"size = 30 to 100, wanted 0\.0001 to 10 m: is the unit"),
+        ("youngs_modulus = 1e5", "youngs_modulus = 0.1", r"youngs_modulus = 0\.1, wanted 100 to 1e\+10 Pa"),
+        ("density = 1000.0", "density = 1.0", r"density = 1, wanted 10 to 30000 kg/m3"),
+        ("at = [0.04, 0.01, 0.02]", "at = [0.14, 0.01, 0.02]", r"tip at .* is 100 mm outside of the body"),
+        ("duration = 0.1", "duration = 0.1\ngravity = [0, 0, -9810]", r"wanted at most 1000 m/s2"),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, old, new, message):
+    assert old in SETUP
     with pytest.raises(ValueError, match=message):
         read_experiment(experiment(tmp_path, SETUP.replace(old, new)))
 
@@ -96,6 +102,12 @@ def test_what_does_not_fit_is_named(tmp_path, old, new, message):
         ("time_s,tip_x_m,tip_z_m\n0,1,2\n0.1,x,2\n0.2,1,2\n", r"line 3: tip_x_m = 'x', wanted a number or nothing"),
         ("time_s,tip_x_m,tip_z_m\n0,1\n", r"line 2 has 2 cells, wanted 3"),
         ("time_s,tip_x_m,tip_z_m\n0,1,2\n0,1,2\n0.2,1,2\n", r"does not increase after sample 0"),
+        ("time_s,tip_x_m,tip_z_m\n0,,\n0.02,,\n0.04,,\n", r"marker tip has no sample"),
+        ("time_s,tip_x_m,tip_z_m\n0,40,20\n0.02,40,20\n0.04,40,20\n", r"marker tip begins at .*: is it in metres"),
+        (
+            "time_s,tip_x_m,tip_z_m\n0,1,2\n0.004,1,2\n0.008,1,2\n",
+            r"times from 0 to 0\.008 s, wanted some of the 0\.03",
+        ),
         ("time_s\n", r"1 lines, wanted names of columns and numbers below"),
     ],
 )

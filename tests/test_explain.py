@@ -294,6 +294,19 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
         read_model(model)
 
 
+def test_what_no_effect_explains_bends_no_clock(made):
+    """A wind that is none of the effects at hand: what is left is priced, and measurement errors stay believable."""
+    twin, ensemble, record = made
+    recorded = record("attached_mass", (0.01, 0.06, 0.01, 0.01))
+    told = judge(
+        Problem(recorded, twin, ensemble=ensemble), [effect("gravity_tilt"), effect("drag")], report=lambda line: None
+    )
+    assert told.kind != "explained" and told.excess > 4
+    errors = np.abs(told.nothing.errors / told.problem.camera.deviations)
+    assert errors.max() < 6
+    assert np.mean(told.problem.numerics) > 1e-4
+
+
 def test_two_effects_are_found_where_one_does_not_do(made):
     """A bar that is drawn by a fluid and let go with a velocity: neither alone explains it."""
     twin, ensemble, record = made

@@ -18,11 +18,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 
 from torchsoro.actuation import Waveform
 from torchsoro.sim2real.recording import Recording, read_table
 
+SHORTEST = 0.03  # s, three times what a clock may be late
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 
@@ -194,12 +196,34 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     recording = None
     if markers.is_file():
         recording = Recording.read(markers, [m.name for m in setup.markers], setup.axes)
+        if recording.time[0] > setup.duration or recording.time[-1] < SHORTEST:
+            raise ValueError(
+                f"{markers}: times from {recording.time[0]:g} to {recording.time[-1]:g} s, wanted some of the "
+                f"{SHORTEST:g} to {setup.duration:g} s from release, in seconds"
+            )
+        _check_places(recording, setup, markers)
     pressure = None
     if setup.cavities:
         if not supply.is_file():
             raise ValueError(f"{folder}: no pressure.csv, wanted one, as the body has a chamber")
         pressure = _pressure(supply, [c.name for c in setup.cavities])
     return Trial(name=folder.name, setup=setup, recording=recording, pressure=pressure)
+
+
+def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
+    reach = max(setup.size)
+    for m, marker in enumerate(setup.markers):
+        seen = recording.place[np.isfinite(recording.place[:, m]).all(-1), m]
+        if not len(seen):
+            raise ValueError(
+                f"{path}: marker {marker.name} has no sample, wanted some, or no such marker in setup.toml"
+            )
+        stated = np.array(marker.at)[list(setup.axes)]
+        if np.abs(seen[0] - stated).max() > 100 * reach:
+            raise ValueError(
+                f"{path}: marker {marker.name} begins at {seen[0].tolist()}, wanted about {stated.tolist()} m: "
+                "is it in metres?"
+            )
 
 
 def _folders(parent: Path) -> list[Path]:
@@ -359,9 +383,32 @@ def _friction(table: _Table) -> str | float:
     return "stick" if value == "stick" else float(value)
 
 
+# What bodies are like whose numbers are in SI units.
+_LENGTH, _MODULUS, _DENSITY, _PULL = (1e-4, 10.0), (1e2, 1e10), (10.0, 3e4), 1e3
+
+
 def _check(setup: Setup, file: Path) -> None:
     if not all(edge > 0 for edge in setup.size):
         raise ValueError(f"{file}: [body]: size = {setup.size}, wanted positive lengths")
+    sized = {
+        "[body]: size": (min(setup.size), max(setup.size), _LENGTH, "m"),
+        "[material]: youngs_modulus": (setup.youngs_modulus, setup.youngs_modulus, _MODULUS, "Pa"),
+        "[material]: density": (setup.density, setup.density, _DENSITY, "kg/m3"),
+    }
+    for name, (least, most, (low, high), unit) in sized.items():
+        if least < low or most > high:
+            seen = f"{least:g}" if least == most else f"{least:g} to {most:g}"
+            raise ValueError(f"{file}: {name} = {seen}, wanted {low:g} to {high:g} {unit}: is the unit right?")
+    if max(map(abs, setup.gravity)) > _PULL:
+        raise ValueError(f"{file}: gravity = {setup.gravity}, wanted at most {_PULL:g} m/s2: is the unit right?")
+    reach = max(setup.size)
+    for marker in setup.markers:
+        away = [max(o - x, x - o - s, 0.0) for x, o, s in zip(marker.at, setup.origin, setup.size, strict=True)]
+        if max(away) > reach / 2:
+            raise ValueError(
+                f"{file}: [[marker]] {marker.name} at {marker.at} m is {1e3 * max(away):.0f} mm outside of the body, "
+                f"wanted one on it or within {1e3 * reach / 2:.0f} mm"
+            )
     if setup.poisson_ratio >= 0.5:
         raise ValueError(f"{file}: [material]: poisson_ratio = {setup.poisson_ratio}, wanted less than 0.5")
     if not setup.markers:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from torchsoro.errors import SimulationDiverged
 from torchsoro.kernels.lanes import LANES
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.likelihood import Effects, Likelihood, Request
@@ -84,7 +83,7 @@ class Problem(Likelihood):
         """Where effects are looked at from: what is believed, or a fit without effects, with derivatives.
 
         Raises:
-            SimulationDiverged: if it breaks down.
+            ValueError: if it breaks down.
         """
         at = np.zeros(len(self.common)) if known is None else known.point
         errors = np.zeros(len(self.camera.deviations)) if known is None else known.errors
@@ -121,6 +120,17 @@ class Problem(Likelihood):
         known = np.concatenate([np.where(slope > 0, believed / np.where(slope > 0, slope, 1), 0), base.errors])
         sound = np.all([m.sound for m in motions], axis=0)
         ranked, at = [], 0
+        if held.any():
+            # What the belief held, set free: no look is needed for that.
+            H = np.concatenate([np.concatenate([base.columns, base.J], 1), np.diag(prior)])
+            target = np.concatenate([base.r, -prior * known])
+            x = np.linalg.lstsq(H, target, rcond=None)[0]
+            common, strength = base.at + x[:count], np.zeros(kinds)
+            for i in np.flatnonzero(held):
+                strength[0] = common[i] * self.common[i][1] / effect.quantities[0].scale
+                common[i] = 0.0
+            left = float(((target - H @ x) ** 2).sum())
+            ranked.append((left, np.clip(np.concatenate([common, strength]), low, high)))
         for directions in looks:
             n = len(directions)
             mine = range(at, at + n)
@@ -214,10 +224,9 @@ class Problem(Likelihood):
                 asked = search.send(self.simulate([asked])[0])
         except StopIteration as end:
             if end.value is None:
-                raise SimulationDiverged(
-                    step=0, time=0.0, particle=0, quantity="the believed motion is not finite", batch=0,
-                    remedy="a setup whose body bears its loads",
-                ) from None  # fmt: skip
+                raise ValueError(
+                    "setup: its simulation breaks down, wanted a body that bears what acts on it"
+                ) from None
             return end.value
 
     def _held(self, effects: Effects) -> np.ndarray:

@@ -21,7 +21,7 @@ from torchsoro.sim2real.residual import Band, Camera, Priors, Slip, estimate_noi
 from torchsoro.sim2real.scenario import Scenario
 from torchsoro.sim2real.twin import Motion, Twin
 
-EDGE = 0.2  # of a belief's tolerance, over which it ends
+EDGE = 0.15  # of a belief's tolerance, over which it ends
 WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
 
 Effects = tuple[Hypothesis, ...]
@@ -92,15 +92,21 @@ class Likelihood:
             self.common.append((PressureGain(), self.beliefs.pressure))
         self.tally = Tally()
 
-    def only(self, trials: Sequence[Trial], slips: Sequence[Slip] | None = None) -> Self:
-        """The same of other trials, or with other slips."""
-        numerics = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
-        common = np.mean(self.numerics, axis=0)
+    def only(
+        self,
+        trials: Sequence[Trial],
+        *,
+        slips: Sequence[Slip] | None = None,
+        numerics: Sequence[np.ndarray] | None = None,
+    ) -> Self:
+        """The same of other trials, with other slips, or with another error of the twin for each trial [M, A] m."""
+        known = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
+        common = np.asarray(np.mean(self.numerics, axis=0))
         there = type(self)(
             self.experiment,
             self.twin,
             trials=trials,
-            numerics=[numerics.get(t.name, np.asarray(common)) for t in trials],
+            numerics=numerics or [known.get(t.name, common) for t in trials],
             beliefs=self.beliefs,
             priors=self.priors,
             noise=self.noise,

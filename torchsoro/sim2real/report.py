@@ -25,6 +25,7 @@ from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
+BELIEVED = 3.0  # standard deviations of a measurement error that are believed
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 
 
@@ -165,7 +166,7 @@ def lead(e: Explanation) -> str:
         return f"Something is missing that is none of the known effects.{tried}{gain}"
     parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
-        return f"One of these is missing, and this recording cannot tell which: {parts}.{gain}"
+        return f"One of these is missing, and this recording cannot tell which: {parts}.{gain}{_beyond(e)}"
     second = next((c for c in v.ranking if c is not v.chosen[0]), None)
     lost = ""
     if second is not None:
@@ -173,7 +174,24 @@ def lead(e: Explanation) -> str:
             f" Next best is {second.fit.name}, which takes away {100 * max(second.explained, 0):.0f} % of the "
             f"difference against {100 * v.chosen[0].explained:.0f} %."
         )
-    return f"Missing is {parts}.{gain}{lost}"
+    return f"Missing is {parts}.{gain}{lost}{_beyond(e)}"
+
+
+def _beyond(e: Explanation) -> str:
+    """Measurement errors that are larger than can be believed: something else is hidden in them."""
+    camera = e.problem.camera
+    large = [
+        f"{name} {value:.2g} (believed within {deviation:.2g})"
+        for name, value, deviation in zip(camera.names, e.best.errors, camera.deviations, strict=True)
+        if abs(value) > BELIEVED * deviation
+    ]
+    if not large:
+        return ""
+    return (
+        " But the fit bends measurement errors further than can be believed, so that more is missing than this: "
+        f"{', '.join(large)}. What is left over is {e.verdict.excess:.2g} times what noise and the simulation's own "
+        "error explain; where and when is drawn below."
+    )
 
 
 def _said(candidate: Candidate, problem: Problem) -> str:

@@ -35,9 +35,9 @@ class Priors:
     """
 
     clock: float = 0.01
-    rate: float = 0.005
+    rate: float = 0.002
     scale: float = 0.02
-    metres: float = 0.01
+    metres: float = 0.005
     rotation: float = 0.01
     place: float = 0.0007
     slip: float = 0.003
