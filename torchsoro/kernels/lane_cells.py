@@ -18,6 +18,29 @@ f32 = np.float32
 
 
 @fast
+def at_least(x, least):
+    """The larger of two numbers, without a branch."""
+    return f32(0.5) * (x + least + abs(x - least))
+
+
+@fast
+def logarithm(J):
+    """Of J: 2 artanh z, z = (J - 1) / (J + 1), by its series."""
+    z = (J - f32(1)) / (J + f32(1))
+    q = z * z
+    tail = f32(1 / 7) + q * (f32(1 / 9) + q * (f32(1 / 11) + q * f32(1 / 13)))
+    return f32(2) * z * (f32(1) + q * (f32(1 / 3) + q * (f32(1 / 5) + q * tail)))
+
+
+@fast
+def shrinkage(log):
+    """J^(-2/3) from ln J, by its series."""
+    y = f32(-2 / 3) * log
+    tail = f32(1 / 24) + y * (f32(1 / 120) + y * (f32(1 / 720) + y * f32(1 / 5040)))
+    return f32(1) + y * (f32(1) + y * (f32(1 / 2) + y * (f32(1 / 6) + y * tail)))
+
+
+@fast
 def gather(d, corner, sx, sy, Wx, Wy, Wz, Sx, Sy, Sz, Z, Y, G):
     """Gradient of a nodal field at the eight points of a cell: G [8, derivative, 48]; Z and Y are for its own use."""
     w00, w01, w02, w10, w11, w12 = Wz[0, 0], Wz[0, 1], Wz[0, 2], Wz[1, 0], Wz[1, 1], Wz[1, 2]
@@ -108,42 +131,18 @@ def solid(at, G, P, Q, own, law, stiffens, softens):
         c10, c11, c12 = F02 * F21 - F01 * F22, F00 * F22 - F02 * F20, F01 * F20 - F00 * F21
         c20, c21, c22 = F01 * F12 - F02 * F11, F02 * F10 - F00 * F12, F00 * F11 - F01 * F10
         J = F00 * c00 + F01 * c01 + F02 * c02
-        J = f32(0.5) * (J + f32(CRUSHED) + abs(J - f32(CRUSHED)))
-        # ln J = 2 artanh z and J^(-2/3) by series, which the compiler can do for all lanes at once.
-        z = (J - one) / (J + one)
-        z2 = z * z
-        log = (
-            f32(2)
-            * z
-            * (
-                one
-                + z2
-                * (
-                    f32(1 / 3)
-                    + z2 * (f32(1 / 5) + z2 * (f32(1 / 7) + z2 * (f32(1 / 9) + z2 * (f32(1 / 11) + z2 * f32(1 / 13)))))
-                )
-            )
-        )
-        y = f32(-2 / 3) * log
-        shrink = one + y * (
-            one
-            + y
-            * (
-                f32(1 / 2)
-                + y * (f32(1 / 6) + y * (f32(1 / 24) + y * (f32(1 / 120) + y * (f32(1 / 720) + y * f32(1 / 5040)))))
-            )
-        )
+        J = at_least(J, f32(CRUSHED))
+        log = logarithm(J)
+        shrink = shrinkage(log)
         square = (
             F00 * F00 + F01 * F01 + F02 * F02 + F10 * F10 + F11 * F11 + F12 * F12 + F20 * F20 + F21 * F21 + F22 * F22
         )
         factor, whole = one, one
-        x = shrink * square - f32(3)
-        x = f32(0.5) * (x + abs(x))
+        x = at_least(shrink * square - f32(3), f32(0))
         if stiffens:
             factor = one + x * (law[lane] + law[16 + lane] * x)
         if softens:
-            below = own[32 + lane] - x
-            below = f32(0.5) * (below + abs(below))
+            below = at_least(own[32 + lane] - x, f32(0))
             own[32 + lane] = x + below
             whole = one - law[32 + lane] * below / (below + law[48 + lane])
         q00, q11, q22, q01, q12, q02 = (
@@ -205,16 +204,11 @@ def remember(at, G, T, Q, Z, series, law, stiffens, elements):
         k00, k11, k22 = C11 * C22 - C12 * C12, C00 * C22 - C02 * C02, C00 * C11 - C01 * C01
         k01, k12, k02 = C02 * C12 - C01 * C22, C01 * C02 - C00 * C12, C01 * C12 - C02 * C11
         J = F00 * (F11 * F22 - F12 * F21) + F01 * (F12 * F20 - F10 * F22) + F02 * (F10 * F21 - F11 * F20)
-        J = f32(0.5) * (J + f32(CRUSHED) + abs(J - f32(CRUSHED)))
+        J = at_least(J, f32(CRUSHED))
         trace = C00 + C11 + C22
         factor = one
         if stiffens:
-            z = (J - one) / (J + one)
-            z2 = z * z
-            y = f32(-4 / 3) * z * (one + z2 * (f32(1 / 3) + z2 * (f32(1 / 5) + z2 * f32(1 / 7))))
-            shrink = one + y * (one + y * (f32(1 / 2) + y * (f32(1 / 6) + y * (f32(1 / 24) + y * f32(1 / 120)))))
-            x = shrink * trace - f32(3)
-            x = f32(0.5) * (x + abs(x))
+            x = at_least(shrinkage(logarithm(J)) * trace - f32(3), f32(0))
             factor = one + x * (law[lane] + law[16 + lane] * x)
         scale = -factor * trace / (f32(3) * J * J * J)
         iso = factor / J

@@ -36,12 +36,11 @@ class Ensemble:
         self.twin, self.threads = twin, threads
         self.mesh = mesh_of(twin)
         grid = twin.grid
-        _, _, places, axes, areas, chambers = grid.walls()
+        _, _, places, axes, areas, chambers = grid.walls
         shape = np.zeros(len(twin.setup.cavities))
         np.add.at(shape, chambers, areas * places[np.arange(len(axes)), axes] / 3)
         self.volumes = shape
         self.steep = max(a.steep for a in grid.axes)
-        self.point_mass = torch.from_numpy(grid.volumes)
 
     def __call__(self, scenarios: Sequence[Scenario]) -> list[Motion]:
         """Simulate.
@@ -65,7 +64,6 @@ class Ensemble:
         longest = max(s.duration for s in scenarios)
         samples = math.ceil(longest / SAMPLE - 1e-9) + 1
         seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
-        largest = 0.0
 
         def run(group: list[Lane]) -> float:
             dt = min(steps[i][b] for i, b in group)
@@ -123,7 +121,7 @@ class Ensemble:
             return np.ascontiguousarray(torch.stack(rows, -1).numpy(), dtype=np.float32)
 
         steps = every * (samples - 1)
-        volume = self.point_mass
+        volume = self.twin.volumes
 
         def modulus(s: Scenario, kind: str) -> Tensor:
             nu = s.poisson_ratio.unsqueeze(-1)
@@ -266,7 +264,7 @@ def mesh_of(twin: Twin) -> Mesh:
     weights, slopes = np.zeros((2, 3, most, 2, 3), f32)
     for i, axis in enumerate(grid.axes):
         weights[i, : axis.cells], slopes[i, : axis.cells] = axis.table
-    wall_node, wall_value, places, axes, areas, chambers = grid.walls()
+    wall_node, wall_value, places, axes, areas, chambers = grid.walls
     there = np.abs(wall_value[..., 0]) > 1e-12
     mark_node, mark_value = twin.marks()
     sx, sy = grid.strides

@@ -169,15 +169,6 @@ def read_experiment(folder: Path) -> Experiment:
     return Experiment(folder=folder, setup=setup, trials=tuple(trials), heldout=tuple(heldout))
 
 
-def readsetup_of(file: Path) -> Setup:
-    """Read a setup.toml alone.
-
-    Raises:
-        ValueError: as :func:`read_experiment`.
-    """
-    return setup_of(read_tables(file), file)
-
-
 def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     """Read a trial's folder: markers.csv, pressure.csv and trial.toml where they are.
 

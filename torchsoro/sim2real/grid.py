@@ -181,6 +181,7 @@ class Grid:
             raise ValueError(f"box = {box}: within a chamber, wanted a box that meets the body")
         return self.spread(x[inside], np.full(int(inside.sum()), 1 / int(inside.sum())))
 
+    @cached_property
     def walls(self) -> tuple[np.ndarray, ...]:
         """Points of the chambers' walls, four on each face of a cell.
 

@@ -92,7 +92,7 @@ def measure(
         report: Called with a line after each batch of simulations.
     """
     setup, twin = experiment.setup, ensemble.twin
-    walls = min(int(np.diff(a.planes).size) for a in twin.grid.axes)
+    walls = min(a.cells for a in twin.grid.axes)
     # Cells are whole: another count through each wall, or across the body.
     fewer = max(twin.walls - 1, 1)
     coarse = Twin(setup, edge=1.4 * twin.edge, walls=fewer, across=max(walls - 1, 2))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -138,18 +138,12 @@ def judge(
         tried.sort(key=lambda fit: fit.misfit)
         behind = tried[0].misfit + BEHIND * max(nothing.misfit - tried[0].misfit, 0.0)
         tasks = [(f.effects, f.point) for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
-    best: dict[str, Fit] = {}
-    for fit in [*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]]:
-        if fit is not None and (fit.name not in best or fit.misfit < best[fit.name].misfit):
-            best[fit.name] = fit
-    leading = min(best.values(), key=lambda fit: fit.misfit, default=None)
-    if leading is not None and leading.misfit > FAR * leading.samples and each < PAIRS * budget:
-        for fit in _pairs(problem, effects, list(best.values()), report):
-            if fit.name not in best or fit.misfit < best[fit.name].misfit:
-                best[fit.name] = fit
-    plain = rank(list(best.values()), nothing)
+    best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]])
+    if best and best[0].misfit > FAR * best[0].samples and each < PAIRS * budget:
+        best = _best([*best, *_pairs(problem, effects, best, report)])
+    plain = rank(best, nothing)
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
-    problem, nothing, fits = _priced(problem, nothing, list(best.values()), report)
+    problem, nothing, fits = _priced(problem, nothing, best, report)
     # What is explained, and what is left, is told by noise and the twin's own error alone.
     explained = {c.fit.name: c.explained for c in plain}
     found = [dataclasses.replace(c, explained=explained[c.fit.name]) for c in rank(fits, nothing)]
@@ -180,7 +174,7 @@ def _priced(
 
     Otherwise a clock or a scale would be bent, far beyond belief, to take up what the model lacks.
     """
-    fits = sorted(fits, key=lambda fit: fit.misfit)[:KEPT]
+    fits = fits[:KEPT]
     own = problem.numerics
     for _ in range(4):
         if not fits or fits[0].misfit < PRICED * fits[0].samples:
@@ -195,7 +189,7 @@ def _priced(
         tasks: list[Task] = [((), nothing.point), *((f.effects, f.point) for f in fits)]
         again, *rest = problem.fit(tasks, rounds=ROUNDS)
         nothing = again or nothing
-        fits = sorted((f for f in rest if f is not None), key=lambda fit: fit.misfit)
+        fits = _best(rest)
     return problem, nothing, fits
 
 
@@ -211,12 +205,8 @@ def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: i
             continue
         nothing = still[0]
         tasks = [*(t for t in carried if t[0]), *_likely(_looks(early, nothing, effects), nothing, most)]
-        ends = [f for f in early.fit(tasks, errors=nothing.errors, rounds=6, settle=False) if f is not None]
-        ends.sort(key=lambda fit: fit.misfit)
-        found: dict[str, Fit] = {}
-        for fit in ends:
-            found.setdefault(fit.name, fit)
-        carried = [((), nothing.point), *((f.effects, f.point) for f in found.values())]
+        ends = _best(early.fit(tasks, errors=nothing.errors, rounds=6, settle=False))
+        carried = [((), nothing.point), *((f.effects, f.point) for f in ends)]
     return carried
 
 
@@ -224,7 +214,7 @@ def _pairs(
     problem: Problem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
     """Two effects together: each of the three that do best with every other, on more and more of the trials."""
-    singles = sorted(singles, key=lambda fit: fit.misfit)[:3]
+    singles = singles[:3]
     tasks: list[Task] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
@@ -233,17 +223,22 @@ def _pairs(
                 looks = other.looks(problem.twin)
                 for look in (looks[0], looks[-1]):
                     tasks.append(((*one.effects, other), np.concatenate([one.point, look[0]])))
-    chosen: dict[str, Fit] = {}
+    chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (24, 10, 5), strict=True):
         where, whole = (problem.early(share), False) if share < 1 else (problem, True)
-        ends = where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole)
-        chosen = {}
-        for fit in sorted((f for f in ends if f is not None), key=lambda f: f.misfit):
-            chosen.setdefault(fit.name, fit)
-        best = ", ".join(f"{name} {fit.misfit:.0f}" for name, fit in [*chosen.items()][:4])
-        report(f"pairs, first {100 * share:.0f} % of the trials: {best}")
-        tasks = [(f.effects, f.point) for f in [*chosen.values()][:most]]
-    return [*chosen.values()]
+        chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
+        leading = ", ".join(f"{fit.name} {fit.misfit:.0f}" for fit in chosen[:4])
+        report(f"pairs, first {100 * share:.0f} % of the trials: {leading}")
+        tasks = [(f.effects, f.point) for f in chosen[:most]]
+    return chosen
+
+
+def _best(fits: Iterable[Fit | None]) -> list[Fit]:
+    """The best fit of each effect, or pair of them, best first; without those that broke down."""
+    found: dict[str, Fit] = {}
+    for fit in sorted((f for f in fits if f is not None), key=lambda fit: fit.misfit):
+        found.setdefault(fit.name, fit)
+    return list(found.values())
 
 
 def _nothing(problem: Problem, tasks: Sequence[Task], report: Callable[[str], None]) -> tuple[Problem, Fit]:
