@@ -24,7 +24,7 @@ from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
-from torchsoro.sim2real.numerics import WALLS, choose_twin, measure
+from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
 from torchsoro.sim2real.report import Explanation, lead, write
 from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.twin import Twin
@@ -93,8 +93,18 @@ def main(options: Options) -> Explanation | None:
         twin = choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
     print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
     ensemble = Ensemble(twin, options.threads or THREADS)
-    numerics = measure(experiment, ensemble, trials)
-    problem = Problem(experiment, twin, trials=trials, numerics=numerics.deviation, ensemble=ensemble)
+    fine = finer(twin, len(trials), 2 * options.budget)
+    print(f"corrected by one of {fine.count} points")
+    numerics = measure(experiment, ensemble, fine)
+    problem = Problem(
+        experiment,
+        twin,
+        trials=trials,
+        numerics=numerics.deviation,
+        shift=numerics.shift,
+        correction=numerics.correction,
+        ensemble=ensemble,
+    )
     print(
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
         + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)

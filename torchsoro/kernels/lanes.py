@@ -17,9 +17,8 @@ import numpy as np
 from torchsoro.kernels.lane_cells import f32, fast, gather, remember, scatter, solid
 
 LANES = 16
-GRAZING = 0.2  # as in ``contact``
 TOUCH = 1e-6  # m in front of a plane within which adhesion holds
-RECOVERY = 200.0  # 1/s at which a node that is behind a plane is moved out
+SURFACE = 0.5  # stiffness of planes for a node, in its mass over the square of the step: what the step still bears
 MARKED = 5 * 3 * LANES  # numbers of a marker: place, velocity, derivatives by the reference place
 
 
@@ -221,28 +220,13 @@ def _attached(case, t, d, f):
 
 
 @fast
-def _touch(u0, u1, u2, n0, n1, n2, stick, friction, hold):
-    """As ``contact.touch``."""
-    normal = u0 * n0 + u1 * n1 + u2 * n2
-    if normal > hold:
-        return u0 - hold * n0, u1 - hold * n1, u2 - hold * n2
-    if normal < 0 or hold > 0:
-        if stick:
-            return f32(0), f32(0), f32(0)
-        t0, t1, t2 = u0 - normal * n0, u1 - normal * n1, u2 - normal * n2
-        speed = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
-        loss = friction * (hold - normal)
-        if speed > loss:
-            rest = f32(1) - loss / speed
-            return t0 * rest, t1 * rest, t2 * rest
-        return f32(0), f32(0), f32(0)
-    return u0, u1, u2
-
-
-@fast
 def _meet(mesh, case, d, v):
-    """Nodes of the surface against the planes, as ``contact.land``; what is behind a plane is moved out."""
+    """Nodes of the surface against the planes: what is behind a plane is pushed out, as by a stiff spring.
+
+    A node that came to rest at once would take its share of a blow's energy away, the more the larger the cells.
+    """
     dt = f32(case.dt)
+    push = f32(SURFACE) / dt
     for a in range(len(case.stick)):
         n0, n1, n2 = case.normals[a, 0], case.normals[a, 1], case.normals[a, 2]
         for node in mesh.surface:
@@ -250,33 +234,26 @@ def _meet(mesh, case, d, v):
             x, u = d[48 * node : 48 * node + 48], v[48 * node : 48 * node + 48]
             for lane in range(16):
                 gap = X + x[lane] * n0 + x[16 + lane] * n1 + x[32 + lane] * n2 - case.offset[a, lane]
-                u0, u1, u2 = u[lane], u[16 + lane], u[32 + lane]
-                normal = u0 * n0 + u1 * n1 + u2 * n2
-                ahead = max(gap, f32(0))
-                hold = f32(-1)
                 if gap < f32(TOUCH):
+                    u0, u1, u2 = u[lane], u[16 + lane], u[32 + lane]
+                    normal = u0 * n0 + u1 * n1 + u2 * n2
                     hold = case.adhesion[a, lane] * case.area[a, node] * dt * case.weight[node, lane]
-                if normal * dt + ahead < 0:
-                    r0, r1, r2 = _touch(
-                        u0, u1, u2, n0, n1, n2, case.stick[a], case.friction[a, lane], max(hold, f32(0))
-                    )
-                    if gap > 0:
-                        # What it goes before it arrives.
-                        l0, l1, l2 = u0 - r0 - normal * n0, u1 - r1 - normal * n1, u2 - r2 - normal * n2
-                        speed = max(-normal, f32(GRAZING) * np.sqrt(l0 * l0 + l1 * l1 + l2 * l2))
-                        x[lane] += gap * (l0 / speed - n0)
-                        x[16 + lane] += gap * (l1 / speed - n1)
-                        x[32 + lane] += gap * (l2 / speed - n2)
-                    u[lane], u[16 + lane], u[32 + lane] = r0, r1, r2
-                elif normal > 0 and hold >= 0:
-                    u[lane], u[16 + lane], u[32 + lane] = _touch(
-                        u0, u1, u2, n0, n1, n2, case.stick[a], case.friction[a, lane], hold
-                    )
-                if gap < 0:
-                    back = -gap * f32(RECOVERY) * dt
-                    x[lane] += back * n0
-                    x[16 + lane] += back * n1
-                    x[32 + lane] += back * n2
+                    # What the plane gives, and what adhesion takes.
+                    pressed = max(-gap, f32(0)) * push
+                    held = max(min(normal + pressed, hold), f32(0))
+                    t0, t1, t2 = u0 - normal * n0, u1 - normal * n1, u2 - normal * n2
+                    rest = f32(0)
+                    if not case.stick[a]:
+                        speed = np.sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+                        lost = case.friction[a, lane] * (pressed + hold)
+                        if speed > lost:
+                            rest = f32(1) - lost / speed
+                    elif pressed + held <= 0:
+                        rest = f32(1)
+                    normal += pressed - held
+                    u[lane] = t0 * rest + normal * n0
+                    u[16 + lane] = t1 * rest + normal * n1
+                    u[32 + lane] = t2 * rest + normal * n2
 
 
 @fast

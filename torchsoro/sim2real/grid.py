@@ -40,13 +40,18 @@ class Axis:
 
     Args:
         planes: Of the cells [cells + 1] m.
+        creases: Planes where slopes may jump, so that what is on one side does not hold what is on the other.
     """
 
-    def __init__(self, planes: np.ndarray) -> None:
+    def __init__(self, planes: np.ndarray, creases: Sequence[float] = ()) -> None:
         self.planes = planes
         self.cells = len(planes) - 1
-        self.nodes = self.cells + 2
-        self.knots = np.concatenate([[planes[0]] * 2, planes, [planes[-1]] * 2])
+        twice = np.isin(planes[1:-1], creases)
+        self.nodes = self.cells + 2 + int(twice.sum())
+        self.first = np.arange(self.cells) + np.concatenate([[0], np.cumsum(twice)])
+        """Lowest node of each cell, which has three."""
+        inner = np.repeat(planes[1:-1], 1 + twice)
+        self.knots = np.concatenate([[planes[0]] * 3, inner, [planes[-1]] * 3])
         self.places = (self.knots[1:-2] + self.knots[2:-1]) / 2
 
     def cell(self, x: np.ndarray) -> np.ndarray:
@@ -54,8 +59,8 @@ class Axis:
         return np.clip(np.searchsorted(self.planes, x, side="right") - 1, 0, self.cells - 1)
 
     def at(self, x: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weights [..., 3] of the nodes of a cell, number ``cell`` and the next two, and their derivatives [1/m]."""
-        k1, k2, k3, k4 = (self.knots[cell + i] for i in range(1, 5))
+        """Weights [..., 3] of the nodes of a cell, lowest first, and their derivatives [1/m]."""
+        k1, k2, k3, k4 = (self.knots[self.first[cell] + i] for i in range(1, 5))
         one, two = (k3 - x) / (k3 - k2), (x - k2) / (k3 - k2)
         first, last = one * (k3 - x) / (k3 - k1), two * (x - k2) / (k4 - k2)
         down, up = -2 * one / (k3 - k1), 2 * two / (k4 - k2)
@@ -124,7 +129,8 @@ class Grid:
     def corner(self, cells: np.ndarray) -> np.ndarray:
         """Lowest node of cells [..., 3]."""
         sx, sy = self.strides
-        return cells[..., 0] * sx + cells[..., 1] * sy + cells[..., 2]
+        x, y, z = (a.first[cells[..., i]] for i, a in enumerate(self.axes))
+        return x * sx + y * sy + z
 
     def stencil(self, x: np.ndarray, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes [N, 27] of points [N, 3] m, weights, and slopes [N, 27, 3]; in given cells, or where they are."""
@@ -229,7 +235,8 @@ class Grid:
             own = self.axes[a]
             share = np.zeros(own.nodes)
             for cell in range(own.cells):
-                share[cell : cell + 3] += own.table[0][cell].sum(0) * np.diff(own.planes)[cell] / 2
+                first = own.first[cell]
+                share[first : first + 3] += own.table[0][cell].sum(0) * np.diff(own.planes)[cell] / 2
             parts.append(share)
         area = np.zeros(self.counts)
         at: list = [slice(None)] * 3

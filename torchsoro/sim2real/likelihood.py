@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -52,6 +52,8 @@ class Likelihood:
         twin: Its body.
         trials: To fit; those with a recording if None.
         numerics: The twin's own error for each trial [M, A] m; none if None.
+        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
+        correction: By trial, what a finer twin then adds to motions [S, M, ...].
         beliefs: See there.
         priors: Of measurement errors.
         noise: [m]; that of the setup, or estimated, if None.
@@ -67,6 +69,8 @@ class Likelihood:
         *,
         trials: Sequence[Trial] | None = None,
         numerics: Sequence[np.ndarray] | None = None,
+        shift: Sequence[float] = (),
+        correction: Mapping[str, Motion] | None = None,
         beliefs: Beliefs | None = None,
         priors: Priors | None = None,
         noise: float | None = None,
@@ -81,6 +85,7 @@ class Likelihood:
         self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
         shape = recordings[0].place.shape[1:]
         self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
+        self.correction = correction or {}
         self.priors, self.slips = priors, tuple(slips)
         self.camera = Camera(experiment.setup, self.trials, priors, slips)
         self.bands = [Band(r, self.noise, n) for r, n in zip(recordings, self.numerics, strict=True)]
@@ -90,6 +95,7 @@ class Likelihood:
         self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.beliefs.modulus)]
         if experiment.setup.cavities:
             self.common.append((PressureGain(), self.beliefs.pressure))
+        self.shift = np.array(shift if len(shift) else [0.0] * len(self.common))
         self.tally = Tally()
 
     def only(
@@ -98,8 +104,9 @@ class Likelihood:
         *,
         slips: Sequence[Slip] | None = None,
         numerics: Sequence[np.ndarray] | None = None,
+        correction: Mapping[str, Motion] | None = None,
     ) -> Self:
-        """The same of other trials, with other slips, or with another error of the twin for each trial [M, A] m."""
+        """The same of other trials, with other slips, or another error or correction of the twin."""
         known = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
         common = np.asarray(np.mean(self.numerics, axis=0))
         there = type(self)(
@@ -107,6 +114,8 @@ class Likelihood:
             self.twin,
             trials=trials,
             numerics=numerics or [known.get(t.name, common) for t in trials],
+            shift=self.shift,
+            correction=self.correction if correction is None else correction,
             beliefs=self.beliefs,
             priors=self.priors,
             noise=self.noise,
@@ -153,6 +162,7 @@ class Likelihood:
     def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:
         """A scenario at points [B, K], in scales."""
         values = torch.from_numpy(points * self.scales(effects))
+        values[:, : len(self.shift)] += torch.from_numpy(self.shift)
         at = 0
         for effect, _ in self.common:
             scenario = effect(scenario, values[:, at : at + 1], self.twin)
@@ -169,9 +179,12 @@ class Likelihood:
         """For each request, the motions of all trials, each with a leading batch; all at once."""
         begin = time.perf_counter()
         varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
-        found = self.ensemble(varied)
-        spent = time.perf_counter() - begin
         count = len(self.scenarios)
+        found = [
+            motion.plus(self.correction[name]) if (name := self.trials[k % count].name) in self.correction else motion
+            for k, motion in enumerate(self.ensemble(varied))
+        ]
+        spent = time.perf_counter() - begin
         simulations = count * sum(len(points) for _, points in requests)
         self.tally.simulations += simulations
         self.tally.seconds += spent

@@ -13,13 +13,16 @@ import torch
 from torchsoro.sim2real.ensemble import SAFETY, THREADS, Ensemble
 from torchsoro.sim2real.experiment import Experiment, Setup, Trial
 from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.residual import Priors
 from torchsoro.sim2real.twin import Motion, Twin
 
 SPEED = 6e7  # points times variations times steps in a second of a thread
-WALLS = 3  # cells through each wall, at least
-SIMULATIONS = 300  # that an explanation takes for each trial
+WALLS = 1  # cells through each wall, at least; each bends by itself
+SIMULATIONS = 400  # that an explanation takes for each trial
 SURE = 1.5  # times the differences that were seen
-GAP = 5e-5  # m
+FINER = (2.0, 1.5)  # times as many cells along each axis, of the twin that corrects the one in use
+GAP = 2e-5  # m
+EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
 FLOOR = 0.003  # of the motion, below which no twin is trusted
 
 
@@ -28,17 +31,21 @@ class Numerics:
     """How far the twin is off by itself.
 
     Attributes:
-        deviation: For each trial [M, A] m, once modulus, pressure and measurement errors are fitted.
+        deviation: For each trial [M, A] m, once it is corrected, and modulus, pressure and measurement errors fitted.
+        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
+        correction: By trial, what the finer twin then adds to the motion that is believed [S, M, ...].
         edges: Of the cells of the twins that were compared [m], the one in use first.
-        walls: Cells through the thinnest wall, or edge.
+        walls: Cells through the thinnest wall, or edge, of each.
     """
 
     deviation: tuple[np.ndarray, ...]
+    shift: tuple[float, ...]
+    correction: dict[str, Motion]
     edges: tuple[float, ...]
-    walls: int
+    walls: tuple[int, ...]
 
 
-def cost(twin: Twin, trials: int, simulations: int = SIMULATIONS) -> float:
+def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     """Seconds that an explanation takes, about."""
     s = twin.setup
     speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
@@ -58,14 +65,14 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
         walls: Cells through each wall, at least.
 
     Raises:
-        ValueError: if so many cells through each wall take more than three times the budget.
+        ValueError: if the coarsest takes more than three times the budget.
     """
-    thin = min(setup.size)
+    thin, long = min(setup.size), max(setup.size)
     chambers = bool(setup.cavities)
-    edges = [max(setup.size) / n for n in (16, 12, 8)] if chambers else [thin / n for n in (3, 2)]
-    twins = [Twin(setup, edge=edge, walls=walls) for edge in edges]
+    edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
+    twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
     for twin in twins:
-        if cost(twin, trials) <= budget:
+        if cost(twin, trials) <= budget / 16:
             return twin
     needed = cost(twins[-1], trials)
     if needed > 3 * budget:
@@ -76,42 +83,69 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     return twins[-1]
 
 
+def finer(twin: Twin, trials: int, seconds: float) -> Twin:
+    """A twin with smaller cells, that simulates trials once in about so long.
+
+    Args:
+        twin: The one in use.
+        trials: To simulate.
+        seconds: On one thread; the least fine of those thought of takes as long as it takes.
+    """
+    least = min(a.cells for a in twin.grid.axes)
+    for share in FINER:
+        walls, across = math.ceil(share * twin.walls), math.ceil(share * least)
+        fine = Twin(twin.setup, edge=twin.edge / share, walls=walls, across=across)
+        # A group of lanes takes as long with one trial as with sixteen.
+        if cost(fine, trials, 16 / trials * THREADS) <= seconds:
+            break
+    return fine
+
+
 def measure(
     experiment: Experiment,
     ensemble: Ensemble,
-    trials: Sequence[Trial],
+    fine: Twin,
     *,
     report: Callable[[str], None] = lambda line: None,
 ) -> Numerics:
-    """Simulate what is believed with a coarser twin, and see what measurement errors and beliefs cannot take up.
+    """Simulate what is believed with a finer twin, and see what measurement errors and beliefs cannot take up.
 
     Args:
-        experiment: What is to be explained.
+        experiment: What is to be explained, with trials that are only predicted.
         ensemble: Of the twin in use.
-        trials: Of it.
+        fine: Another twin.
         report: Called with a line after each batch of simulations.
     """
     setup, twin = experiment.setup, ensemble.twin
-    walls = min(a.cells for a in twin.grid.axes)
-    # Cells are whole: another count through each wall, or across the body.
-    fewer = max(twin.walls - 1, 1)
-    coarse = Twin(setup, edge=1.4 * twin.edge, walls=fewer, across=max(walls - 1, 2))
-    here = Problem(experiment, twin, trials=trials, noise=1e-4, ensemble=ensemble, report=report)
-    other_ensemble = Ensemble(coarse, ensemble.threads)
-    there = Problem(experiment, coarse, trials=trials, noise=1e-4, ensemble=other_ensemble, report=report)
-    own = here.simulate([((), np.zeros((1, len(here.common))))])[0]
-    deviations = []
-    for other in [there.simulate([((), np.zeros((1, len(there.common))))])[0], *_touching(here)]:
-        deviations.append(_apart(here, other, _ratio(coarse, twin) if not deviations else math.inf))
+    trials = [t for t in experiment.trials if t.recording is not None]
+    everything = [*trials, *(t for t in experiment.heldout if t.recording is not None)]
+    common = {"noise": 1e-4, "report": report}
+    there = Problem(experiment, fine, trials=everything, ensemble=Ensemble(fine, ensemble.threads), **common)
+    other = _believed(there)
+    here = Problem(experiment, twin, trials=trials, ensemble=ensemble, priors=EXACT, **common)
+    fit = here.only(_told(here, other)).fit([((), None)], rounds=4)[0]
+    shift = np.zeros(len(here.common)) if fit is None else fit.belief
+    own = _believed(Problem(experiment, twin, trials=everything, ensemble=ensemble, shift=tuple(shift), **common))
+    correction = {t.name: b.plus(a, -1.0) for t, a, b in zip(everything, own, other, strict=True)}
+    here = Problem(experiment, twin, trials=trials, ensemble=ensemble, **common)
+    # Of the difference to cells that are so much larger, the finer twin's own error, which falls with their square;
+    # blows do not.
+    ratio = max((fine.count / twin.count) ** (1 / 3), 1.1)
+    share = 1.0 if here.scenarios[0].grounds else 1 / (ratio**2 - 1)
+    deviations = [_apart(here, other[: len(trials)], share)]
+    deviations += [_apart(here, touching, 0.5) for touching in _touching(here)]
     found = []
-    for i, motion in enumerate(own):
+    for i, motion in enumerate(own[: len(trials)]):
         left = SURE * np.sqrt(sum(d[i] ** 2 for d in deviations))
-        seen = here.camera.see(motion.alone(), i, np.zeros(len(here.camera.deviations)))[0]
+        seen = here.camera.see(motion, i, np.zeros(len(here.camera.deviations)))[0]
         # Error is shared: no marker is far better than the others.
         common = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
         found.append(np.maximum(left, max(common / 2, FLOOR * moved)))
-    return Numerics(deviation=tuple(found), edges=(twin.edge, coarse.edge), walls=walls)
+    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.cavities else t.walls for t in (twin, fine))
+    return Numerics(
+        deviation=tuple(found), shift=tuple(shift), correction=correction, edges=(twin.edge, fine.edge), walls=thinnest
+    )
 
 
 def _touching(here: Problem) -> list[list[Motion]]:
@@ -131,22 +165,16 @@ def _touching(here: Problem) -> list[list[Motion]]:
     return [[m.alone(k) for m in motions] for k in range(2)]
 
 
-def _apart(here: Problem, other: Sequence[Motion], ratio: float) -> list[np.ndarray]:
-    """How far other motions are off, once modulus, pressure and measurement errors are fitted [M, A] m for each trial.
+def _apart(here: Problem, other: Sequence[Motion], share: float) -> list[np.ndarray]:
+    """A share of how far other motions are off, once modulus, pressure and measurement errors are fitted.
 
-    Errors fall with the square of the cell: of the difference to cells that are ``ratio`` times larger, the finer
-    twin's own error is a share.
+    Returns:
+        For each trial [M, A] m.
     """
-    told = []
-    for i, (trial, motion) in enumerate(zip(here.trials, other, strict=True)):
-        assert trial.recording is not None
-        place = here.camera.see(motion.alone(), i, np.zeros(len(here.camera.deviations)))[0]
-        recording = dataclasses.replace(trial.recording, place=place)
-        told.append(dataclasses.replace(trial, recording=recording))
+    told = _told(here, other)
     fit = here.only(told).fit([((), None)], rounds=2)[0]
     if fit is None:
         return [np.zeros(n.shape) for n in here.numerics]
-    share = 1 / (ratio**2 - 1) if math.isfinite(ratio) else 0.5
     return [
         share * np.sqrt(((t.recording.place - seen) ** 2).mean(0))
         for t, seen in zip(told, fit.seen, strict=True)
@@ -154,6 +182,24 @@ def _apart(here: Problem, other: Sequence[Motion], ratio: float) -> list[np.ndar
     ]
 
 
-def _ratio(coarse: Twin, fine: Twin) -> float:
-    """How much larger the cells of a twin are."""
-    return max((fine.count / coarse.count) ** (1 / 3), 1.1)
+def _told(here: Problem, motions: Sequence[Motion]) -> list[Trial]:
+    """Trials that recorded just these motions."""
+    told = []
+    for i, (trial, motion) in enumerate(zip(here.trials, motions, strict=False)):
+        assert trial.recording is not None
+        place = here.camera.see(motion.alone(), i, np.zeros(len(here.camera.deviations)))[0]
+        recording = dataclasses.replace(trial.recording, place=place)
+        told.append(dataclasses.replace(trial, recording=recording))
+    return told
+
+
+def _believed(problem: Problem) -> list[Motion]:
+    """What is believed, for each trial.
+
+    Raises:
+        ValueError: if it breaks down.
+    """
+    motions = problem.simulate([((), np.zeros((1, len(problem.common))))])[0]
+    if not all(m.sound.all() for m in motions):
+        raise ValueError("setup: its simulation breaks down, wanted a body that bears what acts on it")
+    return [m.alone() for m in motions]

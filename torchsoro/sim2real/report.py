@@ -122,7 +122,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 t.name: float(np.sqrt((n**2).mean())) for t, n in zip(problem.trials, problem.numerics, strict=True)
             },
             "edges_m": list(e.numerics.edges),
-            "cells_through_thinnest_wall": e.numerics.walls,
+            "cells_through_thinnest_wall": list(e.numerics.walls),
             "excess": v.excess,
             "nothing": {"misfit": v.nothing.misfit, "samples": v.nothing.samples, "alike": correlation(v.nothing)},
         },
@@ -259,7 +259,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         f"Noise {1e3 * noise['standard_deviation_m']:.3f} mm. The simulation's own error, from twins with cells of "
         f"{', '.join(f'{1e3 * s:.2f}' for s in e.numerics.edges)} mm: "
         + ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
-        + f". {e.numerics.walls} cells through the thinnest wall."
+        + f". {e.numerics.walls[0]} cells through the thinnest wall, corrected by a twin with {e.numerics.walls[1]}."
     )
     deviations = dict(zip(e.problem.camera.names, e.problem.camera.deviations, strict=True))
     page.table(

@@ -43,6 +43,16 @@ class Motion:
             self, place=self.place[number], velocity=self.velocity[number], gradient=self.gradient[number]
         )
 
+    def plus(self, other: Motion, share: float = 1.0) -> Motion:
+        """With a share of another motion [S', M, ...] added, whose last values last."""
+        at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
+        return dataclasses.replace(
+            self,
+            place=self.place + share * other.place[at],
+            velocity=self.velocity + share * other.velocity[at],
+            gradient=self.gradient + share * other.gradient[at],
+        )
+
     @property
     def sound(self) -> np.ndarray:
         """Which of a batch did not break down, bool [...]."""
@@ -77,9 +87,9 @@ class Twin:
                     f"{end:g} m, within the body"
                 )
             breaks = [begin, *inner, end]
-            # Two walls that share a node would pull at each other across the chamber.
             least = [walls] * (len(breaks) - 1) if inner else [across]
-            axes.append(Axis(divide(breaks, least, edge)))
+            # Two walls that share a node would pull at each other across the chamber.
+            axes.append(Axis(divide(breaks, least, edge), inner))
         x, y, z = axes
         self.grid = Grid((x, y, z), [c.box for c in setup.cavities])
         self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]
