@@ -103,18 +103,6 @@ class Density(Hypothesis):
         return scenario.replace(density=scenario.density * values[:, :1].exp())
 
 
-class PoissonRatio(Hypothesis):
-    """The solid is more or less compressible than believed."""
-
-    name, seam = "poisson_ratio", "Poisson ratio"
-    quantities = (Quantity("change", "1", 0.03, -6.0, 3.0),)
-    starts = ((1.0,), (-2.0,))
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Nu + a."""
-        return scenario.replace(poisson_ratio=(scenario.poisson_ratio + values[:, 0]).clamp(0.0, 0.49))
-
-
 class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 

@@ -6,6 +6,7 @@ Searches ask for simulations and wait; those of all searches are simulated toget
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
@@ -290,6 +291,8 @@ class Problem(Likelihood):
             left, _ = self.residual([m.alone(k) for m in motions], errors)
             columns[:, i] = (r - left) / steps[i]
         misfit += float((self.belief(at, held)[0] ** 2).sum())
+        if not (math.isfinite(misfit) and np.isfinite(columns).all()):
+            return None
         return Point(misfit=misfit, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
 
     def _step(self, point: Point, held, places, low, high, damping) -> np.ndarray:

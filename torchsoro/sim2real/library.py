@@ -7,7 +7,6 @@ from torchsoro.sim2real.body_effects import (
     Density,
     LoadInertia,
     Modulus,
-    PoissonRatio,
     PrintOffset,
     Softening,
     SoftSide,
@@ -35,7 +34,7 @@ from torchsoro.sim2real.outer_effects import (
 def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
-        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density, PoissonRatio),
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness),
         *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialTilt),
     )

@@ -114,7 +114,7 @@ class Likelihood:
             self.twin,
             trials=trials,
             numerics=numerics or [known.get(t.name, common) for t in trials],
-            shift=self.shift,
+            shift=tuple(self.shift),
             correction=self.correction if correction is None else correction,
             beliefs=self.beliefs,
             priors=self.priors,

@@ -72,7 +72,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
     twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
     for twin in twins:
-        if cost(twin, trials) <= budget / 16:
+        if cost(twin, trials) <= budget / 64:
             return twin
     needed = cost(twins[-1], trials)
     if needed > 3 * budget:

@@ -22,6 +22,8 @@ FAR = 3.0  # times what noise and numerics explain, above which searches begin w
 EARLY = (0.12, 0.35)  # of the trials
 PRICED = 1.5  # times what noise and numerics explain, above which what the best effect leaves counts as one of them
 PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
+FORM = 0.002  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
+MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 TRIED = 4  # rounds of searches before the best are chosen
 FAINT = 4.0  # of the score that a look promises, below which nothing is fitted
@@ -43,7 +45,7 @@ class Thresholds:
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
     """
 
-    alarm: float = 20.0
+    alarm: float = 40.0
     margin: float = 6.0
     beyond: float = 4.0
     share: float = 0.75
@@ -58,7 +60,8 @@ class Candidate:
         fit: The best of it.
         score: What it gains in ln of the likelihood over nothing, less what its parameters are worth. Residuals of a
             wrong model are neither white nor of the variance that was thought: the gain counts in units of what the
-            best effect leaves, and neighbouring samples that are alike count once.
+            best effect leaves, neighbouring samples that are alike count once, and no difference counts that the form
+            of an effect may make.
         explained: Share of the misfit beyond noise and numerics that it takes away.
         kept: Error on trials that were left out over that without an effect; not a number where none was.
     """
@@ -119,7 +122,7 @@ def judge(
     problem, nothing = _nothing(problem, [((), None)], report, rounds=3)
     begin = problem.tally
     each = begin.seconds / max(begin.simulations, 1) * len(problem.trials)
-    most = int(np.clip(0.3 * budget / (10 * each), KEPT, len(effects)))
+    most = int(np.clip(0.3 * budget / (10 * each), KEPT, MOST))
     carried: list[Task] = []
     if nothing.misfit > FAR * nothing.samples:
         # Nothing is linear here, but less is wrong at first, where a wrong frequency is not yet a wrong phase. What a
@@ -215,18 +218,16 @@ def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: i
 def _pairs(
     problem: Problem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
-    """Two effects together: each of the three that do best with every other, on more and more of the trials."""
-    singles = singles[:3]
+    """Two effects together: each of the two that do best with every other, on more and more of the trials."""
+    singles = singles[:2]
     tasks: list[Task] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
         for other in effects:
             if other.name not in known:
-                looks = other.looks(problem.twin)
-                for look in (looks[0], looks[-1]):
-                    tasks.append(((*one.effects, other), np.concatenate([one.point, look[0]])))
+                tasks.append(((*one.effects, other), np.concatenate([one.point, other.looks(problem.twin)[-1][0]])))
     chosen: list[Fit] = []
-    for share, most in zip((*EARLY, 1.0), (24, 10, 5), strict=True):
+    for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         where, whole = (problem.early(share), False) if share < 1 else (problem, True)
         chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
         leading = ", ".join(f"{fit.name} {fit.misfit:.0f}" for fit in chosen[:4])
@@ -297,13 +298,15 @@ def tell(fit: Fit) -> str:
 
 
 def rank(fits: Sequence[Fit], nothing: Fit) -> list[Candidate]:
-    """Score fits, best first."""
+    """Score fits that are better than nothing, best first."""
+    fits = [fit for fit in fits if fit.misfit < nothing.misfit]
     if not fits:
         return []
     best = min(fits, key=lambda fit: fit.misfit)
     alike = correlation(best)
-    unit = 2 * max(1.0, best.misfit / best.samples) * alike
-    worth = 0.5 * math.log(best.samples / alike)
+    gained = nothing.misfit - best.misfit
+    unit = 2 * max(max(1.0, best.misfit / best.samples) * alike, FORM * gained)
+    worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
     found = [
         Candidate(
             fit=fit,
