@@ -23,6 +23,8 @@ from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
+from torchsoro.sim2real.hypothesis import Hypothesis
+from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
 from torchsoro.sim2real.report import Explanation, lead, write
@@ -50,6 +52,8 @@ class Options:
     """Edge of the twin's cells [m] instead."""
     walls: int = WALLS
     """Cells through each wall around a chamber, at least."""
+    effects: tuple[str, ...] = ()
+    """Names of the effects to think of; all of the library if none is given."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""
 
@@ -70,6 +74,18 @@ def predicted(options: Options) -> None:
         file.write(("\n".join(lines) + "\n").encode())
 
 
+def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
+    """Effects of the library by name; None for all.
+
+    Raises:
+        ValueError: for a name that is not known.
+    """
+    known = {effect.name: effect for effect in library()}
+    if unknown := set(names) - set(known):
+        raise ValueError(f"effects = {', '.join(sorted(unknown))}: wanted names out of {', '.join(known)}")
+    return [known[name] for name in names] or None
+
+
 def main(options: Options) -> Explanation | None:
     """Explain an experiment, or predict a trial.
 
@@ -80,6 +96,7 @@ def main(options: Options) -> Explanation | None:
         return predicted(options)
     if options.experiment is None:
         raise ValueError("experiment: wanted a folder, or --predict")
+    effects = named(options.effects)
     begin = time.perf_counter()
     torch.set_num_threads(1)
     experiment, confused = reordered(read_experiment(options.experiment))
@@ -109,7 +126,7 @@ def main(options: Options) -> Explanation | None:
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
         + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)
     )
-    verdict = judge(problem, kept=kept, budget=60 * options.budget)
+    verdict = judge(problem, effects, kept=kept, budget=60 * options.budget)
     problem = verdict.problem
     best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
     everything = [*trials, *kept]

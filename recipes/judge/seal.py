@@ -36,6 +36,7 @@ from visible import detectability
 from world import Line, World
 
 BATCHES = ("calibration", "test", "smoke")
+DRAWS = 60  # of a case, until a body bears what was drawn
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,7 +128,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     rng = np.random.default_rng(seed)
     specimen = SPECIMENS[plan.specimen]()
     started = time.perf_counter()
-    for _ in range(8):
+    for _ in range(DRAWS):
         errors = draw_errors(specimen, rng)
         bare = world = own_world(specimen, rng)
         drawn: list[Effect] = []
@@ -146,7 +147,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
         except Broken:
             continue
     else:
-        raise RuntimeError(f"{plan.name}: eight draws of {plan.effects} on {plan.specimen} turned inside out")
+        raise RuntimeError(f"{plan.name}: all draws of {plan.effects} on {plan.specimen} turned inside out")
     folder, kept = out / "cases" / plan.name, out / "sealed" / plan.name
     folder.mkdir(parents=True, exist_ok=True)
     kept.mkdir(parents=True, exist_ok=True)

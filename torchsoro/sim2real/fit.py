@@ -250,6 +250,8 @@ class Problem(Likelihood):
         anew = True  # whether the derivatives are those of this point
         for _ in range(rounds):
             step = self._step(current, held, places, low, high, damping)
+            if not step.any():
+                break
             eager = self.eager
             ahead = yield from self._linearise(
                 effects, current.at + step, current.errors, held, moving if eager else moving[:0], high

@@ -25,6 +25,8 @@ PAIRS = 0.002  # of the budget, that the simulation of all trials may take for p
 FORM = 0.002  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
+TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
+FOLDS = 4  # trials that are left out, one after the other
 TRIED = 4  # rounds of searches before the best are chosen
 FAINT = 4.0  # of the score that a look promises, below which nothing is fitted
 ROUNDS = 12  # of a search
@@ -145,7 +147,9 @@ def judge(
         tasks = [(f.effects, f.point) for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
     best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]])
     if best and best[0].misfit > FAR * best[0].samples and each < PAIRS * budget:
-        best = _best([*best, *_pairs(problem, effects, best, report)])
+        left = best[0].misfit - best[0].samples
+        pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]
+        best = _best([*best, *pairs])
     plain = rank(best, nothing)
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
     problem, nothing, fits = _priced(problem, nothing, best, report)
@@ -333,28 +337,31 @@ def _proved(
 ) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]]]:
     """The candidates near the best with their error on trials left out; and by name, errors as believed and with it."""
     near = [c for c in found[:3] if c.score > 0 and c.score > 0.5 * found[0].score]
-    fits, where, trials = [nothing, *(c.fit for c in near)], problem, list(kept)
-    if not kept:
-        if len(problem.trials) < 3:
-            return found, {}
-        trials, where = [problem.trials[-1]], problem.only(problem.trials[:-1])
-        errors = np.delete(nothing.errors, len(problem.trials) - 1)
-        again = where.fit([(f.effects, f.point) for f in fits], errors=errors, rounds=4)
-        fits = [new or old for new, old in zip(again, fits, strict=True)]
-        if any(new is None for new in again):
-            return found, {}
-    # Nothing is what is within beliefs.
-    fits[0] = dataclasses.replace(fits[0], point=np.clip(fits[0].point, -1, 1))
-    told = predict_all(where, fits, trials)
-    believed = predict_all(where, fits[:1], trials, believed=True)[0]
-    if not told[0] or not believed:
+    fits = [nothing, *(c.fit for c in near)]
+    if kept:
+        folds = [(problem, fits, list(kept))]
+    elif len(problem.trials) < 3 or not near:
         return found, {}
-    heldout = {
-        fit.name: {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
-        for fit, row in zip(fits, told, strict=True)
-    }
-    totals = [math.sqrt(sum(p.total**2 for p in row)) if row else math.inf for row in told]
-    proved = {id(c): t / totals[0] for c, t in zip(near, totals[1:], strict=True)}
+    else:
+        folds = []
+        for i, trial in enumerate(problem.trials[:FOLDS]):
+            where = problem.only([t for t in problem.trials if t is not trial])
+            again = where.fit([(f.effects, f.point) for f in fits], errors=np.delete(nothing.errors, i), rounds=4)
+            folds.append((where, [new or old for new, old in zip(again, fits, strict=True)], [trial]))
+    squares = np.zeros(len(fits))
+    heldout: dict[str, dict[str, tuple[float, float]]] = {fit.name: {} for fit in fits}
+    for where, (still, *others), trials in folds:
+        # Nothing is what is within beliefs.
+        mine = [dataclasses.replace(still, point=np.clip(still.point, -1, 1)), *others]
+        told = predict_all(where, mine, trials)
+        believed = predict_all(where, mine[:1], trials, believed=True)[0]
+        if not told[0] or not believed:
+            return found, {}
+        for k, (fit, row) in enumerate(zip(mine, told, strict=True)):
+            squares[k] += sum(p.total**2 for p in row) if row else math.inf
+            heldout[fit.name] |= {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
+    ratios = np.sqrt(squares / squares[0])
+    proved = {id(c): float(ratio) for c, ratio in zip(near, ratios[1:], strict=True)}
     return [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found], heldout
 
 
