@@ -43,7 +43,7 @@ archive
 robot
 results
 sim2real.recording
-sim2real.experiment sim2real.scenario sim2real.grid
+sim2real.experiment sim2real.scenario sim2real.grid sim2real.tracking
 sim2real.twin
 sim2real.ensemble
 sim2real.hypothesis sim2real.residual

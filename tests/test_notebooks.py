@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom, shortened: losses fall, and a ball of a fitted material bounces less."""
+"""The notebooks run from top to bottom: losses fall, a fitted ball bounces less, an effect of one's own is found."""
 
 from __future__ import annotations
 
@@ -47,6 +47,21 @@ def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, t
     assert restitution[0] > 0.85  # four cells across the ball are few
     assert 0.4 < restitution[3] < 0.65
     assert all(more < less + 0.01 for less, more in pairwise(restitution))
+
+
+@pytest.mark.notebook
+@pytest.mark.filterwarnings("default")
+def test_an_effect_of_ones_own_is_found_among_those_of_the_package(monkeypatch, tmp_path):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    notebook = nbformat.read(NOTEBOOKS / "03_why_it_moves_differently.ipynb", as_version=4)
+    notebook.cells.append(nbformat.v4.new_code_cell("print(first.kind, second.kind, fit.name, value)"))
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
+    ).execute()
+    before, after, name, value = notebook.cells[-1].outputs[-1].text.split()
+    assert before != "explained" and (after, name) == ("explained", "eddy_brake")
+    assert float(value) == pytest.approx(0.1, rel=0.03)
 
 
 def test_the_committed_notebooks_hold_their_figures_and_stay_small():
