@@ -24,6 +24,7 @@ from torchsoro.sim2real.numerics import Numerics
 from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
 
+FORM = 0.1  # of a number, that is due to an effect's form
 LEVEL = 0.9
 BELIEVED = 3.0  # standard deviations of a measurement error that are believed
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
@@ -61,16 +62,20 @@ def effect_rows(candidate: Candidate, weight: float, problem: Problem) -> list[d
     """The effects of a candidate, as in explanation.json; intervals by the law of errors, within bounds."""
     wide, rows, scenario = float(norm.ppf((1 + LEVEL) / 2)), [], problem.scenarios[0]
     fit = candidate.fit
-    spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
+    spread = max(1.0, fit.misfit / fit.samples) * correlation(fit)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
+        # Nature's form is not the hypothesis': of no number more is known than some share.
+        logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
+        own = np.where(logarithm, 1.0, values[:count])
+        whole = spread * covariance[:count, :count] + np.diag((FORM * own) ** 2)
         steps = 1e-4 * np.array([q.scale for q in effect.quantities])
         told = effect.told(values[:count], scenario)
         ahead = [effect.told(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
         parameters = {}
         for name, (value, unit) in told.items():
             slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
-            half = wide * spread * math.sqrt(max(float(slope @ covariance[:count, :count] @ slope), 0.0))
+            half = wide * math.sqrt(max(float(slope @ whole @ slope), 0.0))
             parameters[name] = {"value": value, "low": value - half, "high": value + half, "unit": unit}
             for quantity in effect.quantities:
                 if quantity.name == name:

@@ -42,13 +42,15 @@ class Thresholds:
     Attributes:
         alarm: Score below which nothing is missing.
         margin: Of the score, within which two effects are not told apart.
-        beyond: Times what noise and numerics explain, above which something is left.
+        quiet: Times what noise and numerics explain, below which nothing is missing if no effect is believed.
+        beyond: The same, above which the best effect leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
     """
 
     alarm: float = 40.0
     margin: float = 6.0
+    quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.75
     lost: float = 0.93
@@ -155,7 +157,7 @@ def judge(
     problem, nothing, fits = _priced(problem, nothing, best, report)
     # What is explained, and what is left, is told by noise and the twin's own error alone.
     explained = {c.fit.name: c.explained for c in plain}
-    found = [dataclasses.replace(c, explained=explained[c.fit.name]) for c in rank(fits, nothing)]
+    found = [dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0)) for c in rank(fits, nothing)]
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
@@ -372,7 +374,7 @@ def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: f
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
     if best is None or best.score < t.alarm:
-        return Verdict(kind="nothing_missing" if excess < t.beyond else "unknown_physics", **common)
+        return Verdict(kind="nothing_missing" if excess < t.quiet else "unknown_physics", **common)
     if excess > t.beyond and best.explained < t.share:
         return Verdict(kind="unknown_physics", **common)
     close = tuple(c for c in believed if c.score > best.score - t.margin)
