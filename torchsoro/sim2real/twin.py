@@ -88,6 +88,9 @@ class Twin:
                 )
             breaks = [begin, *inner, end]
             least = [walls] * (len(breaks) - 1) if inner else [across]
+            # Where every interval has one cell, what is quadratic along two axes has no strain at the points.
+            widest = int(np.diff(breaks).argmax())
+            least[widest] = max(least[widest], 2)
             # Two walls that share a node would pull at each other across the chamber.
             axes.append(Axis(divide(breaks, least, edge), inner))
         x, y, z = axes

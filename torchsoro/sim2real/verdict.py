@@ -14,6 +14,7 @@ from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.heldout import predict_all
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
+from torchsoro.sim2real.likelihood import EDGE
 from torchsoro.sim2real.residual import find_slips
 
 KEPT = 6  # searches that are led to their end, of those that do best at first
@@ -25,6 +26,7 @@ PAIRS = 0.002  # of the budget, that the simulation of all trials may take for p
 FORM = 0.002  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
+BELIEVED = 1 + 3 * EDGE  # of its tolerance, that a believed number may be off
 TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
 FOLDS = 4  # trials that are left out, one after the other
 TRIED = 4  # rounds of searches before the best are chosen
@@ -52,7 +54,7 @@ class Thresholds:
     margin: float = 6.0
     quiet: float = 1.8
     beyond: float = 4.0
-    share: float = 0.75
+    share: float = 0.8
     lost: float = 0.93
 
 
@@ -152,12 +154,15 @@ def judge(
         left = best[0].misfit - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]
         best = _best([*best, *pairs])
-    plain = rank(best, nothing)
+    believed = _within(problem, nothing)
+    plain = rank(best, nothing, believed)
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
+    own = problem
     problem, nothing, fits = _priced(problem, nothing, best, report)
+    believed = believed if problem is own else _within(problem, nothing)
     # What is explained, and what is left, is told by noise and the twin's own error alone.
     explained = {c.fit.name: c.explained for c in plain}
-    found = [dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0)) for c in rank(fits, nothing)]
+    found = [dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0)) for c in rank(fits, nothing, believed)]
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
@@ -303,21 +308,37 @@ def tell(fit: Fit) -> str:
     return ", ".join(parts)
 
 
-def rank(fits: Sequence[Fit], nothing: Fit) -> list[Candidate]:
-    """Score fits that are better than nothing, best first."""
-    fits = [fit for fit in fits if fit.misfit < nothing.misfit]
+def _within(problem: Problem, nothing: Fit) -> float:
+    """The misfit without an effect, with modulus and pressure no further off than one believes."""
+    point = np.clip(nothing.point, -BELIEVED, BELIEVED)
+    if (point == nothing.point).all():
+        return nothing.misfit
+    motions = problem.simulate([((), point[None])])[0]
+    misfit = problem.measure([m.alone() for m in motions], nothing.errors)[0]
+    return max(misfit, nothing.misfit) if math.isfinite(misfit) else nothing.misfit
+
+
+def rank(fits: Sequence[Fit], nothing: Fit, believed: float) -> list[Candidate]:
+    """Score fits that are better than nothing and within beliefs, best first.
+
+    Args:
+        fits: Of effects.
+        nothing: The fit without any.
+        believed: Its misfit within beliefs.
+    """
+    fits = [f for f in fits if f.misfit < nothing.misfit and np.abs(f.point[: len(f.belief)]).max() < BELIEVED]
     if not fits:
         return []
     best = min(fits, key=lambda fit: fit.misfit)
     alike = correlation(best)
-    gained = nothing.misfit - best.misfit
+    gained = believed - best.misfit
     unit = 2 * max(max(1.0, best.misfit / best.samples) * alike, FORM * gained)
     worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
     found = [
         Candidate(
             fit=fit,
-            score=(nothing.misfit - fit.misfit) / unit - fit.unknowns * worth,
-            explained=(nothing.misfit - fit.misfit) / max(nothing.misfit - fit.samples, 1.0),
+            score=(believed - fit.misfit) / unit - fit.unknowns * worth,
+            explained=(believed - fit.misfit) / max(believed - fit.samples, 1.0),
         )
         for fit in fits
     ]
@@ -354,7 +375,7 @@ def _proved(
     heldout: dict[str, dict[str, tuple[float, float]]] = {fit.name: {} for fit in fits}
     for where, (still, *others), trials in folds:
         # Nothing is what is within beliefs.
-        mine = [dataclasses.replace(still, point=np.clip(still.point, -1, 1)), *others]
+        mine = [dataclasses.replace(still, point=np.clip(still.point, -BELIEVED, BELIEVED)), *others]
         told = predict_all(where, mine, trials)
         believed = predict_all(where, mine[:1], trials, believed=True)[0]
         if not told[0] or not believed:
