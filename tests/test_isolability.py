@@ -18,9 +18,11 @@ from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.isolability import isolability
 from torchsoro.sim2real.likelihood import Beliefs
 from torchsoro.sim2real.likeness import Response, cleared, compare, first_seen, imitation, settle
-from torchsoro.sim2real.next_experiment import Proposal, advice, next_experiment
-from torchsoro.sim2real.report import draw_alike
+from torchsoro.sim2real.next_experiment import REPEAT, Proposal, advice, next_experiment
+from torchsoro.sim2real.numerics import Numerics
+from torchsoro.sim2real.report import Explanation, as_json, draw_alike, lead
 from torchsoro.sim2real.scenario import Scenario
+from torchsoro.sim2real.verdict import Candidate, Verdict
 
 # A chain: four masses between springs, from a wall on; two of them are seen. ----------------------------------------
 
@@ -226,10 +228,36 @@ def test_a_known_pull_tells_density_from_modulus(problem):
     heavy, soft = ((Density(),), np.array([0.0, 3.0])), ((Modulus(),), np.array([0.0, -3.0]))
     proposals = next_experiment(problem, heavy, soft)
     assert problem.tally.simulations - before < 64
-    same = next(p for p in proposals if p.words == "repeat")
+    same = next(p for p in proposals if p.words == REPEAT)
     best = proposals[0]
     assert same.alike > 0.97 and same.distance < 10
     assert "pull" in best.words and best.alike < 0.9 and best.distance > 100
-    said = advice(proposals)
-    assert said.startswith("To tell them apart, record next: the same with a pull of")
-    assert not advice([Proposal(words="repeat", alike=1.0, distance=0.0)]) and not advice([])
+    assert advice(proposals).startswith("To tell them apart, record next: the same with a pull of")
+    assert advice([Proposal(words=REPEAT, alike=1.0, distance=0.0)]).startswith("None of the trials")
+    assert not advice([])
+
+
+def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(problem, told):
+    density, nothing = problem.fit([((effect("density"),), None), ((), None)], rounds=1)
+    chosen = Candidate(fit=density, score=50.0, explained=1.0)
+    verdict = Verdict(
+        kind="cannot_distinguish", problem=problem, nothing=nothing, ranking=(chosen,), chosen=(chosen,) * 2
+    )
+    found = Explanation(
+        problem=problem,
+        numerics=Numerics(deviation=(), shift=(), correction={}, edges=(0.01,), walls=(2,)),
+        verdict=verdict,
+        before=(),
+        after=(),
+        heldout=(),
+        seconds=1.0,
+        isolability=told,
+        following=(
+            Proposal(words="the same for 9 s", alike=0.5, distance=900.0),
+            Proposal(words=REPEAT, alike=1.0, distance=0.0),
+        ),
+    )
+    assert "record next: the same for 9 s; there they differ by 30 standard deviations" in lead(found)
+    assert as_json(found, {})["next"][0] == {"record": "the same for 9 s", "alike": 0.5, "distance": 900.0}
+    explained = dataclasses.replace(found, verdict=dataclasses.replace(verdict, kind="explained"))
+    assert "record next" not in lead(explained)

@@ -20,6 +20,8 @@ from torchsoro.sim2real.twin import Motion, Twin
 
 LONGER = 1.5  # times as long; every simulation of the menu takes as long as its longest
 END = 0.1  # of the body's length, that is pulled at its free end
+CLEAR = 3.0  # standard deviations, by which explanations differ that a trial tells apart
+REPEAT = "the same trial once more"
 PULL = 0.5  # of the body's weight
 SAGS = 9.81  # m/s2, of a body that is turned, where it weighs nothing as it is
 
@@ -57,7 +59,7 @@ class Choice:
 
 
 def next_experiment(problem: Problem, one: Explained, other: Explained) -> list[Proposal]:
-    """Trials that tell two explanations apart, best first; the same trial once more, "repeat", is among them.
+    """Trials that tell two explanations apart, best first; the same trial once more is among them.
 
     Each explanation is simulated as it was fitted; the other may then change all its numbers, with modulus, pressure
     and measurement errors, to say the same. All is one batch of simulations.
@@ -102,13 +104,18 @@ def next_experiment(problem: Problem, one: Explained, other: Explained) -> list[
 
 
 def advice(proposals: Sequence[Proposal]) -> str:
-    """The best of them in a sentence, if it tells more than the same trial once more; empty if none does."""
-    same = next((p for p in proposals if p.words == "repeat"), None)
-    best = proposals[0] if proposals else None
-    if best is None or best is same or best.alike > 0.999:
+    """The best of them in a sentence, or that none tells them apart; empty without any."""
+    same = next((p for p in proposals if p.words == REPEAT), None)
+    if same is None:
         return ""
-    now = "" if same is None else f", instead of {100 * same.alike:.1f} % now"
-    return f"To tell them apart, record next: {best.words}; there they are {100 * best.alike:.1f} % alike{now}."
+    best = proposals[0]
+    if best is same or best.distance < max(CLEAR**2, 2 * same.distance):
+        return "None of the trials that were thought of would tell them apart."
+    return (
+        f"To tell them apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
+        f"deviations and are {100 * best.alike:.0f} % alike, in the same trial once more by {same.distance**0.5:.1f} "
+        f"and {100 * same.alike:.0f} %."
+    )
 
 
 def menu(trial: Trial, twin: Twin, extra: Marker) -> list[Choice]:
@@ -123,7 +130,7 @@ def menu(trial: Trial, twin: Twin, extra: Marker) -> list[Choice]:
     same = dataclasses.replace(trial, recording=trial.recording)
     longest = int(np.argmax(s.size))
     found = [
-        Choice(words="repeat", trial=same),
+        Choice(words=REPEAT, trial=same),
         Choice(words=f"the same with another marker at {_mm(extra.at)}", trial=same, marker=True),
     ]
 
