@@ -77,9 +77,12 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
         if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
     ]
     n = len(problem.common)
-    looks = [_looks(effect, problem) for effect in effects]
+    # Effects that are fitted always need no simulation of their own.
+    fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
+    others = [e for e in effects if type(e) not in fitted]
+    looks = [_looks(effect, problem) for effect in others]
     still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
-    asked = [((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(effects, looks, strict=True)]
+    asked = [((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, looks, strict=True)]
     problem = problem.only(problem.trials)
     problem.ensemble = Even(problem.twin, problem.ensemble.threads)
     base, *found = problem.simulate([((), still), *asked])
@@ -90,10 +93,17 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
     blocks[0] = blocks[0][:, 1:] / SMALL
     by = errors_of(problem.camera, problem.bands, believed)
     common, *rest = np.split(shortened(blocks, by, problem.camera), np.cumsum([b.shape[1] for b in blocks])[:-1], 1)
-    responses = [
-        _response(effect, mine, block, np.all([m.sound for m in motions], axis=0))
-        for effect, mine, block, motions in zip(effects, looks, rest, found, strict=True)
-    ]
+    known = {
+        id(effect): _response(effect, mine, block, np.all([m.sound for m in motions], axis=0))
+        for effect, mine, block, motions in zip(others, looks, rest, found, strict=True)
+    }
+    for effect in effects:
+        if type(effect) in fitted:
+            k = fitted[type(effect)]
+            column = common[:, k : k + 1] * effect.quantities[0].scale / problem.common[k][1]
+            free = np.ones(1, bool)
+            known[id(effect)] = Response(paths=((np.ones(1), column),), cones=((column, free),), either=True)
+    responses = [known[id(effect)] for effect in effects]
     detectable, alike = compare(responses, common, belief_of(problem), score)
     first = [e.quantities[0] for e in effects]
     return Isolability(
@@ -180,18 +190,16 @@ def _response(effect: Hypothesis, looks: list[np.ndarray], columns: np.ndarray, 
             # Strengths are in the first quantity's unit: directions in that unit count, the most visible of them.
             alike = [q.unit == effect.quantities[0].unit for q in effect.quantities]
             some = mine[:, directions[:, :kinds][:, alike].any(1)]
-            turn = np.linalg.svd(some, full_matrices=False)[2]
-            paths.append((np.array([SMALL]), some @ turn[:1].T))
+            turn = np.linalg.svd(some, full_matrices=False)[2][:1]
+            paths.append((np.array([SMALL]), some @ turn.T * (1 if turn.sum() > 0 else -1)))
         return Response(paths=tuple(paths), cones=tuple(cones), either=bool(backwards[0]))
     if kinds == 1 and not effect.local and kept and np.linalg.norm(kept[0][1]) < NOTHING:
         # It begins at some strength.
         strong = [(d[0, 0], mine) for d, mine in kept if d[0, 0] * kept[-1][0][0, 0] > 0]
         course = np.concatenate([mine for _, mine in strong], 1)
         paths = [(np.abs([d for d, _ in strong]), course)]
-        cones = [
-            (course[:, k : k + 2], np.zeros(course[:, k : k + 2].shape[1], bool))
-            for k in range(max(len(strong) - 1, 1))
-        ]
+        pairs = [course[:, max(k - 1, 0) : k + 1] for k in range(len(strong))]
+        cones = [(pair, np.zeros(pair.shape[1], bool)) for pair in pairs]
     else:
         weak = kept[:1] if kinds == 1 and not effect.local else kept
         paths = [(np.abs(d[0, :1]), mine) for d, mine in weak]
