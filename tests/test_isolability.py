@@ -166,6 +166,15 @@ class Idle(Hypothesis):
         return scenario
 
 
+class Broken(Idle):
+    """Breaks down."""
+
+    name = "broken"
+
+    def forward(self, scenario: Scenario, values: torch.Tensor, twin) -> Scenario:
+        return scenario.replace(displacement=scenario.displacement + math.nan * values[:, :, None])
+
+
 @pytest.fixture(scope="module")
 def problem(made):  # noqa: F811
     """From rest, under its own weight, believed to be springy: no time but that of density and modulus."""
@@ -177,7 +186,7 @@ def problem(made):  # noqa: F811
 @pytest.fixture(scope="module")
 def told(problem):
     names = ("modulus", "density", "attached_mass", "drag", "gravity_tilt")
-    return isolability(problem, [*map(effect, names), Twice(), Idle()])
+    return isolability(problem, [*map(effect, names), Twice(), Idle(), Broken()])
 
 
 def test_effects_that_are_the_same_are_alike(told):
@@ -204,10 +213,12 @@ def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than
     assert found.alike[mass, drag] < 0.97
 
 
-def test_what_changes_nothing_is_never_seen(told):
-    idle = told.effects.index("idle")
-    assert math.isinf(told.detectable[idle]) and np.isfinite(np.delete(told.detectable, idle)).all()
-    assert not np.delete(told.alike[idle], idle).any() and not np.delete(told.alike[:, idle], idle).any()
+def test_what_changes_nothing_or_breaks_down_is_never_seen(told):
+    idle, broken = told.effects.index("idle"), told.effects.index("broken")
+    assert np.isinf(told.detectable[[idle, broken]]).all()
+    assert np.isfinite(np.delete(told.detectable, [idle, broken])).all()
+    for k in (idle, broken):
+        assert not np.delete(told.alike[k], k).any() and not np.delete(told.alike[:, k], k).any()
     answer = json.loads(json.dumps(told.as_json()))
     assert answer["detectable"][idle]["value"] is None and answer["effects"][idle] == "idle"
     draw_alike(told)

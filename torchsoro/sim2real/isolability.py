@@ -133,12 +133,13 @@ def belief_of(problem: Problem) -> Belief:
 
 
 def changes(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion], motions: Sequence[Motion]) -> np.ndarray:
-    """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]."""
+    """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]; 0 for broken ones."""
+    sound = np.all([m.sound for m in motions], axis=0)
     still = np.zeros(len(camera.deviations))
     parts = []
     for i, (band, base, motion) in enumerate(zip(bands, believed, motions, strict=True)):
         seen = camera.see(base, i, still)[0]
-        each = [camera.see(motion.alone(k), i, still)[0] - seen for k in range(len(motion.place))]
+        each = [camera.see(motion.alone(k), i, still)[0] - seen if good else 0 * seen for k, good in enumerate(sound)]
         parts.append(band.whiten(np.stack(each, -1)))
     return np.concatenate(parts)
 
@@ -152,7 +153,7 @@ def errors_of(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion])
 
 def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, camera: Camera) -> np.ndarray:
     """Changes without what measurement errors take up, in as few rows as keep all lengths and angles."""
-    left = cleared(np.nan_to_num(np.concatenate(blocks, 1)), by, 1 / camera.deviations)
+    left = cleared(np.concatenate(blocks, 1), by, 1 / camera.deviations)
     return np.asarray(np.linalg.qr(left, mode="r"))
 
 

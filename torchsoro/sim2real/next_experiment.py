@@ -113,8 +113,8 @@ def advice(proposals: Sequence[Proposal]) -> str:
         return "None of the trials that were thought of would tell them apart."
     return (
         f"To tell them apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
-        f"deviations and are {100 * best.alike:.0f} % alike, in the same trial once more by {same.distance**0.5:.1f} "
-        f"and {100 * same.alike:.0f} %."
+        f"deviations and are {100 * best.alike:.0f} % alike, where the same trial once more gives "
+        f"{same.distance**0.5:.1f} and {100 * same.alike:.0f} %."
     )
 
 
