@@ -25,7 +25,9 @@ from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
+from torchsoro.sim2real.isolability import isolability
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
+from torchsoro.sim2real.next_experiment import next_experiment
 from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
 from torchsoro.sim2real.report import Explanation, lead, write
 from torchsoro.sim2real.residual import reordered
@@ -126,9 +128,14 @@ def main(options: Options) -> Explanation | None:
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
         + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)
     )
+    tells = isolability(problem)
     verdict = judge(problem, effects, kept=kept, budget=60 * options.budget)
     problem = verdict.problem
     best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
+    following = []
+    if verdict.kind == "cannot_distinguish":
+        one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
+        following = next_experiment(problem, one, other)
     everything = [*trials, *kept]
     found = Explanation(
         problem=problem,
@@ -138,6 +145,8 @@ def main(options: Options) -> Explanation | None:
         after=tuple(predict(problem, best, everything)),
         heldout=tuple(t.name for t in kept),
         seconds=time.perf_counter() - begin,
+        isolability=tells,
+        following=tuple(following),
     )
     settings = {
         "experiment": str(options.experiment),

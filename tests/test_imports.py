@@ -50,9 +50,10 @@ sim2real.hypothesis sim2real.residual
 sim2real.body_effects
 sim2real.outer_effects
 sim2real.library
-sim2real.likelihood
+sim2real.likelihood sim2real.likeness
 sim2real.fit
-sim2real.heldout sim2real.model sim2real.numerics
+sim2real.heldout sim2real.isolability sim2real.model sim2real.numerics
+sim2real.next_experiment
 sim2real.verdict
 sim2real.report
 """

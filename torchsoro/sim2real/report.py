@@ -20,6 +20,9 @@ from torchsoro.document import Document
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.heldout import Prediction
+from torchsoro.sim2real.isolability import SAME, Isolability
+from torchsoro.sim2real.likeness import SCORE
+from torchsoro.sim2real.next_experiment import Proposal, advice
 from torchsoro.sim2real.numerics import Numerics
 from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
@@ -42,6 +45,8 @@ class Explanation:
         after: The same with the best effect, or with nothing where nothing is missing.
         heldout: Names of the trials that were only predicted.
         seconds: It took.
+        isolability: What the experiment can tell, if that was asked.
+        following: What could be recorded next, best first, where effects are not told apart.
     """
 
     problem: Problem
@@ -51,6 +56,8 @@ class Explanation:
     after: tuple[Prediction, ...]
     heldout: tuple[str, ...]
     seconds: float
+    isolability: Isolability | None = None
+    following: tuple[Proposal, ...] = ()
 
     @property
     def best(self) -> Fit:
@@ -139,6 +146,8 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "error_before": errors(e.before),
         "error_after": errors(e.after),
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
+        "isolability": None if e.isolability is None else e.isolability.as_json(),
+        "next": [{"record": p.words, "alike": p.alike, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),
         "settings": dict(settings),
@@ -171,7 +180,8 @@ def lead(e: Explanation) -> str:
         return f"Something is missing that is none of the known effects.{tried}{gain}"
     parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
-        return f"One of these is missing, and this recording cannot tell which: {parts}.{gain}{_beyond(e)}"
+        following = f" {advice(e.following)}" if advice(e.following) else ""
+        return f"One of these is missing, and this recording cannot tell which: {parts}.{following}{gain}{_beyond(e)}"
     second = next((c for c in v.ranking if c is not v.chosen[0]), None)
     lost = ""
     if second is not None:
@@ -245,6 +255,9 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     ]
     if considered:
         page.table(considered, "Score: gain in ln of the likelihood, studentised, less what the parameters are worth.")
+    if e.isolability is not None:
+        page.section("What this experiment can tell")
+        write_isolability(page, e.isolability)
     page.section("Errors")
     page.table(
         [
@@ -275,6 +288,43 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     )
     page.text(f"{e.problem.tally.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")
     page.save(out / "report.html")
+
+
+def write_isolability(page: Document, found: Isolability) -> None:
+    """What would be seen, and what looks alike."""
+    alike = found.confused()
+    page.table(
+        [
+            {
+                "effect": name,
+                "quantity": quantity,
+                "seen from": value if math.isfinite(value) else None,
+                "unit": unit,
+                "may pass for it": ", ".join(b for a, b in alike if a == name),
+            }
+            for name, (quantity, unit), value in zip(found.effects, found.quantities, found.detectable, strict=True)
+        ],
+        f"By times, markers and noise alone: the strength from which on an effect stands out (score {SCORE:g}), beside "
+        f"measurement errors, modulus and pressure; and what else can make {100 * SAME:.0f} % of its change.",
+    )
+    caption = "How much of the change that the effect of a row makes, that of a column can imitate."
+    page.figure(draw_alike(found), caption)
+
+
+def draw_alike(found: Isolability) -> Figure:
+    """A heat map of what looks alike."""
+    count = len(found.effects)
+    figure = Figure(figsize=(3.2 + 0.36 * count, 2.2 + 0.3 * count), layout="constrained")
+    panel: Axes = figure.subplots()
+    image = panel.imshow(found.alike, vmin=0, vmax=1, cmap="Blues", aspect="auto")
+    for i, j in np.ndindex(count, count):
+        if i != j and found.alike[i, j] > 0.5:
+            color = "white" if found.alike[i, j] > 0.7 else "black"
+            panel.text(j, i, f"{found.alike[i, j]:.2f}", ha="center", va="center", fontsize=6, color=color)
+    panel.set_xticks(range(count), found.effects, rotation=90, fontsize=7)
+    panel.set_yticks(range(count), found.effects, fontsize=7)
+    figure.colorbar(image, ax=panel, shrink=0.8)
+    return figure
 
 
 def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:

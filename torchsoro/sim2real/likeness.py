@@ -1,0 +1,159 @@
+"""What whitened changes share: linear algebra on columns, which knows no twin.
+
+Every effect changes what would be recorded. Counted in noise, and without what measurement errors, modulus and pressure
+within their beliefs can take up, that change has a length, which says whether the effect is seen, and a direction,
+which other effects may share.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import least_squares, nnls, root_scalar
+
+SCORE = 40.0  # squared length of a whitened change at which it stands out
+FARTHEST = 1e4  # times the largest strength that was simulated, beyond which an effect counts as never seen
+
+Belief = Callable[[np.ndarray], np.ndarray]  # what values of the common unknowns cost: residuals [C] of values [C]
+
+
+def cleared(changes: np.ndarray, nuisances: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Changes less what nuisances with Gaussian priors take up.
+
+    Args:
+        changes: Whitened [N, K].
+        nuisances: Whitened change by each nuisance [N, L].
+        slopes: One over the standard deviation of each nuisance [L], positive.
+
+    Returns:
+        What is left [N + L, K]; the last rows are what the nuisances cost. The squared length of a column is its
+        generalised least-squares misfit.
+    """
+    padded = np.concatenate([changes, np.zeros((len(slopes), changes.shape[1]))])
+    basis, _ = np.linalg.qr(np.concatenate([nuisances, np.diag(slopes)]))
+    return padded - basis @ (basis.T @ padded)
+
+
+def imitation(change: np.ndarray, directions: np.ndarray, free: np.ndarray) -> float:
+    """How much of a change directions can make: the cosine of its angle to their cone, 0 to 1.
+
+    Args:
+        change: [N].
+        directions: That add up [N, D].
+        free: Whether each may also be taken backwards, bool [D].
+    """
+    lengths, size = np.linalg.norm(directions, axis=0), float(np.linalg.norm(change))
+    some = lengths > 1e-12 * max(size, 1e-300)
+    if not size or not some.any():
+        return 0.0
+    unit = directions[:, some] / lengths[some]
+    _, off = nnls(np.concatenate([unit, -unit[:, free[some]]], 1), change / size)
+    return math.sqrt(max(1 - off**2, 0.0))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Response:
+    """Whitened changes by one effect.
+
+    Attributes:
+        paths: Alternatives: strengths, in scales, from the smallest on [S], and changes at them [N, S].
+        cones: Alternatives: what the effect can do at all, as directions that add up [N, D], and which of them may be
+            taken backwards, bool [D].
+        either: Whether strengths of both signs make sense.
+    """
+
+    paths: tuple[tuple[np.ndarray, np.ndarray], ...]
+    cones: tuple[tuple[np.ndarray, np.ndarray], ...]
+    either: bool
+
+
+def settle(change: np.ndarray, common: np.ndarray, belief: Belief) -> tuple[float, np.ndarray]:
+    """What the common unknowns leave of a change.
+
+    Args:
+        change: [N].
+        common: Change by each of them [N, C].
+        belief: What their values cost.
+
+    Returns:
+        Length of what is left, beliefs included, and slopes [C] of the Gaussian priors that cost as much there.
+    """
+    basis, root = np.linalg.qr(common)
+    inner = basis.T @ change
+    rest = float(change @ change - inner @ inner)
+    slight = belief(np.full(common.shape[1], 1e-3)) / 1e-3
+    start = np.linalg.lstsq(np.concatenate([root, np.diag(slight)]), np.append(inner, 0 * slight), rcond=None)[0]
+    found = least_squares(lambda x: np.append(inner - root @ x, belief(x)), np.clip(start, -1.5, 1.5))
+    x = np.where(np.abs(found.x) < 1e-3, 1e-3, found.x)
+    return math.sqrt(max(rest, 0.0) + 2 * float(found.cost)), np.abs(belief(x) / x)
+
+
+def first_seen(
+    strengths: np.ndarray, changes: np.ndarray, common: np.ndarray, belief: Belief, score: float
+) -> tuple[float, np.ndarray]:
+    """The strength at which an effect stands out, and its change there; straight lines between what was simulated.
+
+    Args:
+        strengths: In scales, from the smallest on [S].
+        changes: At each [N, S].
+        common: Change by each common unknown [N, C].
+        belief: What their values cost.
+        score: Squared length at which a change stands out.
+    """
+    at = np.append(0.0, strengths)
+    known = np.concatenate([np.zeros((len(changes), 1)), changes], 1)
+
+    def change(s: float) -> np.ndarray:
+        if s > at[-1]:
+            return known[:, -1] * s / at[-1]
+        k = max(int(np.searchsorted(at, s)), 1)
+        share = (s - at[k - 1]) / (at[k] - at[k - 1])
+        return (1 - share) * known[:, k - 1] + share * known[:, k]
+
+    def above(s: float) -> float:
+        return settle(change(s), common, belief)[0] - math.sqrt(score)
+
+    low = 0.0
+    for high in (*strengths, *(strengths[-1] * np.geomspace(10, FARTHEST, 4))):
+        if above(high) > 0:
+            s = float(root_scalar(above, bracket=(low, high), rtol=1e-3).root)
+            return s, change(s)
+        low = float(high)
+    return math.inf, known[:, -1]
+
+
+def compare(
+    responses: Sequence[Response], common: np.ndarray, belief: Belief, score: float = SCORE
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which effects are seen, and which of them are alike.
+
+    Args:
+        responses: Of E effects, without what measurement errors take up.
+        common: Change by each common unknown [N, C].
+        belief: What their values cost.
+        score: Squared length at which a change stands out.
+
+    Returns:
+        Strengths at which they stand out [E], in scales, infinite for what is never seen; and how much of the change
+        that effect i makes then effect j can imitate [E, E].
+    """
+    count = len(responses)
+    detectable, alike = np.full(count, np.inf), np.eye(count)
+    for i, mine in enumerate(responses):
+        seen = [first_seen(*path, common, belief, score) for path in mine.paths]
+        if not seen:
+            continue
+        detectable[i], change = min(seen, key=lambda s: s[0])
+        if not math.isfinite(detectable[i]):
+            continue
+        slopes = settle(change, common, belief)[1]
+        left = cleared(change[:, None], common, slopes)[:, 0]
+        for j, other in enumerate(responses):
+            signs = (1, -1) if mine.either or other.either else (1,)
+            for directions, free in other.cones if j != i else ():
+                cone = cleared(directions, common, slopes)
+                alike[i, j] = max(alike[i, j], *(imitation(sign * left, cone, free) for sign in signs))
+    return detectable, alike
