@@ -52,7 +52,8 @@ sim2real.outer_effects
 sim2real.library
 sim2real.likelihood
 sim2real.fit
-sim2real.heldout sim2real.model sim2real.numerics
+sim2real.histories
+sim2real.heldout sim2real.model sim2real.numerics sim2real.forcemap
 sim2real.verdict
 sim2real.report
 """

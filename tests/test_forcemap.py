@@ -1,0 +1,82 @@
+"""Where, when and how strong a force would be needed, and the phases that a mismatch is in."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from test_experiment import experiment
+from test_explain import SETUP
+
+from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.experiment import read_experiment
+from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.forcemap import force_map, patches
+from torchsoro.sim2real.recording import Recording
+from torchsoro.sim2real.residual import Camera
+from torchsoro.sim2real.scenario import Push
+from torchsoro.sim2real.twin import Twin
+
+COUNT = 3
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A bar, and what its twin would record in two trials, with a force on a patch from 60 to 120 ms in the second."""
+    folder = tmp_path_factory.mktemp("bar")
+    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
+    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
+    experiment(folder, SETUP, f"{header}\n{blank}\n")
+    found = read_experiment(folder)
+    twin = Twin(found.setup, edge=0.01, across=2)
+    ensemble = Ensemble(twin)
+    thrown = dataclasses.replace(
+        found.trials[0], name="b", setup=dataclasses.replace(found.setup, velocity=(0, 0.1, 0.3))
+    )
+
+    def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> Problem:
+        rng, trials = np.random.default_rng(1), []
+        share = patches(twin, COUNT)[1][patch]
+        pushed = torch.tensor(force, dtype=torch.float64)
+        for trial in (found.trials[0], thrown):
+            s = twin.scenario(trial)
+            if trial is thrown:
+                pushes = tuple(Push(share=share, force=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
+                s = s.replace(pushes=pushes)
+            camera = Camera(found.setup, [trial])
+            errors = np.zeros(len(camera.deviations))
+            errors[0], errors[6:] = 0.002, 2e-4
+            seen = camera.see(ensemble([s])[0].alone(), 0, errors)[0]
+            place = seen + 5e-5 * rng.normal(size=seen.shape)
+            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
+        return Problem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)
+
+    return record
+
+
+def fitted(problem):
+    (nothing,) = problem.fit([((), None)], rounds=4)
+    return nothing
+
+
+@pytest.mark.parametrize(("patch", "force"), [(2, (0.0, 0.0, 0.05)), (1, (0.0, -0.1, 0.0)), (2, (0.5, 0.0, 0.0))])
+def test_a_planted_force_is_found(made, patch, force):
+    problem = made(patch, force)
+    found = force_map(problem, fitted(problem), count=COUNT)
+    needed = found.needed[0]
+    axis, size = int(np.abs(force).argmax()), float(np.abs(force).max())
+    width = found.windows[1, 1]
+    assert needed.trial == "b" and int(np.abs(needed.force).argmax()) == axis
+    assert abs(needed.place[0] - found.places[patch][0]) < 0.021
+    assert abs(needed.start - 0.06) < 1.01 * width and abs(needed.end - 0.12) < 1.01 * width
+    assert needed.force[axis] == pytest.approx(force[axis], rel=0.2)
+    assert np.linalg.norm(needed.force - np.array(force)) < 0.25 * size
+    assert found.share > 0.8 and found.simulated > 0.8
+
+
+def test_no_force_is_needed_where_the_recording_agrees(made):
+    problem = made()
+    found = force_map(problem, fitted(problem), count=COUNT)
+    assert found.share < 0.02 and not found.needed
