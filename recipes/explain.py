@@ -22,9 +22,11 @@ from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.forcemap import force_map
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
+from torchsoro.sim2real.phases import mismatches
 from torchsoro.sim2real.report import Explanation, lead, write
 from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.twin import Twin
@@ -113,13 +115,18 @@ def main(options: Options) -> Explanation | None:
     problem = verdict.problem
     best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
     everything = [*trials, *kept]
+    after = tuple(predict(problem, best, everything))
+    # Without what the best effect leaves, which was priced for the verdict.
+    known = problem.only(problem.trials, numerics=numerics.deviation)
     found = Explanation(
         problem=problem,
         numerics=numerics,
         verdict=verdict,
         before=tuple(predict(problem, best, everything, believed=True)),
-        after=tuple(predict(problem, best, everything)),
+        after=after,
         heldout=tuple(t.name for t in kept),
+        mismatches=tuple(mismatches(known, verdict.nothing, everything, after)),
+        forces=force_map(known, best) if verdict.kind == "unknown_physics" else None,
         seconds=time.perf_counter() - begin,
     )
     settings = {

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,12 +17,14 @@ from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.forcemap import force_map, patches
+from torchsoro.sim2real.outer_effects import GravityTilt
 from torchsoro.sim2real.recording import Recording
 from torchsoro.sim2real.residual import Camera
 from torchsoro.sim2real.scenario import Push
 from torchsoro.sim2real.twin import Twin
 
-COUNT = 3
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
+COUNT = 3  # patches
 
 
 @pytest.fixture(scope="module")
@@ -80,3 +85,23 @@ def test_no_force_is_needed_where_the_recording_agrees(made):
     problem = made()
     found = force_map(problem, fitted(problem), count=COUNT)
     assert found.share < 0.02 and not found.needed
+
+
+# The whole --------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_says_which_force_no_effect_stands_for(made, tmp_path, monkeypatch):
+    import explain
+
+    problem = made(2, (0.0, 0.0, 0.05))
+    monkeypatch.setattr(explain, "read_experiment", lambda folder: problem.experiment)
+    monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (GravityTilt(),))
+    explain.main(explain.Options(experiment=problem.experiment.folder, out=tmp_path / "out", edge=0.01))
+    answer = json.loads((tmp_path / "out" / "explanation.json").read_text())
+    assert answer["verdict"] == "unknown_physics"
+    needed = answer["force_map"]["needed"][0]
+    assert needed["trial"] == "b" and needed["force_n"][2] == pytest.approx(0.05, rel=0.3)
+    assert answer["force_map"]["words"] in (tmp_path / "out" / "report.html").read_text()
+    parted = answer["mismatch"]["b"]
+    assert 0.06 < parted["starts_s"] < 0.1 and "swing" in parted["phase"] and parted["worst_marker"] == "tip"
+    assert {"name", "start_s", "end_s", "before", "after"} == set(parted["phases"][0])

@@ -54,7 +54,8 @@ sim2real.likelihood
 sim2real.fit
 sim2real.histories
 sim2real.heldout sim2real.model sim2real.numerics sim2real.forcemap
-sim2real.verdict
+sim2real.verdict sim2real.phases
+sim2real.drawings
 sim2real.report
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

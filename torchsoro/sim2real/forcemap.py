@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,7 @@ ALIKE = 1.25  # of the misfit that the best patch leaves by itself, below which 
 STRONG = 0.5  # of the largest force, above which others are told
 
 
-class Force(Hypothesis):
+class StepForce(Hypothesis):
     """A dead force on a part of the body, from a time on.
 
     Args:
@@ -183,7 +182,7 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
     """
     places, shares = patches(problem.twin, count)
     size = _small(problem.twin)
-    steps = tuple(Force(share, k / windows, size) for share in shares for k in range(windows))
+    steps = tuple(StepForce(share, k / windows, size) for share in shares for k in range(windows))
     # Errors that were bent to stand in for a force are no point for a straight line.
     errors = np.clip(fit.errors, -2 * problem.camera.deviations, 2 * problem.camera.deviations)
     at, forces = fit.point, np.zeros((len(problem.trials), count, windows, 3))
@@ -233,7 +232,7 @@ def _small(twin: Twin) -> float:
 
 
 def _simulate(problem: Problem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool) -> list[Motion]:
-    """Each trial with histories of its own [T, P, W, 3], in steps; then with changes of what is common, and one step more."""
+    """Each trial with its own forces [T, P, W, 3], in steps; then with changes of what is common, and more steps."""
     found = []
     for trial, history in zip(problem.trials, np.diff(forces, axis=2, prepend=0.0), strict=True):
         point = np.concatenate([at, history.reshape(-1)])
