@@ -45,8 +45,8 @@ def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:
     return figure
 
 
-def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial]) -> Figure:
-    """Mismatch of each trial over time, phases as bands."""
+def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after: str) -> Figure:
+    """Mismatch of each trial over time, phases as bands; ``after`` says what the second line is."""
     figure = Figure(figsize=(11, 0.4 + 2.2 * len(mismatches)), layout="constrained")
     panels: Any = figure.subplots(len(mismatches), 1, squeeze=False)
     for panel, m, trial in zip(panels[:, 0], mismatches, trials, strict=True):
@@ -65,7 +65,7 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial]) -> Fi
                     color="0.35",
                     rotation=0 if wide > 0.014 * len(p.name) / 2 else 90,
                 )
-        for values, color, label in ((m.before, NOMINAL, "before"), (m.after, EXPLAINED, "after")):
+        for values, color, label in ((m.before, NOMINAL, "before"), (m.after, EXPLAINED, after)):
             panel.plot(m.time, np.maximum(together(values), 0.1), color=color, lw=1.2, label=label)
         panel.axhline(BEYOND, color="0.5", lw=0.8, ls=":")
         if m.start is not None:
@@ -92,14 +92,18 @@ def draw_body(
     after: Sequence[Prediction],
     places: Sequence[tuple[str, np.ndarray]],
     forces: ForceMap | None,
+    said: str,
 ) -> Figure:
-    """Markers on the body in space, coloured by mismatch, with the places of effects and of forces."""
+    """Markers on the body in space, coloured by mismatch, with the places of effects and of forces.
+
+    ``said`` is what the second picture shows.
+    """
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     at, low, size = (1e3 * np.array(v) for v in ([m.at for m in setup.markers], setup.origin, setup.size))
     values = [1e3 * np.sqrt(np.mean([p.error**2 for p in all_], axis=0)) for all_ in (before, after)]
     most = max(float(values[0].max()), float(values[1].max()), 1e-6)
     panels, points = [], None
-    for k, title in enumerate(("before", "after")):
+    for k, title in enumerate(("before", said)):
         panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
         panels.append(panel)
         for begin, end in itertools.combinations(itertools.product((0, 1), repeat=3), 2):

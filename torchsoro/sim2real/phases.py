@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.signal import savgol_filter
 
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import STEP, Fit, Problem
@@ -16,6 +17,7 @@ from torchsoro.sim2real.twin import Motion
 
 SHORT = 0.02  # of a trial: no phase is shorter
 SLOPE = 0.5  # of the range of a pressure in a trial's duration, above which it rises or falls
+WIDE = 31  # thousandths of a trial, over which a pressure's slope is taken, as it may be noisy
 NEAR = 0.03  # of the body's longest edge, within which a plane is touched
 TURN = 0.05  # of the range of a swing, by which it has to come back to be over
 SWINGS = 8  # that are told apart
@@ -30,8 +32,8 @@ class Phase:
     """A part of a trial.
 
     Attributes:
-        name: "inflation", "deflation", "held pressure", "no pressure", "contact", "flight", "free", "swing", ...; with
-            its number where there are several.
+        name: Such as "inflation", "hold", "deflation", "pause", "contact", "flight", "swing" or "inflation in contact",
+            with its number where there are several.
         start: [s].
         end: [s].
     """
@@ -187,9 +189,11 @@ def phases(trial: Trial, motion: Motion) -> list[Phase]:
         motion: As it is simulated, without a batch.
     """
     duration = trial.setup.duration
-    time = np.linspace(0, duration, 1001)
-    labels = [*_pressures(trial, time), *_contacts(trial, motion, time), *_loads(trial, time)]
-    names = [", ".join(parts) for parts in zip(*labels, strict=True)] if labels else [""] * len(time)
+    time = np.linspace(0, duration, 1001)  # thousandths
+    names = [" and ".join(parts) for parts in zip(*_pressures(trial, time), strict=True)] or [""] * len(time)
+    for one, more in zip((" in ", " in the "), (_contacts(trial, motion, time), _loads(trial, time)), strict=True):
+        if more:
+            names = [f"{name}{one}{label}" if name else label for name, label in zip(names, more, strict=True)]
     parts = _runs(names, time)
     if len(parts) == 1:
         parts = _runs(_swings(motion, time), time)
@@ -227,8 +231,7 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
     found = []
     for cavity, p in zip(trial.setup.cavities, course, strict=True):
         reach, most = float(np.ptp(p)), float(np.abs(p).max())
-        wide = np.pad(p, 5, mode="edge")
-        slope = np.gradient(np.convolve(wide, np.full(11, 1 / 11), "valid"), time)
+        slope = savgol_filter(p, WIDE, 1, deriv=1, delta=float(time[1]), mode="nearest")
         steep = SLOPE * reach / float(time[-1])
         of = f" of {cavity.name}" if len(course) > 1 else ""
         names = []
@@ -236,12 +239,12 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
             if abs(s) > steep > 0:
                 names.append(("inflation" if s > 0 else "deflation") + of)
             else:
-                names.append(("held pressure" if abs(value) > TURN * most else "no pressure") + of)
+                names.append(("hold" if abs(value) > TURN * most else "pause") + of)
         found.append(names)
     return found
 
 
-def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[list[str]]:
+def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[str]:
     """Whether a corner of the body, which moves as the marker nearest to it does, is at a plane."""
     s = trial.setup
     if not s.planes:
@@ -256,18 +259,18 @@ def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[list[str]]
         above = (moved - np.array(plane.point)) @ normal
         touched |= above.min(1) < NEAR * max(s.size)
     on = touched[np.clip(np.searchsorted(motion.time, time), 0, len(touched) - 1)]
-    away = "free" if s.clamps else "flight"
-    return [["contact" if t else away for t in on]]
+    away = "free motion" if s.clamps else "flight"
+    return ["contact" if t else away for t in on]
 
 
-def _loads(trial: Trial, time: np.ndarray) -> list[list[str]]:
+def _loads(trial: Trial, time: np.ndarray) -> list[str]:
     """Which of the loads that begin later has begun."""
     starts = sorted({load.start for load in trial.setup.loads if 0 < load.start < time[-1]})
     if not starts:
         return []
     count = np.searchsorted(starts, time, side="right")
-    several = len(starts) > 1
-    return [["before the load" if k == 0 else f"load {k}" if several else "loaded" for k in count]]
+    of = [f" {k + 1}" if len(starts) > 1 else "" for k in range(len(starts))]
+    return [f"time before the load{of[0]}" if k == 0 else f"time under the load{of[k - 1]}" for k in count]
 
 
 def _swings(motion: Motion, time: np.ndarray) -> list[str]:

@@ -277,8 +277,9 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         page.figure(draw_trial(trial, before, after), caption)
     page.section("Where and when")
     page.text(" ".join(map(str, e.mismatches)))
+    after = "after" if e.verdict.chosen else "fitted without an effect"
     page.figure(
-        draw_mismatch(e.mismatches, trials),
+        draw_mismatch(e.mismatches, trials, after),
         "Mismatch over time before and after, in what noise and the simulation's own error explain, with the phases of "
         "each trial; where a pressure is supplied it is grey.",
     )
@@ -289,7 +290,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         if row["location_m"] is not None
     ]
     page.figure(
-        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces),
+        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces, after),
         "Mismatch on the body by marker, root mean square over all trials.",
     )
     if e.forces is not None:
