@@ -17,8 +17,9 @@ from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.forcemap import force_map, patches
+from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.outer_effects import GravityTilt
-from torchsoro.sim2real.phases import phases
+from torchsoro.sim2real.phases import mismatches, phases
 from torchsoro.sim2real.recording import Recording
 from torchsoro.sim2real.residual import Camera
 from torchsoro.sim2real.scenario import Push
@@ -84,8 +85,11 @@ def test_a_planted_force_is_found(made, patch, force):
 
 def test_no_force_is_needed_where_the_recording_agrees(made):
     problem = made()
-    found = force_map(problem, fitted(problem), count=COUNT)
-    assert found.share < 0.02 and not found.needed
+    nothing = fitted(problem)
+    found = force_map(problem, nothing, count=COUNT)
+    assert found.share < 0.02 and not found.needed and str(found).startswith("No force")
+    after = predict(problem, nothing, problem.trials)
+    assert all(m.start is None for m in mismatches(problem, nothing, problem.trials, after))
 
 
 # Phases -----------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ A force stands in for whatever is missing; it does not say what that is.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from dataclasses import dataclass
@@ -13,15 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.sim2real.fit import STEP, Fit, Problem
-from torchsoro.sim2real.histories import Solution, row, solve
+from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.histories import Solution, misfit_of, simulate, solve
 from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
-from torchsoro.sim2real.likelihood import Effects
 from torchsoro.sim2real.scenario import Push, Scenario
-from torchsoro.sim2real.twin import Motion, Twin
+from torchsoro.sim2real.twin import Twin
 
 SMALL = 1e-3  # of the body's length, by which a force bends it for its response to be measured
-PASSES = 2  # of simulations: the response to forces is not quite linear
+PASSES = 3  # of simulations at most: the response to forces is not quite linear
+SHARES = np.array([1.0, 0.5, 0.25, 0.1])  # of a step that are tried
+ENOUGH = 0.05  # of the misfit, below which a pass is the last if it gains no more
+ROUGH = 0.7  # of what the linear response promises, below which a force is only a hint
 ALIKE = 1.25  # of the misfit that the best patch leaves by itself, below which another might be the place as well
 STRONG = 0.5  # of the largest force, above which others are told
 
@@ -142,6 +145,8 @@ class ForceMap:
             f"It would take {'; '.join(map(str, needed))}. That takes away {100 * self.share:.0f} % of the misfit by "
             f"the linear response, {100 * max(self.simulated, 0.0):.0f} % when simulated."
         )
+        if self.simulated < ROUGH * self.share:
+            told += " The response is far from linear, so that this is no more than a hint."
         here = int((self.places == needed[0].place).all(-1).argmax())
         others = [p for p in np.flatnonzero(self.misfits < ALIKE * self.misfits[here]) if p != here]
         if others:
@@ -185,31 +190,31 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
     steps = tuple(StepForce(share, k / windows, size) for share in shares for k in range(windows))
     # Errors that were bent to stand in for a force are no point for a straight line.
     errors = np.clip(fit.errors, -2 * problem.camera.deviations, 2 * problem.camera.deviations)
-    at, forces = fit.point, np.zeros((len(problem.trials), count, windows, 3))
-    solution: Solution | None = None
-    before, kept = 0.0, (math.inf, solution)
-    for left in reversed(range(PASSES + 1)):
-        motions = _simulate(problem, (*fit.effects, *steps), at, forces, slopes=left > 0)
-        if not all(m.sound.all() for m in motions):
-            if solution is None:
-                raise ValueError("fit: its simulation breaks down, wanted a point that bears a small force")
-            break
-        believed = problem.belief(at, np.zeros(len(at), bool))[0]
-        misfit = problem.measure(row(motions, 0), fit.errors if solution is None else errors)[0]
-        misfit += float((believed**2).sum())
-        if solution is None:
-            before = misfit
-        elif misfit < kept[0]:
-            kept = misfit, solution
-        else:
-            break
-        if not left:
-            break
+    effects, at, forces = (*fit.effects, *steps), fit.point, np.zeros((len(problem.trials), count, windows, 3))
+    found: Solution | None = None
+    before = misfit = math.inf
+    for _ in range(PASSES):
+        motions = simulate(problem, effects, at[None], forces[None], slopes=True)
+        if found is None:
+            before = misfit = misfit_of(problem, motions, 0, fit.errors, at)
+        if not math.isfinite(misfit) or not all(m.sound.all() for m in motions):
+            raise ValueError("fit: its simulation breaks down, wanted a point that bears a small force")
         solution, common, errors = solve(problem, errors, at, motions, forces, before)
+        found = found or solution
         if not solution.forces.any():
             break
-        at, forces = np.concatenate([at[: len(common)] + common, at[len(common) :]]), solution.forces
-    found = kept[1] or solution
+        # The whole way, or less where the response is far from linear.
+        ahead = at + SHARES[:, None] * np.append(common, np.zeros(len(at) - len(common)))
+        tried = forces + SHARES[:, None, None, None, None] * (solution.forces - forces)
+        motions = simulate(problem, effects, ahead, tried)
+        left = [misfit_of(problem, motions, k, errors, a) for k, a in enumerate(ahead)]
+        best, gained = int(np.argmin(left)), misfit - min(left)
+        if gained <= 0:
+            break
+        at, forces, misfit = ahead[best], tried[best], left[best]
+        found = dataclasses.replace(solution, forces=forces)
+        if gained < ENOUGH * before:
+            break
     assert found is not None
     ends = np.array([t.setup.duration for t in problem.trials])
     return ForceMap(
@@ -220,7 +225,7 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
         deviations=size * found.deviations,
         misfits=found.misfits,
         share=1 - found.misfit / before,
-        simulated=max(1 - kept[0] / before, 0.0),
+        simulated=1 - misfit / before,
     )
 
 
@@ -229,17 +234,3 @@ def _small(twin: Twin) -> float:
     s = twin.setup
     thin, wide, long = sorted(s.size)
     return SMALL * long * 3 * s.youngs_modulus * wide * thin**3 / 12 / long**3
-
-
-def _simulate(problem: Problem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool) -> list[Motion]:
-    """Each trial with its own forces [T, P, W, 3], in steps; then with changes of what is common, and more steps."""
-    found = []
-    for trial, history in zip(problem.trials, np.diff(forces, axis=2, prepend=0.0), strict=True):
-        point = np.concatenate([at, history.reshape(-1)])
-        moves = np.eye(len(point))
-        moves[: len(at)] *= STEP
-        moves = np.delete(moves, np.s_[len(problem.common) : len(at)], axis=0) if slopes else moves[:0]
-        # One trial fills all lanes.
-        (motions,) = problem.only([trial]).simulate([(effects, np.concatenate([point[None], point + moves]))])
-        found += motions
-    return found

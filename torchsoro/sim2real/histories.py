@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from torchsoro.sim2real.fit import STEP, Problem
+from torchsoro.sim2real.likelihood import Effects
 from torchsoro.sim2real.twin import Motion
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows
@@ -178,3 +180,29 @@ def solve(
         common, errors = lines.along(solution.forces)
     assert solution is not None
     return solution, common, errors
+
+
+def misfit_of(problem: Problem, motions: Sequence[Motion], number: int, errors: np.ndarray, at: np.ndarray) -> float:
+    """Of one of a batch with its best measurement errors, and of what is believed; infinite if it broke down."""
+    if not all(m.sound[number] for m in motions):
+        return math.inf
+    believed = problem.belief(at, np.zeros(len(at), bool))[0]
+    return problem.measure(row(motions, number), errors)[0] + float((believed**2).sum())
+
+
+def simulate(
+    problem: Problem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool = False
+) -> list[Motion]:
+    """Each trial at points [R, K] with its own forces [R, T, P, W, 3], in steps; the first also with more steps."""
+    found = []
+    for t, trial in enumerate(problem.trials):
+        points = np.concatenate([at, np.diff(forces[:, t], axis=2, prepend=0.0).reshape(len(at), -1)], 1)
+        if slopes:
+            moves = np.eye(points.shape[1])
+            moves[: at.shape[1]] *= STEP
+            moves = np.delete(moves, np.s_[len(problem.common) : at.shape[1]], axis=0)
+            points = np.concatenate([points, points[0] + moves])
+        # One trial fills all lanes.
+        (motions,) = problem.only([trial]).simulate([(effects, points)])
+        found += motions
+    return found

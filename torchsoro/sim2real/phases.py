@@ -231,7 +231,7 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
     found = []
     for cavity, p in zip(trial.setup.cavities, course, strict=True):
         reach, most = float(np.ptp(p)), float(np.abs(p).max())
-        slope = savgol_filter(p, WIDE, 1, deriv=1, delta=float(time[1]), mode="nearest")
+        slope = np.asarray(savgol_filter(p, WIDE, 1, deriv=1, delta=float(time[1]), mode="nearest"))
         steep = SLOPE * reach / float(time[-1])
         of = f" of {cavity.name}" if len(course) > 1 else ""
         names = []
@@ -253,11 +253,14 @@ def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[str]:
     at = np.array([m.at for m in s.markers])
     near = np.linalg.norm(corners[:, None] - at, axis=-1).argmin(1)
     moved = motion.place[:, near] + np.einsum("scij,cj->sci", motion.gradient[:, near], corners - at[near])
-    touched = np.zeros(len(motion.time), bool)
+    above = np.full(len(motion.time), np.inf)
     for plane in s.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
-        above = (moved - np.array(plane.point)) @ normal
-        touched |= above.min(1) < NEAR * max(s.size)
+        above = np.minimum(above, ((moved - np.array(plane.point)) @ normal).min(1))
+    touched, now = np.zeros(len(above), bool), False
+    for k, height in enumerate(above / (NEAR * max(s.size))):
+        now = bool(height < (2 if now else 1))  # left only when it is well off
+        touched[k] = now
     on = touched[np.clip(np.searchsorted(motion.time, time), 0, len(touched) - 1)]
     away = "free motion" if s.clamps else "flight"
     return ["contact" if t else away for t in on]
