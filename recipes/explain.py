@@ -118,6 +118,12 @@ def main(options: Options) -> Explanation | None:
     after = tuple(predict(problem, best, everything))
     # Without what the best effect leaves, which was priced for the verdict.
     known = problem.only(problem.trials, numerics=numerics.deviation)
+    forces = None
+    if verdict.kind == "unknown_physics":
+        try:
+            forces = force_map(known, best)
+        except ValueError as error:  # the verdict is worth its report without it
+            print(f"no force map: {error}")
     found = Explanation(
         problem=problem,
         numerics=numerics,
@@ -126,7 +132,7 @@ def main(options: Options) -> Explanation | None:
         after=after,
         heldout=tuple(t.name for t in kept),
         mismatches=tuple(mismatches(known, verdict.nothing, everything, after)),
-        forces=force_map(known, best) if verdict.kind == "unknown_physics" else None,
+        forces=forces,
         seconds=time.perf_counter() - begin,
     )
     settings = {
