@@ -22,13 +22,15 @@ from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.forcemap import force_map
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.hypothesis import Hypothesis
-from torchsoro.sim2real.library import library
 from torchsoro.sim2real.isolability import isolability
+from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.next_experiment import next_experiment
 from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
+from torchsoro.sim2real.phases import mismatches
 from torchsoro.sim2real.report import Explanation, lead, write
 from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.twin import Twin
@@ -137,13 +139,24 @@ def main(options: Options) -> Explanation | None:
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
     everything = [*trials, *kept]
+    after = tuple(predict(problem, best, everything))
+    # Without what the best effect leaves, which was priced for the verdict.
+    known = problem.only(problem.trials, numerics=numerics.deviation)
+    forces = None
+    if verdict.kind == "unknown_physics":
+        try:
+            forces = force_map(known, best)
+        except ValueError as error:  # the verdict is worth its report without it
+            print(f"no force map: {error}")
     found = Explanation(
         problem=problem,
         numerics=numerics,
         verdict=verdict,
         before=tuple(predict(problem, best, everything, believed=True)),
-        after=tuple(predict(problem, best, everything)),
+        after=after,
         heldout=tuple(t.name for t in kept),
+        mismatches=tuple(mismatches(known, verdict.nothing, everything, after)),
+        forces=forces,
         seconds=time.perf_counter() - begin,
         isolability=tells,
         following=tuple(following),
@@ -156,7 +169,7 @@ def main(options: Options) -> Explanation | None:
     }
     options.out.mkdir(parents=True, exist_ok=True)
     write(found, everything, options.out, settings)
-    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, twin)
+    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, fine)
     print(f"{verdict.kind}: {lead(found)}\n{found.seconds:.0f} s; {options.out / 'report.html'}")
     return found
 

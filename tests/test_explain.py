@@ -276,6 +276,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     assert found["low"] < found["value"] < found["high"] and found["value"] == pytest.approx(800.0, rel=0.15)
     assert set(answer) >= {"ranking", "noise", "nuisance", "error_before", "error_after", "heldout", "cost", "version"}
     assert set(answer["isolability"]) >= {"effects", "detectable", "alike"}
+    assert answer["force_map"] is None and answer["mismatch"]["b"]["phase"].endswith("swing")
     assert answer["error_after"]["a"]["all"] < 0.5 * answer["error_before"]["a"]["all"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Missing is drag" in page and page.count("data:image/png") == 4

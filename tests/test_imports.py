@@ -52,9 +52,11 @@ sim2real.outer_effects
 sim2real.library
 sim2real.likelihood sim2real.likeness
 sim2real.fit
-sim2real.heldout sim2real.isolability sim2real.model sim2real.numerics
+sim2real.histories
+sim2real.heldout sim2real.isolability sim2real.model sim2real.numerics sim2real.forcemap
 sim2real.next_experiment
-sim2real.verdict
+sim2real.verdict sim2real.phases
+sim2real.drawings
 sim2real.report
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}

@@ -250,7 +250,7 @@ def test_a_known_pull_tells_density_from_modulus(problem):
 
 def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(problem, told):
     density, nothing = problem.fit([((effect("density"),), None), ((), None)], rounds=1)
-    chosen = Candidate(fit=density, score=50.0, explained=1.0)
+    chosen = Candidate(fit=density, score=50.0, gain=50.0, explained=1.0)
     verdict = Verdict(
         kind="cannot_distinguish", problem=problem, nothing=nothing, ranking=(chosen,), chosen=(chosen,) * 2
     )

@@ -34,6 +34,7 @@ class Model:
         setup: The same, read.
         edge: Of the twin's cells [m].
         walls: Of them through each wall, at least.
+        across: Of them across a body without a chamber, at least.
         ln_modulus: What the modulus is off.
         ln_pressure: What the pressure is off.
         effects: What was missing, with its values [K], places included.
@@ -43,6 +44,7 @@ class Model:
     setup: Setup
     edge: float
     walls: int
+    across: int
     ln_modulus: float
     ln_pressure: float
     effects: tuple[tuple[Hypothesis, np.ndarray], ...]
@@ -65,7 +67,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         path: Of the model; its folder exists.
         setup: The setup.toml that was believed, which is copied.
         fit: What was found.
-        twin: It was found with.
+        twin: To predict with; one as fine as that which corrected the fit's.
     """
     belief = [*fit.belief.tolist(), 0.0][:2]
     lines = [
@@ -75,6 +77,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         "[model]",
         f"edge = {twin.edge!r}",
         f"walls = {twin.walls}",
+        f"across = {twin.across}",
     ]
     lines += [f"ln_modulus = {belief[0]!r}", f"ln_pressure = {belief[1]!r}"]
     for effect, values in zip(fit.effects, fit.values, strict=True):
@@ -100,7 +103,7 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     """
     tables = read_tables(path)
     numbers, rows = tables.pop("model", None), tables.pop("effect", [])
-    wanted = {"edge", "walls", "ln_modulus", "ln_pressure"}
+    wanted = {"edge", "walls", "across", "ln_modulus", "ln_pressure"}
     if not isinstance(numbers, dict) or set(numbers) != wanted:
         raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
     known = {e.name: e for e in (library() if effects is None else effects)}
@@ -134,7 +137,7 @@ def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarr
     if trial.name != "trial.toml":
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
-    twin = Twin(told.setup, edge=model.edge, walls=model.walls)
+    twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
     motion = Ensemble(twin)([model.apply(twin.scenario(told), twin)])[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")

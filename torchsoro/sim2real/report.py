@@ -11,26 +11,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.patches import Rectangle
 from scipy.stats import norm
 
 from torchsoro.document import Document
+from torchsoro.sim2real.drawings import draw_alike, draw_body, draw_forces, draw_mismatch, draw_trial
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.forcemap import ForceMap
 from torchsoro.sim2real.heldout import Prediction
 from torchsoro.sim2real.isolability import SAME, Isolability
 from torchsoro.sim2real.likeness import SCORE
 from torchsoro.sim2real.next_experiment import Proposal, advice
 from torchsoro.sim2real.numerics import Numerics
+from torchsoro.sim2real.phases import Mismatch
 from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
 
 FORM = 0.1  # of a number, that is due to an effect's form
 LEVEL = 0.9
 BELIEVED = 3.0  # standard deviations of a measurement error that are believed
-RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,6 +46,8 @@ class Explanation:
         seconds: It took.
         isolability: What the experiment can tell, if that was asked.
         following: What could be recorded next, best first, where effects are not told apart.
+        mismatches: Where and when each trial and its simulation part.
+        forces: That would be needed where no effect fits.
     """
 
     problem: Problem
@@ -58,6 +59,8 @@ class Explanation:
     seconds: float
     isolability: Isolability | None = None
     following: tuple[Proposal, ...] = ()
+    mismatches: tuple[Mismatch, ...] = ()
+    forces: ForceMap | None = None
 
     @property
     def best(self) -> Fit:
@@ -122,6 +125,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "misfit": c.fit.misfit,
                 "samples": c.fit.samples,
                 "unknowns": c.fit.unknowns,
+                "gain": c.gain,
                 "alike": correlation(c.fit),
                 "heldout_over_nothing": None if math.isnan(c.kept) else c.kept,
                 "effects": effect_rows(c, 0.0, problem),
@@ -145,12 +149,58 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         },
         "error_before": errors(e.before),
         "error_after": errors(e.after),
+        "mismatch": {m.trial: _parted(m) for m in e.mismatches},
+        "force_map": None if e.forces is None else _needed(e.forces),
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
         "isolability": None if e.isolability is None else e.isolability.as_json(),
         "next": [{"record": p.words, "alike": p.alike, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),
         "settings": dict(settings),
+    }
+
+
+def _parted(m: Mismatch) -> dict[str, Any]:
+    """A trial's mismatch, as in explanation.json; in units of what noise and numerics explain."""
+
+    def numbers(row: np.ndarray) -> dict[str, float | None]:
+        return {name: None if math.isnan(v) else float(v) for name, v in zip(m.markers, row, strict=True)}
+
+    return {
+        "starts_s": m.start,
+        "phase": None if m.phase is None else m.phase.name,
+        "worst_marker": m.marker,
+        "phases": [
+            {"name": p.name, "start_s": p.start, "end_s": p.end, "before": numbers(b), "after": numbers(a)}
+            for p, b, a in zip(m.phases, m.by_phase(), m.by_phase(after=True), strict=True)
+        ],
+    }
+
+
+def _needed(f: ForceMap) -> dict[str, Any]:
+    """A force map, as in explanation.json; no deviation where a patch was not needed."""
+    deviations = f.deviations.astype(object)
+    deviations[~np.isfinite(f.deviations)] = None
+    return {
+        "trials": list(f.trials),
+        "places_m": f.places.tolist(),
+        "windows_s": f.windows.tolist(),
+        "forces_n": f.forces.tolist(),
+        "deviations_n": deviations.tolist(),
+        "misfit_of_each_place": f.misfits.tolist(),
+        "share": f.share,
+        "simulated_share": f.simulated,
+        "needed": [
+            {
+                "trial": n.trial,
+                "place_m": n.place.tolist(),
+                "force_n": n.force.tolist(),
+                "start_s": n.start,
+                "end_s": n.end,
+            }
+            for n in f.needed
+        ],
+        "words": str(f),
     }
 
 
@@ -177,7 +227,8 @@ def lead(e: Explanation) -> str:
             if best
             else ""
         )
-        return f"Something is missing that is none of the known effects.{tried}{gain}"
+        force = f" {e.forces}" if e.forces else ""
+        return f"Something is missing that is none of the known effects.{tried}{gain}{force}"
     parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
         following = f" {advice(e.following)}" if advice(e.following) else ""
@@ -241,7 +292,30 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         caption = f"Trial {trial.name}{kept}: markers as recorded, as believed, and as explained."
         page.figure(draw_trial(trial, before, after), caption)
     page.section("Where and when")
-    page.figure(draw_where(e, trials), "Mismatch before and after: on the body by marker, and over time.")
+    page.text(" ".join(map(str, e.mismatches)))
+    after = "after" if e.verdict.chosen else "fitted without an effect"
+    page.figure(
+        draw_mismatch(e.mismatches, trials, after),
+        "Mismatch over time before and after, in what noise and the simulation's own error explain, with the phases of "
+        "each trial; where a pressure is supplied it is grey.",
+    )
+    places = [
+        (row["name"], np.array(row["location_m"]))
+        for c in e.verdict.chosen
+        for row in effect_rows(c, 0.0, e.problem)
+        if row["location_m"] is not None
+    ]
+    page.figure(
+        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces, after),
+        "Mismatch on the body by marker, root mean square over all trials.",
+    )
+    if e.forces is not None:
+        page.section("The force that would be needed")
+        page.text(f"{e.forces} A force stands in for what is missing; it does not say what that is.")
+        page.figure(
+            draw_forces(e.forces, e.problem.experiment.setup),
+            "Size of the force by place and time, and the components of the strongest, with standard deviations.",
+        )
     page.section("What was considered")
     considered = [
         {
@@ -309,88 +383,3 @@ def write_isolability(page: Document, found: Isolability) -> None:
     )
     caption = "How much of the change that the effect of a row makes, that of a column can imitate."
     page.figure(draw_alike(found), caption)
-
-
-def draw_alike(found: Isolability) -> Figure:
-    """A heat map of what looks alike."""
-    count = len(found.effects)
-    figure = Figure(figsize=(3.2 + 0.36 * count, 2.2 + 0.3 * count), layout="constrained")
-    panel: Axes = figure.subplots()
-    image = panel.imshow(found.alike, vmin=0, vmax=1, cmap="Blues", aspect="auto")
-    for i, j in np.ndindex(count, count):
-        if i != j and found.alike[i, j] > 0.5:
-            color = "white" if found.alike[i, j] > 0.7 else "black"
-            panel.text(j, i, f"{found.alike[i, j]:.2f}", ha="center", va="center", fontsize=6, color=color)
-    panel.set_xticks(range(count), found.effects, rotation=90, fontsize=7)
-    panel.set_yticks(range(count), found.effects, fontsize=7)
-    figure.colorbar(image, ax=panel, shrink=0.8)
-    return figure
-
-
-def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:
-    """Each marker's recorded axes over time."""
-    recording = trial.recording
-    assert recording is not None
-    names = [m.name for m in trial.setup.markers]
-    count, axes = len(names), recording.axes
-    figure = Figure(figsize=(11, 1.2 + 1.35 * count), layout="constrained")
-    panels: Any = figure.subplots(count, len(axes), sharex=True, squeeze=False)
-    for m, a in np.ndindex(count, len(axes)):
-        panel: Axes = panels[m, a]
-        panel.plot(recording.time, 1e3 * recording.place[:, m, a], ".", ms=2, color=RECORDED, label="recorded")
-        panel.plot(recording.time, 1e3 * before.seen[:, m, a], "-", lw=1, color=NOMINAL, label="believed")
-        panel.plot(recording.time, 1e3 * after.seen[:, m, a], "-", lw=1, color=EXPLAINED, label="explained")
-        panel.tick_params(labelsize=7)
-        if a == 0:
-            panel.set_ylabel(f"{names[m]} [mm]", fontsize=8)
-        if m == 0:
-            panel.set_title("xyz"[axes[a]], fontsize=9)
-        if m == count - 1:
-            panel.set_xlabel("time [s]", fontsize=8)
-    panels[0, 0].legend(fontsize=7)
-    return figure
-
-
-def draw_where(e: Explanation, trials: Sequence[Trial]) -> Figure:
-    """Mismatch by marker on the body's side views, and over time with the pressure."""
-    setup = e.problem.experiment.setup
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    halves: Any = figure.subfigures(2, 1)
-    top, bottom = halves
-    panels: Sequence[Axes] = top.subplots(1, 2)
-    at = np.array([m.at for m in setup.markers])
-    before = np.sqrt(np.mean([p.error**2 for p in e.before], axis=0))
-    after = np.sqrt(np.mean([p.error**2 for p in e.after], axis=0))
-    largest = max(float(before.max()), 1e-9)
-    for panel, (i, j) in zip(panels, ((0, 2), (0, 1)), strict=True):
-        low, size = np.array(setup.origin)[[i, j]], np.array(setup.size)[[i, j]]
-        panel.add_patch(_rectangle(low * 1e3, size * 1e3))
-        for number, (value, color) in enumerate(((before, NOMINAL), (after, EXPLAINED))):
-            sizes = 20 + 600 * value / largest
-            label = ("before", "after")[number]
-            panel.scatter(1e3 * at[:, i], 1e3 * at[:, j], s=sizes, color=color, alpha=0.55, label=label)
-        for c in e.verdict.chosen:
-            for row in effect_rows(c, 0.0, e.problem):
-                if row["location_m"] is not None:
-                    place = 1e3 * np.array(row["location_m"])
-                    panel.plot(place[i], place[j], "x", ms=11, mew=2.5, color="#a3154a", label=row["name"])
-        panel.set(aspect="equal", xlabel=f"{'xyz'[i]} [mm]", ylabel=f"{'xyz'[j]} [mm]")
-    panels[0].legend(fontsize=7)
-    axes = bottom.subplots(1, len(trials), squeeze=False)[0]
-    for panel, trial, one, other in zip(axes, trials, e.before, e.after, strict=True):
-        recording = trial.recording
-        assert recording is not None
-        for p, color in ((one, NOMINAL), (other, EXPLAINED)):
-            off = np.sqrt(np.nanmean(((recording.place - p.seen) ** 2).sum(-1), axis=1))
-            panel.plot(recording.time, 1e3 * off, color=color, lw=1)
-        panel.set(xlabel="time [s]", ylabel="off by [mm]", title=f"trial {trial.name}", yscale="log")
-        if trial.pressure is not None:
-            other_axis = panel.twinx()
-            supply = trial.pressure.pressure.reshape(-1, len(trial.pressure.time))[0].numpy()
-            other_axis.fill_between(trial.pressure.time.numpy(), supply / 1e3, color="0.85", zorder=0)
-            other_axis.set_ylabel("pressure [kPa]", fontsize=8)
-    return figure
-
-
-def _rectangle(low: np.ndarray, size: np.ndarray) -> Rectangle:
-    return Rectangle((float(low[0]), float(low[1])), float(size[0]), float(size[1]), fc="#e4e9ef", ec="0.6")

@@ -76,7 +76,7 @@ class Twin:
     def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
         if setup.mesh is not None:
             raise ValueError(f"setup: body of {setup.mesh.name}, wanted a box")
-        self.setup, self.edge, self.walls = setup, edge, walls
+        self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
         axes = []
         for axis in range(3):
             begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]

@@ -42,7 +42,7 @@ class Thresholds:
     """What decides; from a batch of cases with known answers that was made for this.
 
     Attributes:
-        alarm: Score below which nothing is missing.
+        alarm: Score and gain below which nothing is missing.
         margin: Of the score, within which two effects are not told apart.
         quiet: Times what noise and numerics explain, below which nothing is missing if no effect is believed.
         beyond: The same, above which the best effect leaves something.
@@ -68,12 +68,14 @@ class Candidate:
             wrong model are neither white nor of the variance that was thought: the gain counts in units of what the
             best effect leaves, neighbouring samples that are alike count once, and no difference counts that the form
             of an effect may make.
+        gain: The same over nothing with any modulus and pressure, without allowance for its form.
         explained: Share of the misfit beyond noise and numerics that it takes away.
         kept: Error on trials that were left out over that without an effect; not a number where none was.
     """
 
     fit: Fit
     score: float
+    gain: float
     explained: float
     kept: float = math.nan
 
@@ -319,25 +321,27 @@ def _within(problem: Problem, nothing: Fit) -> float:
 
 
 def rank(fits: Sequence[Fit], nothing: Fit, believed: float) -> list[Candidate]:
-    """Score fits that are better than nothing and within beliefs, best first.
+    """Score fits that are better than nothing, best first.
 
     Args:
         fits: Of effects.
         nothing: The fit without any.
         believed: Its misfit within beliefs.
     """
-    fits = [f for f in fits if f.misfit < nothing.misfit and np.abs(f.point[: len(f.belief)]).max() < BELIEVED]
+    fits = [fit for fit in fits if fit.misfit < nothing.misfit]
     if not fits:
         return []
     best = min(fits, key=lambda fit: fit.misfit)
     alike = correlation(best)
     gained = believed - best.misfit
-    unit = 2 * max(max(1.0, best.misfit / best.samples) * alike, FORM * gained)
+    bare = 2 * max(1.0, best.misfit / best.samples) * alike
+    unit = max(bare, 2 * FORM * gained)
     worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
     found = [
         Candidate(
             fit=fit,
             score=(believed - fit.misfit) / unit - fit.unknowns * worth,
+            gain=(nothing.misfit - fit.misfit) / bare - fit.unknowns * worth,
             explained=(believed - fit.misfit) / max(believed - fit.samples, 1.0),
         )
         for fit in fits
@@ -359,7 +363,7 @@ def _proved(
     problem: Problem, nothing: Fit, found: list[Candidate], kept: Sequence[Trial]
 ) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]]]:
     """The candidates near the best with their error on trials left out; and by name, errors as believed and with it."""
-    near = [c for c in found[:3] if c.score > 0 and c.score > 0.5 * found[0].score]
+    near = [c for c in found if c.gain > FAINT and c.score > 0.5 * found[0].score][:3]
     fits = [nothing, *(c.fit for c in near)]
     if kept:
         folds = [(problem, fits, list(kept))]
@@ -391,7 +395,7 @@ def _proved(
 def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: float, t: Thresholds) -> Verdict:
     """The verdict on a ranking whose best leaves ``excess`` times what noise and numerics explain."""
     proved = any(math.isfinite(c.kept) for c in found)
-    believed = [c for c in found if c.kept <= t.lost or not proved]
+    believed = [c for c in found if c.gain > t.alarm and (c.kept <= t.lost or not proved)]
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
     if best is None or best.score < t.alarm:

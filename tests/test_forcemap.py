@@ -1,0 +1,177 @@
+"""Where, when and how strong a force would be needed, and the phases that a mismatch is in."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_experiment import experiment
+from test_explain import SETUP
+
+from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.experiment import read_experiment
+from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.forcemap import force_map, patches
+from torchsoro.sim2real.heldout import predict
+from torchsoro.sim2real.outer_effects import GravityTilt
+from torchsoro.sim2real.phases import mismatches, phases
+from torchsoro.sim2real.recording import Recording
+from torchsoro.sim2real.residual import Camera
+from torchsoro.sim2real.scenario import Push
+from torchsoro.sim2real.twin import Motion, Twin
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
+COUNT = 3  # patches
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A bar, and what its twin would record in two trials, with a force on a patch from 60 to 120 ms in the second."""
+    folder = tmp_path_factory.mktemp("bar")
+    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
+    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
+    experiment(folder, SETUP, f"{header}\n{blank}\n")
+    found = read_experiment(folder)
+    twin = Twin(found.setup, edge=0.01, across=2)
+    ensemble = Ensemble(twin)
+    thrown = dataclasses.replace(
+        found.trials[0], name="b", setup=dataclasses.replace(found.setup, velocity=(0, 0.1, 0.3))
+    )
+
+    def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> Problem:
+        rng, trials = np.random.default_rng(1), []
+        share = patches(twin, COUNT)[1][patch]
+        pushed = torch.tensor(force, dtype=torch.float64)
+        for trial in (found.trials[0], thrown):
+            s = twin.scenario(trial)
+            if trial is thrown:
+                pushes = tuple(Push(share=share, force=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
+                s = s.replace(pushes=pushes)
+            camera = Camera(found.setup, [trial])
+            errors = np.zeros(len(camera.deviations))
+            errors[0], errors[6:] = 0.002, 2e-4
+            seen = camera.see(ensemble([s])[0].alone(), 0, errors)[0]
+            place = seen + 5e-5 * rng.normal(size=seen.shape)
+            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
+        return Problem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)
+
+    return record
+
+
+def fitted(problem):
+    (nothing,) = problem.fit([((), None)], rounds=4)
+    return nothing
+
+
+@pytest.mark.parametrize(("patch", "force"), [(2, (0.0, 0.0, 0.05)), (1, (0.0, -0.1, 0.0)), (2, (0.5, 0.0, 0.0))])
+def test_a_planted_force_is_found(made, patch, force):
+    problem = made(patch, force)
+    found = force_map(problem, fitted(problem), count=COUNT)
+    needed = found.needed[0]
+    axis, size = int(np.abs(force).argmax()), float(np.abs(force).max())
+    width = found.windows[1, 1]
+    assert needed.trial == "b" and int(np.abs(needed.force).argmax()) == axis
+    assert abs(needed.place[0] - found.places[patch][0]) < 0.021
+    assert abs(needed.start - 0.06) < 1.01 * width and abs(needed.end - 0.12) < 1.01 * width
+    assert needed.force[axis] == pytest.approx(force[axis], rel=0.2)
+    assert np.linalg.norm(needed.force - np.array(force)) < 0.25 * size
+    assert found.share > 0.8 and found.simulated > 0.8
+
+
+def test_no_force_is_needed_where_the_recording_agrees(made):
+    problem = made()
+    nothing = fitted(problem)
+    found = force_map(problem, nothing, count=COUNT)
+    assert found.share < 0.02 and not found.needed and str(found).startswith("No force")
+    after = predict(problem, nothing, problem.trials)
+    assert all(m.start is None for m in mismatches(problem, nothing, problem.trials, after))
+
+
+# Phases -----------------------------------------------------------------------------------------------------------
+
+
+def trial_of(tmp_path, tables="", pressure=""):
+    """A bar of one second with what else is told."""
+    chamber = '[[chamber]]\nname = "air"\nbox = [[0.01, 0.005, 0.005], [0.05, 0.015, 0.015]]\n' if pressure else ""
+    setup = SETUP.replace("duration = 0.2", "duration = 1.0") + chamber + tables
+    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
+    experiment(tmp_path, setup, header + "\n" + "\n".join(f"{0.02 * k},0,0,0,0,0,0" for k in range(50)))
+    if pressure:
+        (tmp_path / "trials" / "a" / "pressure.csv").write_text(f"time_s,air_pa\n{pressure}\n")
+    return read_experiment(tmp_path).trials[0]
+
+
+def motion_of(z):
+    """Markers that all move up and down [S], a second long."""
+    at = np.array([[0.06, 0.01, 0.02], [0.04, 0.0, 0.01]])
+    place = at + z[:, None, None] * np.array([0, 0, 1.0])
+    gradient = np.broadcast_to(np.eye(3), (len(z), 2, 3, 3))
+    return Motion(time=np.linspace(0, 1, len(z)), place=place, velocity=0 * place, gradient=gradient, dt=1e-3)
+
+
+STILL = np.zeros(401)
+
+
+def test_phases_of_a_pressure_are_those_that_were_written(tmp_path):
+    rng = np.random.default_rng(3)
+    time = np.linspace(0, 1, 501)
+    p = np.interp(time, (0.2, 0.4, 0.7, 0.8), (0, 2e4, 2e4, 0)) + 50 * rng.normal(size=501)
+    lines = "\n".join(f"{t},{v}" for t, v in zip(time, p, strict=True))
+    found = phases(trial_of(tmp_path, pressure=lines), motion_of(STILL))
+    assert [x.name for x in found] == ["first pause", "inflation", "hold", "deflation", "second pause"]
+    np.testing.assert_allclose([x.start for x in found], (0, 0.2, 0.4, 0.7, 0.8), atol=0.02)
+    assert found[-1].end == 1.0
+
+
+def test_phases_of_a_walk_are_inflations_and_deflations(tmp_path):
+    time = np.linspace(0, 1, 501)
+    lines = "\n".join(f"{t},{1e4 * (1 - np.cos(4 * np.pi * t))}" for t in time)
+    names = [x.name for x in phases(trial_of(tmp_path, pressure=lines), motion_of(STILL))]
+    kinds = [name.split()[-1] for name in names if name.split()[-1] in ("inflation", "deflation")]
+    assert kinds == ["inflation", "deflation"] * 2
+
+
+def test_contact_and_flight_are_told_by_the_lowest_corner(tmp_path):
+    plane = "[[plane]]\npoint = [0.0, 0.0, -0.05]\nnormal = [0.0, 0.0, 1.0]\n"
+    fall = np.interp(np.linspace(0, 1, 401), (0, 0.4, 0.6, 1.0), (0.0, -0.05, -0.05, 0.0))
+    trial = trial_of(tmp_path, plane)
+    trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, clamps=()))
+    found = phases(trial, motion_of(fall))
+    assert [x.name for x in found] == ["first flight", "contact", "second flight"]
+    assert found[1].start == pytest.approx(0.4, abs=0.03) and found[1].end == pytest.approx(0.6, abs=0.03)
+
+
+def test_a_load_and_swings_are_phases(tmp_path):
+    load = "[[load]]\nbox = [[0.05, 0, 0], [0.06, 0.02, 0.02]]\nforce = [0.0, 0.0, -0.1]\nstart = 0.3\n"
+    found = phases(trial_of(tmp_path / "loaded", load), motion_of(STILL))
+    assert [x.name for x in found] == ["time before the load", "time under the load"]
+    assert found[0].end == pytest.approx(0.3, abs=0.002)
+    swing = 0.01 * np.cos(6 * np.pi * np.linspace(0, 1, 401))
+    found = phases(trial_of(tmp_path / "swinging"), motion_of(swing))
+    assert [x.name for x in found][:2] == ["first swing", "second swing"]
+    np.testing.assert_allclose([x.start for x in found], np.arange(6) / 6, atol=0.01)
+
+
+# The whole --------------------------------------------------------------------------------------------------------
+
+
+def test_the_report_says_which_force_no_effect_stands_for(made, tmp_path, monkeypatch):
+    import explain
+
+    problem = made(2, (0.0, 0.0, 0.05))
+    monkeypatch.setattr(explain, "read_experiment", lambda folder: problem.experiment)
+    monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (GravityTilt(),))
+    explain.main(explain.Options(experiment=problem.experiment.folder, out=tmp_path / "out", edge=0.01))
+    answer = json.loads((tmp_path / "out" / "explanation.json").read_text())
+    assert answer["verdict"] == "unknown_physics"
+    needed = answer["force_map"]["needed"][0]
+    assert needed["trial"] == "b" and needed["force_n"][2] == pytest.approx(0.05, rel=0.3)
+    assert answer["force_map"]["words"] in (tmp_path / "out" / "report.html").read_text()
+    parted = answer["mismatch"]["b"]
+    assert 0.06 < parted["starts_s"] < 0.1 and "swing" in parted["phase"] and parted["worst_marker"] == "tip"
+    assert {"name", "start_s", "end_s", "before", "after"} == set(parted["phases"][0])
