@@ -246,8 +246,12 @@ def test_candidates_are_scored_by_the_best_of_them(made):
     worse = dataclasses.replace(nothing, misfit=3 * nothing.samples, effects=(effect("drag"),), unknowns=1)
     better = dataclasses.replace(worse, misfit=1.5 * nothing.samples, effects=(effect("tether"),), unknowns=6)
     start = dataclasses.replace(nothing, misfit=10.0 * nothing.samples)
-    first, second = rank([worse, better], start)
+    first, second = rank([worse, better], start, start.misfit)
     assert first.fit is better and second.fit is worse
+    # What no form of an effect is known well enough for does not count, and then the simpler is the better.
+    near = dataclasses.replace(worse, misfit=better.misfit + 0.5 * nothing.samples)
+    simple, other = rank([near, better], start, 1e3 * start.misfit)
+    assert simple.fit is near and simple.gain < other.gain
     assert first.explained == pytest.approx(8.5 / 9) and second.explained == pytest.approx(7 / 9)
 
 
@@ -279,7 +283,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     assert answer["force_map"] is None and answer["mismatch"]["b"]["phase"].endswith("swing")
     assert answer["error_after"]["a"]["all"] < 0.5 * answer["error_before"]["a"]["all"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Missing is drag" in page and page.count("data:image/png") == 4
+    assert "Missing is drag" in page and page.count("data:image/png") == 5
     folder = tmp_path / "new"
     folder.mkdir()
     (folder / "trial.toml").write_text("duration = 0.05\n[start]\nvelocity = [0.0, 0.0, 0.2]\n")
