@@ -9,12 +9,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from torchsoro.sim2real.body_effects import Modulus
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.heldout import predict_all
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.likelihood import EDGE
+from torchsoro.sim2real.outer_effects import PressureGain
 from torchsoro.sim2real.residual import find_slips
 
 KEPT = 6  # searches that are led to their end, of those that do best at first
@@ -23,10 +25,11 @@ FAR = 3.0  # times what noise and numerics explain, above which searches begin w
 EARLY = (0.12, 0.35)  # of the trials
 PRICED = 1.5  # times what noise and numerics explain, above which what the best effect leaves counts as one of them
 PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
-FORM = 0.002  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
+FORM = 0.001  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 BELIEVED = 1 + 3 * EDGE  # of its tolerance, that a believed number may be off
+LEANS = 20.0  # of the score, that an effect must do better than a free modulus if it needs that too
 TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
 FOLDS = 4  # trials that are left out, one after the other
 TRIED = 4  # rounds of searches before the best are chosen
@@ -51,7 +54,7 @@ class Thresholds:
     """
 
     alarm: float = 40.0
-    margin: float = 6.0
+    margin: float = 8.0
     quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.8
@@ -279,12 +282,13 @@ def _nothing(
 def _likely(looks: Sequence[tuple[float, Hypothesis, np.ndarray]], nothing: Fit, most: int) -> list[Task]:
     """Where to begin searches: each effect that promises something at its best look, then at others that differ."""
     unit = max(1.0, nothing.misfit / nothing.samples) * correlation(nothing)
+    strained = np.abs(nothing.point).max(initial=0.0) > 1  # so that much is taken up that it should not be
     first: list[Task] = []
     more: list[Task] = []
     known: dict[str, list[np.ndarray]] = {}
     for misfit, effect, start in sorted(looks, key=lambda look: look[0]):
         faint = nothing.misfit - misfit < 2 * FAINT * unit
-        if faint and nothing.misfit < 2 * nothing.samples:
+        if faint and nothing.misfit < 2 * nothing.samples and not strained:
             continue
         mine = known.setdefault(effect.name, [])
         if not mine:
@@ -337,6 +341,12 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float) -> list[Candidate]:
     bare = 2 * max(1.0, best.misfit / best.samples) * alike
     unit = max(bare, 2 * FORM * gained)
     worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
+    freed = [f for f in fits if f.effects and all(isinstance(e, Modulus | PressureGain) for e in f.effects)]
+    if freed:
+        # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
+        enough = min(f.misfit for f in freed) - LEANS * unit
+        leaning = [f for f in fits if np.abs(f.point[: len(f.belief)]).max() > BELIEVED and f.misfit > enough]
+        fits = [f for f in fits if f in freed or f not in leaning]
     found = [
         Candidate(
             fit=fit,
