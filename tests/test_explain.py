@@ -246,12 +246,16 @@ def test_candidates_are_scored_by_the_best_of_them(made):
     worse = dataclasses.replace(nothing, misfit=3 * nothing.samples, effects=(effect("drag"),), unknowns=1)
     better = dataclasses.replace(worse, misfit=1.5 * nothing.samples, effects=(effect("tether"),), unknowns=6)
     start = dataclasses.replace(nothing, misfit=10.0 * nothing.samples)
-    first, second = rank([worse, better], start, start.misfit)
+    trust = problem.camera.deviations
+    first, second = rank([worse, better], start, start.misfit, trust)
     assert first.fit is better and second.fit is worse
     # What no form of an effect is known well enough for does not count, and then the simpler is the better.
     near = dataclasses.replace(worse, misfit=better.misfit + 0.5 * nothing.samples)
-    simple, other = rank([near, better], start, 1e3 * start.misfit)
+    simple, other = rank([near, better], start, 1e3 * start.misfit, trust)
     assert simple.fit is near and simple.gain < other.gain
+    # A clock that would have to be off by thirty standard deviations is not excused.
+    bent = dataclasses.replace(near, errors=30 * trust)
+    assert rank([bent, better], start, 1e3 * start.misfit, trust)[0].fit is better
     assert first.explained == pytest.approx(8.5 / 9) and second.explained == pytest.approx(7 / 9)
 
 

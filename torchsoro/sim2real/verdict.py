@@ -30,6 +30,7 @@ MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 BELIEVED = 1 + 3 * EDGE  # of its tolerance, that a believed number may be off
 LEANS = 20.0  # of the score, that an effect must do better than a free modulus if it needs that too
+BENT = 3.0  # standard deviations of a measurement error, beyond which it tells against an effect
 TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
 FOLDS = 4  # trials that are left out, one after the other
 TRIED = 4  # rounds of searches before the best are chosen
@@ -46,7 +47,7 @@ class Thresholds:
 
     Attributes:
         alarm: Score and gain below which nothing is missing.
-        margin: Of the score, within which two effects are not told apart.
+        margin: Of the score, within which two effects are not told apart: odds of twenty to one.
         quiet: Times what noise and numerics explain, below which nothing is missing if no effect is believed.
         beyond: The same, above which the best effect leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
@@ -54,7 +55,7 @@ class Thresholds:
     """
 
     alarm: float = 40.0
-    margin: float = 8.0
+    margin: float = 3.0
     quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.8
@@ -69,8 +70,8 @@ class Candidate:
         fit: The best of it.
         score: What it gains in ln of the likelihood over nothing, less what its parameters are worth. Residuals of a
             wrong model are neither white nor of the variance that was thought: the gain counts in units of what the
-            best effect leaves, neighbouring samples that are alike count once, and no difference counts that the form
-            of an effect may make.
+            best effect leaves, neighbouring samples that are alike count once, no difference counts that the form of
+            an effect may make, and measurement errors far beyond belief tell against it.
         gain: The same over nothing with any modulus and pressure, without allowance for its form.
         explained: Share of the misfit beyond noise and numerics that it takes away.
         kept: Error on trials that were left out over that without an effect; not a number where none was.
@@ -160,14 +161,17 @@ def judge(
         pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]
         best = _best([*best, *pairs])
     believed = _within(problem, nothing)
-    plain = rank(best, nothing, believed)
+    plain = rank(best, nothing, believed, problem.camera.deviations)
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
     own = problem
     problem, nothing, fits = _priced(problem, nothing, best, report)
     believed = believed if problem is own else _within(problem, nothing)
     # What is explained, and what is left, is told by noise and the twin's own error alone.
     explained = {c.fit.name: c.explained for c in plain}
-    found = [dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0)) for c in rank(fits, nothing, believed)]
+    found = [
+        dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0))
+        for c in rank(fits, nothing, believed, problem.camera.deviations)
+    ]
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
@@ -324,13 +328,14 @@ def _within(problem: Problem, nothing: Fit) -> float:
     return max(misfit, nothing.misfit) if math.isfinite(misfit) else nothing.misfit
 
 
-def rank(fits: Sequence[Fit], nothing: Fit, believed: float) -> list[Candidate]:
+def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndarray) -> list[Candidate]:
     """Score fits that are better than nothing, best first.
 
     Args:
         fits: Of effects.
         nothing: The fit without any.
         believed: Its misfit within beliefs.
+        deviations: That measurement errors are believed to have.
     """
     fits = [fit for fit in fits if fit.misfit < nothing.misfit]
     if not fits:
@@ -350,13 +355,18 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float) -> list[Candidate]:
     found = [
         Candidate(
             fit=fit,
-            score=(believed - fit.misfit) / unit - fit.unknowns * worth,
+            score=(believed - fit.misfit) / unit - fit.unknowns * worth - _bent(fit, deviations),
             gain=(nothing.misfit - fit.misfit) / bare - fit.unknowns * worth,
             explained=(believed - fit.misfit) / max(believed - fit.samples, 1.0),
         )
         for fit in fits
     ]
     return sorted(found, key=lambda c: -c.score)
+
+
+def _bent(fit: Fit, deviations: np.ndarray) -> float:
+    """What it costs that measurement errors are far beyond belief, which no form of an effect excuses."""
+    return 0.5 * float((np.maximum(np.abs(fit.errors / deviations) - BENT, 0.0) ** 2).sum())
 
 
 def correlation(fit: Fit) -> float:
