@@ -253,10 +253,11 @@ def test_candidates_are_scored_by_the_best_of_them(made):
     near = dataclasses.replace(worse, misfit=better.misfit + 0.5 * nothing.samples)
     simple, other = rank([near, better], start, 1e3 * start.misfit, trust)
     assert simple.fit is near and simple.gain < other.gain
-    # A clock that would have to be off by thirty standard deviations is not excused.
-    bent = dataclasses.replace(near, errors=30 * trust)
-    assert rank([bent, better], start, 1e3 * start.misfit, trust)[0].fit is better
-    assert first.explained == pytest.approx(8.5 / 9) and second.explained == pytest.approx(7 / 9)
+    # A clock that would have to be off by five standard deviations tells against an effect, thirty do not forbid it.
+    for off, cost in ((2.0, 0.0), (5.0, 2.0), (30.0, 12.0)):
+        bent = dataclasses.replace(near, errors=off * trust * (np.arange(len(trust)) == 0))
+        told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.misfit, trust)}
+        assert told["drag"] == pytest.approx(simple.score - cost)
 
 
 # The whole --------------------------------------------------------------------------------------------------------

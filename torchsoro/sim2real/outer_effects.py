@@ -116,7 +116,8 @@ class FluidDrag(Hypothesis):
     """The surrounding fluid slows the body, with the square of the velocity, on the area that moves through it."""
 
     name, seam = "drag", "drag of what surrounds the body"
-    quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 1000.0),)
+    # Water, and a plate across its motion: 1000 kg/m3 times 2.
+    quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 125.0),)
     starts = ((1.0,), (5.0,), (25.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:

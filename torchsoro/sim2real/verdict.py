@@ -29,6 +29,7 @@ FORM = 0.001  # of what an effect takes away, that may be due to its form: natur
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 BELIEVED = 1 + 3 * EDGE  # of its tolerance, that a believed number may be off
+MISTRUST = 12.0  # of the score, that measurement errors beyond belief cost at most
 LEANS = 20.0  # of the score, that an effect must do better than a free modulus if it needs that too
 BENT = 3.0  # standard deviations of a measurement error, beyond which it tells against an effect
 TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
@@ -238,8 +239,8 @@ def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: i
 def _pairs(
     problem: Problem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
-    """Two effects together: each of the two that do best with every other, on more and more of the trials."""
-    singles = singles[:2]
+    """Two effects together: each of the three that do best with every other, on more and more of the trials."""
+    singles = singles[:3]
     tasks: list[Task] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
@@ -365,8 +366,8 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndar
 
 
 def _bent(fit: Fit, deviations: np.ndarray) -> float:
-    """What it costs that measurement errors are far beyond belief, which no form of an effect excuses."""
-    return 0.5 * float((np.maximum(np.abs(fit.errors / deviations) - BENT, 0.0) ** 2).sum())
+    """What it costs that measurement errors are far beyond belief: something, as beliefs may be wrong."""
+    return min(0.5 * float((np.maximum(np.abs(fit.errors / deviations) - BENT, 0.0) ** 2).sum()), MISTRUST)
 
 
 def correlation(fit: Fit) -> float:
