@@ -60,7 +60,7 @@ class Thresholds:
     quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.8
-    lost: float = 0.93
+    lost: float = 0.82
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -358,7 +358,7 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndar
             fit=fit,
             score=(believed - fit.misfit) / unit - fit.unknowns * worth - _bent(fit, deviations),
             gain=(nothing.misfit - fit.misfit) / bare - fit.unknowns * worth,
-            explained=(believed - fit.misfit) / max(believed - fit.samples, 1.0),
+            explained=min((believed - fit.misfit) / max(believed - fit.samples, 1.0), 1.0),
         )
         for fit in fits
     ]
