@@ -125,6 +125,7 @@ def main(options: Options) -> Explanation | None:
         shift=numerics.shift,
         correction=numerics.correction,
         ensemble=ensemble,
+        fine=Ensemble(fine, ensemble.threads),
     )
     print(
         f"noise {1e3 * problem.noise:.3f} mm, numerics "

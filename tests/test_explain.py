@@ -260,6 +260,19 @@ def test_candidates_are_scored_by_the_best_of_them(made):
         assert told["drag"] == pytest.approx(simple.score - cost)
 
 
+def test_a_finer_twin_corrects_where_one_is(made):
+    twin, ensemble, record = made
+    setup = record(None).setup
+    fine = Ensemble(Twin(setup, edge=0.6 * twin.edge, across=5))
+    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
+    at = np.array([0.8])
+    there = Problem(record(None), fine.twin, ensemble=fine)
+    wanted = there.simulate([((), at[None])])[0]
+    for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
+        assert np.abs(motion.place - right.place).max() < 1e-7
+    assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
+
+
 # The whole --------------------------------------------------------------------------------------------------------
 
 

@@ -59,6 +59,7 @@ class Likelihood:
         noise: [m]; that of the setup, or estimated, if None.
         slips: Markers that have slipped.
         ensemble: Of the twin, if there is one already.
+        fine: Of a finer twin, for :meth:`corrected`.
         report: Called with a line after each batch of simulations.
     """
 
@@ -76,10 +77,11 @@ class Likelihood:
         noise: float | None = None,
         slips: Sequence[Slip] = (),
         ensemble: Ensemble | None = None,
+        fine: Ensemble | None = None,
         report: Callable[[str], None] = lambda line: None,
     ) -> None:
         self.experiment, self.twin, self.report = experiment, twin, report
-        self.ensemble = ensemble or Ensemble(twin)
+        self.ensemble, self.fine = ensemble or Ensemble(twin), fine
         self.trials = tuple(experiment.trials if trials is None else trials)
         recordings = [t.recording for t in self.trials if t.recording is not None]
         self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
@@ -121,10 +123,25 @@ class Likelihood:
             noise=self.noise,
             slips=self.slips if slips is None else slips,
             ensemble=self.ensemble,
+            fine=self.fine,
             report=self.report,
         )
         there.tally = self.tally
         return there
+
+    def corrected(self, at: np.ndarray) -> Self:
+        """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales."""
+        if self.fine is None:
+            return self
+        still: list[Request] = [((), at[None])]
+        there = type(self)(self.experiment, self.fine.twin, trials=self.trials, noise=self.noise, ensemble=self.fine)
+        own = self.only(self.trials, correction={}).simulate(still)[0]
+        found = {
+            t.name: b.alone().plus(a.alone(), -1.0)
+            for t, a, b in zip(self.trials, own, there.simulate(still)[0], strict=True)
+            if a.sound.all() and b.sound.all()
+        }
+        return self.only(self.trials, correction={**self.correction, **found})
 
     def early(self, share: float) -> Self:
         """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase."""

@@ -60,7 +60,7 @@ class Thresholds:
     quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.8
-    lost: float = 0.82
+    lost: float = 0.85
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -143,6 +143,9 @@ def judge(
         problem = problem.only(problem.trials, correction={})
         carried = _from_the_beginning(problem, effects, most)
         problem, nothing = _nothing(problem, [t for t in carried if not t[0]], report)
+    else:
+        problem = problem.corrected(nothing.point)
+        problem, nothing = _nothing(problem, [((), nothing.point)], report)
     tasks = [t for t in carried if t[0]]
     if not tasks:
         looks = _looks(problem, nothing, effects)
