@@ -360,7 +360,8 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndar
         Candidate(
             fit=fit,
             score=(believed - fit.misfit) / unit - fit.unknowns * worth - _bent(fit, deviations),
-            gain=(nothing.misfit - fit.misfit) / bare - fit.unknowns * worth,
+            # What sets a modulus free gains over one that is believed.
+            gain=((believed if fit in freed else nothing.misfit) - fit.misfit) / bare - fit.unknowns * worth,
             explained=min((believed - fit.misfit) / max(believed - fit.samples, 1.0), 1.0),
         )
         for fit in fits
