@@ -10,18 +10,14 @@ Nothing is resampled, smoothed or filled. Markers of setup.toml must have the sa
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import io
-import math
 from pathlib import Path
 
 import tyro
 
 from torchsoro.settings import plain_errors
-from torchsoro.sim2real.recording import AXES
+from torchsoro.sim2real.recording import AXES, write_table
 from torchsoro.sim2real.tracking import LIKELIHOOD, Frame, Tracked, read
-from torchsoro.storage import atomic_write
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -83,15 +79,7 @@ def main(options: Options) -> None:
         start=options.start,
     )
     tracked = renamed(read(options.files, frame, fps=options.fps, likelihood=options.likelihood), options.rename)
-    columns = tracked.columns()
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(columns)
-    for row in zip(*columns.values(), strict=True):  # adding 0 makes -0 a 0
-        table.writerow("" if math.isnan(value) else f"{value + 0.0:.9g}" for value in row)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(options.out) as file:
-        file.write(text.getvalue().encode())
+    write_table(options.out, tracked.columns())
     recording = tracked.recording
     for m, name in enumerate(tracked.names):
         seen = recording.seen[:, m, 0]  # one coordinate, as a sample is lost as a whole

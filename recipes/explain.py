@@ -5,8 +5,8 @@
     python recipes/explain.py --predict runs/explained/model.toml --trial trial.toml --out markers.csv
 
 The experiment is a folder: setup.toml says what is believed, trials/<name>/markers.csv what was recorded. Trials in a
-folder heldout/ are only predicted; without one, the last of three or more. Writes report.html, explanation.json and
-model.toml, the setup with what was missing, which predicts a trial that nobody has recorded yet.
+folder heldout/ are only predicted; without one, each of three or more from the others. Writes report.html,
+explanation.json and model.toml, the setup with what was missing, which predicts a trial that nobody has recorded yet.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from torchsoro.sim2real.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.next_experiment import next_experiment
 from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
 from torchsoro.sim2real.phases import mismatches
+from torchsoro.sim2real.recording import write_table
 from torchsoro.sim2real.report import Explanation, lead, write
 from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.twin import Twin
 from torchsoro.sim2real.verdict import judge
-from torchsoro.storage import atomic_write
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,11 +71,7 @@ def predicted(options: Options) -> None:
     assert options.predict is not None
     if options.trial is None:
         raise ValueError("trial: wanted the trial.toml to predict")
-    columns = predict_trial(read_model(options.predict), options.trial, options.predict)
-    lines = [",".join(columns), *(",".join(f"{x:.9g}" for x in row) for row in zip(*columns.values(), strict=True))]
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(options.out) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    write_table(options.out, predict_trial(read_model(options.predict), options.trial, options.predict))
 
 
 def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
@@ -84,10 +80,11 @@ def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
     Raises:
         ValueError: for a name that is not known.
     """
-    known = {effect.name: effect for effect in library()}
+    known = dict.fromkeys(effect.name for effect in library())
     if unknown := set(names) - set(known):
         raise ValueError(f"effects = {', '.join(sorted(unknown))}: wanted names out of {', '.join(known)}")
-    return [known[name] for name in names] or None
+    # More than one may have a name, as friction of planes that are thought to stick and of others.
+    return [effect for effect in library() if effect.name in names] or None
 
 
 def main(options: Options) -> Explanation | None:
@@ -114,8 +111,8 @@ def main(options: Options) -> Explanation | None:
         twin = choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
     print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
     ensemble = Ensemble(twin, options.threads or THREADS)
-    fine = finer(twin, len(trials), 2 * options.budget)
-    print(f"corrected by one of {fine.count} points")
+    fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads)
+    print(f"corrected by one of {fine.twin.count} points")
     numerics = measure(experiment, ensemble, fine)
     problem = Problem(
         experiment,
@@ -125,7 +122,7 @@ def main(options: Options) -> Explanation | None:
         shift=numerics.shift,
         correction=numerics.correction,
         ensemble=ensemble,
-        fine=Ensemble(fine, ensemble.threads),
+        fine=fine,
     )
     print(
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
@@ -170,7 +167,7 @@ def main(options: Options) -> Explanation | None:
     }
     options.out.mkdir(parents=True, exist_ok=True)
     write(found, everything, options.out, settings)
-    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, fine)
+    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, fine.twin)
     print(f"{verdict.kind}: {lead(found)}\n{found.seconds:.0f} s; {options.out / 'report.html'}")
     return found
 

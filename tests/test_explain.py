@@ -13,7 +13,7 @@ import torch
 from test_experiment import experiment
 
 from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Experiment, read_experiment
+from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
@@ -59,19 +59,22 @@ def effect(name):
     return next(e for e in library() if e.name == name)
 
 
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A bar, and what its twin would record with an effect, two trials."""
-    folder = tmp_path_factory.mktemp("bar")
+def two_trials(folder: Path) -> tuple[Experiment, Trial]:
+    """A bar with a trial in which nothing was seen yet, and another in which it is thrown."""
     header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
     blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
     experiment(folder, SETUP, f"{header}\n{blank}\n")
     found = read_experiment(folder)
+    thrown = dataclasses.replace(found.setup, velocity=(0.0, 0.1, 0.3))
+    return found, dataclasses.replace(found.trials[0], name="b", setup=thrown)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A bar, and what its twin would record with an effect, two trials."""
+    found, loud = two_trials(tmp_path_factory.mktemp("bar"))
     twin = Twin(found.setup, edge=EDGE, across=2)
     ensemble = Ensemble(twin)
-    loud = dataclasses.replace(
-        found.trials[0], name="b", setup=dataclasses.replace(found.setup, velocity=(0.0, 0.1, 0.3))
-    )
 
     def record(name: str | None, values=()) -> Experiment:
         rng, trials = np.random.default_rng(1), []

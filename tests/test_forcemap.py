@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from test_experiment import experiment
-from test_explain import SETUP
+from test_explain import SETUP, two_trials
 
 from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import read_experiment
@@ -32,16 +32,9 @@ COUNT = 3  # patches
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A bar, and what its twin would record in two trials, with a force on a patch from 60 to 120 ms in the second."""
-    folder = tmp_path_factory.mktemp("bar")
-    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
-    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
-    experiment(folder, SETUP, f"{header}\n{blank}\n")
-    found = read_experiment(folder)
+    found, thrown = two_trials(tmp_path_factory.mktemp("bar"))
     twin = Twin(found.setup, edge=0.01, across=2)
     ensemble = Ensemble(twin)
-    thrown = dataclasses.replace(
-        found.trials[0], name="b", setup=dataclasses.replace(found.setup, velocity=(0, 0.1, 0.3))
-    )
 
     def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> Problem:
         rng, trials = np.random.default_rng(1), []

@@ -12,18 +12,24 @@ from nbclient import NotebookClient
 NOTEBOOKS = Path(__file__).parents[1] / "notebooks"
 
 
+def executed(name, last, monkeypatch, folder):
+    """The notebook, run in a folder, with one more cell."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.delenv("MPLBACKEND", raising=False)
+    notebook = nbformat.read(NOTEBOOKS / name, as_version=4)
+    notebook.cells.append(nbformat.v4.new_code_cell(last))
+    NotebookClient(
+        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
+    return notebook
+
+
 @pytest.mark.notebook
 @pytest.mark.filterwarnings("default")  # those of the kernel's client are not ours
 def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHSORO_NOTEBOOK_STEPS", "4")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.delenv("MPLBACKEND", raising=False)
-    notebook = nbformat.read(NOTEBOOKS / "01_compose_with_torch.ipynb", as_version=4)
     losses = "print(volume_loss[-1] / volume_loss[0], bend_loss[-1] - bend_loss[0])"
-    notebook.cells.append(nbformat.v4.new_code_cell(losses))
-    NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    ).execute()
+    notebook = executed("01_compose_with_torch.ipynb", losses, monkeypatch, tmp_path)
     ratio, change = map(float, notebook.cells[-1].outputs[-1].text.split())
     assert ratio < 0.8
     assert change < -0.01
@@ -35,13 +41,7 @@ def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatc
 @pytest.mark.filterwarnings("default")
 def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHSORO_NOTEBOOK_CELLS", "4")
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.delenv("MPLBACKEND", raising=False)
-    notebook = nbformat.read(NOTEBOOKS / "02_from_sweep_to_bounce.ipynb", as_version=4)
-    notebook.cells.append(nbformat.v4.new_code_cell("print(*restitution)"))
-    NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    ).execute()
+    notebook = executed("02_from_sweep_to_bounce.ipynb", "print(*restitution)", monkeypatch, tmp_path)
     restitution = list(map(float, notebook.cells[-1].outputs[-1].text.split()))
     assert len(restitution) == 6
     assert restitution[0] > 0.85  # four cells across the ball are few
@@ -52,13 +52,8 @@ def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, t
 @pytest.mark.notebook
 @pytest.mark.filterwarnings("default")
 def test_an_effect_of_ones_own_is_found_among_those_of_the_package(monkeypatch, tmp_path):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.delenv("MPLBACKEND", raising=False)
-    notebook = nbformat.read(NOTEBOOKS / "03_why_it_moves_differently.ipynb", as_version=4)
-    notebook.cells.append(nbformat.v4.new_code_cell("print(first.kind, second.kind, fit.name, value)"))
-    NotebookClient(
-        notebook, timeout=300, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    ).execute()
+    said = "print(first.kind, second.kind, fit.name, value)"
+    notebook = executed("03_why_it_moves_differently.ipynb", said, monkeypatch, tmp_path)
     before, after, name, value = notebook.cells[-1].outputs[-1].text.split()
     assert before != "explained" and (after, name) == ("explained", "eddy_brake")
     assert float(value) == pytest.approx(0.1, rel=0.03)

@@ -28,7 +28,6 @@ class Mesh(NamedTuple):
     Attributes:
         corners: Lowest node of each cell [C].
         cells: Number of each cell along x, y, z [C, 3].
-        points: Number of each of a cell's points, z fastest [C, 8]; -1 where there is no body.
         weights: Of an axis' three nodes at a cell's two points [3, cells, 2, 3].
         slopes: The same, of the derivatives of the weights.
         stride_x: Between nodes along x.
@@ -51,7 +50,6 @@ class Mesh(NamedTuple):
 
     corners: np.ndarray
     cells: np.ndarray
-    points: np.ndarray
     weights: np.ndarray
     slopes: np.ndarray
     stride_x: int
@@ -79,7 +77,7 @@ class Case(NamedTuple):
         dt: Substep.
         steps: Of them.
         every: Substeps between two samples.
-        own: Of each point, shear and bulk modulus times volume, and 0 [P * 48].
+        own: Of each point, eight to a cell with z fastest, shear and bulk modulus times volume, and 0 [P * 48].
         series: Of Maxwell elements g, g b, a and b (1 - a) [E * 64], with a and b as in ``Prony.discrete``.
         law: Coefficients a and b of ``stress.stiffening``, depth and range of softening [64].
         stiffens: Whether any of the former is not zero.
@@ -307,15 +305,11 @@ def march(mesh, case, out):
             Wz, Sz = mesh.weights[2, mesh.cells[cell, 2]], mesh.slopes[2, mesh.cells[cell, 2]]
             gather(d, corner, mesh.stride_x, mesh.stride_y, Wx, Wy, Wz, Sx, Sy, Sz, X, Y, G)
             for k in range(8):
-                p = mesh.points[cell, k]
-                if p < 0:
-                    P[144 * k : 144 * k + 144] = f32(0)
-                else:
-                    if elements > 0:
-                        history = Z[96 * elements * p : 96 * elements * (p + 1)]
-                        remember(144 * k, G, T, Q, history, case.series, case.law, case.stiffens, elements)
-                    mine = own[48 * p : 48 * p + 48]
-                    solid(144 * k, G, P, Q, mine, case.law, case.stiffens, case.softens)
+                p = 8 * cell + k
+                if elements > 0:
+                    history = Z[96 * elements * p : 96 * elements * (p + 1)]
+                    remember(144 * k, G, T, Q, history, case.series, case.law, case.stiffens, elements)
+                solid(144 * k, G, P, Q, own[48 * p : 48 * p + 48], case.law, case.stiffens, case.softens)
             scatter(f, corner, mesh.stride_x, mesh.stride_y, Wx, Wy, Wz, Sx, Sy, Sz, X, P)
         if chambers > 0:
             _walls(mesh, case, t, d, f, swept, normals)

@@ -272,7 +272,6 @@ def mesh_of(twin: Twin) -> Mesh:
     return Mesh(
         corners=grid.corner(grid.cells).astype(whole),
         cells=grid.cells.astype(whole),
-        points=np.arange(len(grid.points)).reshape(-1, 8),
         weights=weights,
         slopes=slopes,
         stride_x=int(sx),

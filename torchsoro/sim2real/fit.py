@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 from torchsoro.kernels.lanes import LANES
 from torchsoro.sim2real.hypothesis import Hypothesis
-from torchsoro.sim2real.likelihood import Effects, Likelihood, Request
+from torchsoro.sim2real.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.twin import Motion
 
 STEP = 0.05  # of a scale, for differences
@@ -225,9 +225,7 @@ class Problem(Likelihood):
                 asked = search.send(self.simulate([asked])[0])
         except StopIteration as end:
             if end.value is None:
-                raise ValueError(
-                    "setup: its simulation breaks down, wanted a body that bears what acts on it"
-                ) from None
+                raise ValueError(BREAKS) from None
             return end.value
 
     def _held(self, effects: Effects) -> np.ndarray:

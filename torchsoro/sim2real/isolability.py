@@ -16,6 +16,7 @@ from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
+from torchsoro.sim2real.likelihood import BREAKS
 from torchsoro.sim2real.likeness import SCORE, Belief, Response, cleared, compare
 from torchsoro.sim2real.residual import Band, Camera
 from torchsoro.sim2real.scenario import Scenario
@@ -71,11 +72,7 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
     Raises:
         ValueError: if what is believed breaks down.
     """
-    effects = [
-        effect
-        for effect in (library() if effects is None else effects)
-        if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
-    ]
+    effects = problem.thought_of(library() if effects is None else effects)
     n = len(problem.common)
     # Effects that are fitted always need no simulation of their own.
     fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
@@ -87,7 +84,7 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
     problem.ensemble = Even(problem.twin, problem.ensemble.threads)
     base, *found = problem.simulate([((), still), *asked])
     if not all(m.sound.all() for m in base):
-        raise ValueError("setup: its simulation breaks down, wanted a body that bears what acts on it")
+        raise ValueError(BREAKS)
     believed = [m.alone(0) for m in base]
     blocks = [changes(problem.camera, problem.bands, believed, motions) for motions in (base, *found)]
     blocks[0] = blocks[0][:, 1:] / SMALL

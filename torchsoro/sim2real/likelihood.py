@@ -24,6 +24,8 @@ from torchsoro.sim2real.twin import Motion, Twin
 EDGE = 0.15  # of a belief's tolerance, over which it ends
 WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
 
+BREAKS = "setup: its simulation breaks down, wanted a body that bears what acts on it"
+
 Effects = tuple[Hypothesis, ...]
 Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
 
@@ -136,12 +138,13 @@ class Likelihood:
         still: list[Request] = [((), at[None])]
         there = type(self)(self.experiment, self.fine.twin, trials=self.trials, noise=self.noise, ensemble=self.fine)
         own = self.only(self.trials, correction={}).simulate(still)[0]
-        found = {
-            t.name: b.alone().plus(a.alone(), -1.0)
-            for t, a, b in zip(self.trials, own, there.simulate(still)[0], strict=True)
-            if a.sound.all() and b.sound.all()
-        }
-        return self.only(self.trials, correction={**self.correction, **found})
+        return self.only(
+            self.trials, correction={**self.correction, **added(self.trials, own, there.simulate(still)[0])}
+        )
+
+    def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Those of the effects for which there is something in a trial that they change."""
+        return [e for e in effects if any(e.applies(scenario, self.twin) for scenario in self.scenarios)]
 
     def early(self, share: float) -> Self:
         """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase."""
@@ -252,3 +255,12 @@ class Likelihood:
         r[:n] = np.sign(at[:n]) * np.hypot(WITHIN * at[:n], out)
         slope[:n] = np.where(out > 0, 1 / EDGE, WITHIN)
         return np.where(held, 0.0, r), np.where(held, 0.0, slope)
+
+
+def added(trials: Sequence[Trial], coarse: Sequence[Motion], fine: Sequence[Motion]) -> dict[str, Motion]:
+    """By trial, what a finer twin adds to motions [S, M, ...]; nothing where one of them broke down."""
+    return {
+        t.name: b.alone().plus(a.alone(), -1.0)
+        for t, a, b in zip(trials, coarse, fine, strict=True)
+        if a.sound.all() and b.sound.all()
+    }

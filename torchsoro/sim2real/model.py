@@ -18,6 +18,7 @@ from torchsoro.sim2real.fit import Fit
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.outer_effects import PressureGain
+from torchsoro.sim2real.recording import Recording
 from torchsoro.sim2real.scenario import Scenario
 from torchsoro.sim2real.twin import Twin
 from torchsoro.storage import atomic_write
@@ -141,8 +142,7 @@ def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarr
     motion = Ensemble(twin)([model.apply(twin.scenario(told), twin)])[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
-    columns = {"time_s": motion.time}
-    for m, marker in enumerate(told.setup.markers):
-        for axis in told.setup.axes:
-            columns[f"{marker.name}_{'xyz'[axis]}_m"] = motion.place[:, m, axis]
-    return columns
+    axes = told.setup.axes
+    return Recording(time=motion.time, place=motion.place[..., list(axes)], axes=axes).columns(
+        [m.name for m in told.setup.markers]
+    )

@@ -127,11 +127,10 @@ def menu(trial: Trial, twin: Twin, extra: Marker) -> list[Choice]:
         extra: Another marker.
     """
     s = trial.setup
-    same = dataclasses.replace(trial, recording=trial.recording)
     longest = int(np.argmax(s.size))
     found = [
-        Choice(words=REPEAT, trial=same),
-        Choice(words=f"the same with another marker at {_mm(extra.at)}", trial=same, marker=True),
+        Choice(words=REPEAT, trial=trial),
+        Choice(words=f"the same with another marker at {_mm(extra.at)}", trial=trial, marker=True),
     ]
 
     def add(words: str, *, pressure: Waveform | None = trial.pressure, **changed) -> None:

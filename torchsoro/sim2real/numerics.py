@@ -13,6 +13,7 @@ import torch
 from torchsoro.sim2real.ensemble import SAFETY, THREADS, Ensemble
 from torchsoro.sim2real.experiment import Experiment, Setup, Trial
 from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.likelihood import BREAKS, added
 from torchsoro.sim2real.residual import Priors
 from torchsoro.sim2real.twin import Motion, Twin
 
@@ -104,7 +105,7 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
 def measure(
     experiment: Experiment,
     ensemble: Ensemble,
-    fine: Twin,
+    fine: Ensemble,
     *,
     report: Callable[[str], None] = lambda line: None,
 ) -> Numerics:
@@ -113,24 +114,24 @@ def measure(
     Args:
         experiment: What is to be explained, with trials that are only predicted.
         ensemble: Of the twin in use.
-        fine: Another twin.
+        fine: Of another.
         report: Called with a line after each batch of simulations.
     """
     setup, twin = experiment.setup, ensemble.twin
     trials = [t for t in experiment.trials if t.recording is not None]
     everything = [*trials, *(t for t in experiment.heldout if t.recording is not None)]
     common = {"noise": 1e-4, "report": report}
-    there = Problem(experiment, fine, trials=everything, ensemble=Ensemble(fine, ensemble.threads), **common)
+    there = Problem(experiment, fine.twin, trials=everything, ensemble=fine, **common)
     other = _believed(there)
     here = Problem(experiment, twin, trials=trials, ensemble=ensemble, priors=EXACT, **common)
     fit = here.only(_told(here, other)).fit([((), None)], rounds=4)[0]
     shift = np.zeros(len(here.common)) if fit is None else fit.belief
     own = _believed(Problem(experiment, twin, trials=everything, ensemble=ensemble, shift=tuple(shift), **common))
-    correction = {t.name: b.plus(a, -1.0) for t, a, b in zip(everything, own, other, strict=True)}
+    correction = added(everything, own, other)
     here = Problem(experiment, twin, trials=trials, ensemble=ensemble, **common)
     # Of the difference to cells that are so much larger, the finer twin's own error, which falls with their square;
     # blows do not.
-    ratio = max((fine.count / twin.count) ** (1 / 3), 1.1)
+    ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
     share = 1.0 if here.scenarios[0].grounds else 1 / (ratio**2 - 1)
     deviations = [_apart(here, other[: len(trials)], share)]
     deviations += [_apart(here, touching, 0.5) for touching in _touching(here)]
@@ -139,12 +140,16 @@ def measure(
         left = SURE * np.sqrt(sum(d[i] ** 2 for d in deviations))
         seen = here.camera.see(motion, i, np.zeros(len(here.camera.deviations)))[0]
         # Error is shared: no marker is far better than the others.
-        common = math.sqrt(float((left**2).mean()))
+        shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
-        found.append(np.maximum(left, max(common / 2, FLOOR * moved)))
-    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.cavities else t.walls for t in (twin, fine))
+        found.append(np.maximum(left, max(shared / 2, FLOOR * moved)))
+    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.cavities else t.walls for t in (twin, fine.twin))
     return Numerics(
-        deviation=tuple(found), shift=tuple(shift), correction=correction, edges=(twin.edge, fine.edge), walls=thinnest
+        deviation=tuple(found),
+        shift=tuple(shift),
+        correction=correction,
+        edges=(twin.edge, fine.twin.edge),
+        walls=thinnest,
     )
 
 
@@ -201,5 +206,5 @@ def _believed(problem: Problem) -> list[Motion]:
     """
     motions = problem.simulate([((), np.zeros((1, len(problem.common))))])[0]
     if not all(m.sound.all() for m in motions):
-        raise ValueError("setup: its simulation breaks down, wanted a body that bears what acts on it")
+        raise ValueError(BREAKS)
     return [m.alone() for m in motions]

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+
+from torchsoro.storage import atomic_write
 
 AXES = "xyz"
 
@@ -52,6 +55,18 @@ class Recording:
         """Where a sample was not lost, bool [T, M, A]."""
         return np.isfinite(self.place)
 
+    def columns(self, markers: Sequence[str]) -> dict[str, np.ndarray]:
+        """Columns [T] of a markers.csv by name; NaN where a sample was lost.
+
+        Args:
+            markers: Names.
+        """
+        columns = {"time_s": self.time}
+        for m, name in enumerate(markers):
+            for a, axis in enumerate(self.axes):
+                columns[f"{name}_{AXES[axis]}_m"] = self.place[:, m, a]
+        return columns
+
     @classmethod
     def read(cls, path: Path, markers: Sequence[str], axes: Sequence[int] = (0, 1, 2)) -> Recording:
         """Read ``time_s, <marker>_x_m, <marker>_y_m, ...``; an empty cell is a lost sample.
@@ -73,6 +88,18 @@ class Recording:
             return cls(time=np.array(columns["time_s"]), place=place, axes=tuple(axes))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+
+
+def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write columns [T] by name as a CSV file, whose folder is made; NaN is an empty cell."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(columns)
+    for row in zip(*columns.values(), strict=True):  # adding 0 makes -0 a 0
+        table.writerow("" if math.isnan(value) else f"{value + 0.0:.9g}" for value in row)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_write(path) as file:
+        file.write(text.getvalue().encode())
 
 
 def read_table(path: Path) -> dict[str, list[float]]:

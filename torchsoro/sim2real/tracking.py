@@ -36,11 +36,7 @@ class Tracked:
 
     def columns(self) -> dict[str, np.ndarray]:
         """Columns [T] of a markers.csv by name; NaN where a sample was lost."""
-        columns = {"time_s": self.recording.time}
-        for m, name in enumerate(self.names):
-            for a, axis in enumerate(self.recording.axes):
-                columns[f"{name}_{AXES[axis]}_m"] = self.recording.place[:, m, a]
-        return columns
+        return self.recording.columns(self.names)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.heldout import predict_all
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.library import library
-from torchsoro.sim2real.likelihood import EDGE
+from torchsoro.sim2real.likelihood import BREAKS, EDGE
 from torchsoro.sim2real.outer_effects import PressureGain
 from torchsoro.sim2real.residual import find_slips
 
@@ -122,16 +122,12 @@ def judge(
     Args:
         problem: Recordings and twin.
         effects: What is thought of; the library if None.
-        kept: Trials that are only predicted. Without any, one of three or more is predicted from the others.
+        kept: Trials that are only predicted. Without any, each of three or more is predicted from the others.
         thresholds: What decides.
         budget: Time that this may take, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
     """
-    effects = [
-        effect
-        for effect in (library() if effects is None else effects)
-        if any(effect.applies(scenario, problem.twin) for scenario in problem.scenarios)
-    ]
+    effects = problem.thought_of(library() if effects is None else effects)
     problem, nothing = _nothing(problem, [((), None)], report, rounds=3)
     begin = problem.tally
     each = begin.seconds / max(begin.simulations, 1) * len(problem.trials)
@@ -275,7 +271,7 @@ def _nothing(
     while True:
         ends = [f for f in problem.fit(tasks, rounds=rounds) if f is not None]
         if not ends:
-            raise ValueError("setup: its simulation breaks down, wanted a body that bears what acts on it")
+            raise ValueError(BREAKS)
         nothing = min(ends, key=lambda fit: fit.misfit)
         report(f"nothing: misfit {nothing.misfit:.0f} of {nothing.samples} samples")
         left = [t.recording.place - seen for t, seen in zip(problem.trials, nothing.seen, strict=True) if t.recording]
@@ -354,8 +350,9 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndar
     if freed:
         # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
         enough = min(f.misfit for f in freed) - LEANS * unit
-        leaning = [f for f in fits if np.abs(f.point[: len(f.belief)]).max() > BELIEVED and f.misfit > enough]
-        fits = [f for f in fits if f in freed or f not in leaning]
+        fits = [
+            f for f in fits if f in freed or f.misfit <= enough or np.abs(f.point[: len(f.belief)]).max() <= BELIEVED
+        ]
     found = [
         Candidate(
             fit=fit,
