@@ -206,6 +206,23 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
     assert one.total < 0.3 * other.total
 
 
+def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
+    """The trial that is left out disagrees, so that the fits differ."""
+    twin, ensemble, record = made
+    told = record("drag", (600.0,))
+    off = dataclasses.replace(told.trials[1], recording=record("drag", (500.0,)).trials[1].recording)
+    problem = Problem(dataclasses.replace(told, trials=(told.trials[0], off)), twin, ensemble=ensemble)
+    tasks = [((effect("drag"),), np.array([0.0, 1.0]))]
+    (both,) = problem.fit(tasks)
+    there = problem.only(problem.trials[:1])
+    (one,) = there.fit(tasks)
+    found = problem.without(both, 1)
+    assert found.errors.shape == one.errors.shape
+    away = abs(both.point - one.point)
+    assert away[1] > 0.1 * one.point[1]
+    assert (abs(found.point - one.point) < 0.2 * away + 0.01).all()
+
+
 def test_what_is_believed_costs_little_within_its_tolerance(made):
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)

@@ -19,9 +19,23 @@ from torchsoro.sim2real.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.twin import Motion
 
 STEP = 0.05  # of a scale, for differences
+STIFF = 1e-3  # damping of the step without a trial: what the others hardly tell stays as it was
 FIRST = 0.5  # the longest step of a search, in shares of what is there plus two scales
 
 Search = Generator[Request, list[Motion], "Point | None"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Point:
+    """Where a search stands: unknowns in scales, measurement errors, whitened residual, slopes by both, motions."""
+
+    misfit: float
+    at: np.ndarray
+    errors: np.ndarray
+    r: np.ndarray
+    J: np.ndarray
+    columns: np.ndarray
+    motions: list[Motion]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -40,6 +54,7 @@ class Fit:
         seen: What would have been recorded in each trial [T, M, A] m.
         whitened: Residual of each trial, divided by what may be.
         point: All that was fitted by simulating, in scales.
+        end: Where the search ended.
     """
 
     effects: Effects
@@ -53,24 +68,12 @@ class Fit:
     seen: tuple[np.ndarray, ...]
     whitened: tuple[np.ndarray, ...]
     point: np.ndarray
+    end: Point
 
     @property
     def name(self) -> str:
         """Of the effects."""
         return " + ".join(e.name for e in self.effects) or "nothing"
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Point:
-    """Where a search stands: unknowns in scales, measurement errors, whitened residual, slopes by both, motions."""
-
-    misfit: float
-    at: np.ndarray
-    errors: np.ndarray
-    r: np.ndarray
-    J: np.ndarray
-    columns: np.ndarray
-    motions: list[Motion]
 
 
 class Problem(Likelihood):
@@ -217,6 +220,25 @@ class Problem(Likelihood):
             None if end is None else self._report(effects, end) for (effects, _), end in zip(tasks, ends, strict=True)
         ]
 
+    def without(self, fit: Fit, number: int) -> Fit:
+        """What a fit would be without one of the trials, by one step along its derivatives.
+
+        Args:
+            fit: Of this problem.
+            number: Of the trial that is left out.
+        """
+        held = self._held(fit.effects)
+        low, high = self.bounds(fit.effects)
+        places = np.array([False] * len(self.common) + [p for e in fit.effects for p in _marks(e)])
+        rows = np.concatenate([np.full(b.count, i != number) for i, b in enumerate(self.bands)])
+        end = fit.end
+        end = dataclasses.replace(end, r=end.r[rows], J=end.J[rows], columns=end.columns[rows])
+        step = self._step(end, held, places, low, high, STIFF)
+        weight = 1 / self.camera.deviations
+        ahead = end.J.T @ (end.r - end.columns @ step) - weight**2 * end.errors
+        errors = end.errors + np.linalg.solve(end.J.T @ end.J + np.diag(weight**2), ahead)
+        return dataclasses.replace(fit, point=end.at + step, errors=np.delete(errors, number))
+
     def _whole(self, search: Search) -> Point:
         """Run one search by itself."""
         asked = next(search)
@@ -347,6 +369,7 @@ class Problem(Likelihood):
             seen=tuple(self.camera.see(m, i, point.errors)[0] for i, m in enumerate(point.motions)),
             whitened=tuple(np.split(point.r, cuts)),
             point=point.at,
+            end=point,
         )
 
 
