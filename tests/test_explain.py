@@ -22,7 +22,7 @@ from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
 from torchsoro.sim2real.twin import Motion, Twin
-from torchsoro.sim2real.verdict import judge, rank
+from torchsoro.sim2real.verdict import Candidate, Thresholds, decide, judge, rank
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 EDGE = 0.01
@@ -278,6 +278,21 @@ def test_candidates_are_scored_by_the_best_of_them(made):
         bent = dataclasses.replace(near, errors=off * trust * (np.arange(len(trust)) == 0))
         told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.misfit, trust)}
         assert told["drag"] == pytest.approx(simple.score - cost)
+
+
+def test_what_predicts_far_worse_than_another_is_not_believed(made):
+    twin, ensemble, record = made
+    problem = Problem(record(None), twin, ensemble=ensemble)
+    nothing = problem.fit([((), None)], rounds=3)[0]
+    tether, drag = (dataclasses.replace(nothing, effects=(effect(name),)) for name in ("tether", "drag"))
+    common = {"gain": 400.0, "explained": 0.9}
+    for kept, chosen in ((0.3, "tether"), (0.38, "tether"), (0.6, "drag"), (0.9, "drag")):
+        found = [
+            Candidate(fit=tether, score=480.0, kept=kept, **common),
+            Candidate(fit=drag, score=460.0, kept=0.3, **common),
+        ]
+        told = decide(problem, nothing, found, 1.5, Thresholds())
+        assert [c.fit.name for c in told.chosen] == [chosen]
 
 
 def test_a_finer_twin_corrects_where_one_is(made):

@@ -17,7 +17,7 @@ from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import Experiment, Trial
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.outer_effects import PressureGain
-from torchsoro.sim2real.residual import Band, Camera, Priors, Slip, estimate_noise
+from torchsoro.sim2real.residual import LASTING, Band, Camera, Priors, Slip, estimate_noise
 from torchsoro.sim2real.scenario import Scenario
 from torchsoro.sim2real.twin import Motion, Twin
 
@@ -59,6 +59,7 @@ class Likelihood:
         beliefs: See there.
         priors: Of measurement errors.
         noise: [m]; that of the setup, or estimated, if None.
+        lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
         slips: Markers that have slipped.
         ensemble: Of the twin, if there is one already.
         fine: Of a finer twin, for :meth:`corrected`.
@@ -77,6 +78,7 @@ class Likelihood:
         beliefs: Beliefs | None = None,
         priors: Priors | None = None,
         noise: float | None = None,
+        lasting: float = LASTING,
         slips: Sequence[Slip] = (),
         ensemble: Ensemble | None = None,
         fine: Ensemble | None = None,
@@ -90,9 +92,9 @@ class Likelihood:
         shape = recordings[0].place.shape[1:]
         self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
         self.correction = correction or {}
-        self.priors, self.slips = priors, tuple(slips)
+        self.priors, self.slips, self.lasting = priors, tuple(slips), lasting
         self.camera = Camera(experiment.setup, self.trials, priors, slips)
-        self.bands = [Band(r, self.noise, n) for r, n in zip(recordings, self.numerics, strict=True)]
+        self.bands = [Band(r, self.noise, n, lasting) for r, n in zip(recordings, self.numerics, strict=True)]
         self.samples = sum(b.count for b in self.bands)
         self.scenarios = [twin.scenario(t) for t in self.trials]
         self.beliefs = beliefs or Beliefs()
@@ -123,6 +125,7 @@ class Likelihood:
             beliefs=self.beliefs,
             priors=self.priors,
             noise=self.noise,
+            lasting=self.lasting,
             slips=self.slips if slips is None else slips,
             ensemble=self.ensemble,
             fine=self.fine,

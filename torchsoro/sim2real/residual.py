@@ -163,9 +163,10 @@ class Band:
         recording: Of the trial.
         noise: Standard deviation of the noise [m].
         numerics: That of the twin's error, by marker and axis [M, A] m.
+        lasting: Share of the noise's variance that lasts from sample to sample.
     """
 
-    def __init__(self, recording: Recording, noise: float, numerics: np.ndarray) -> None:
+    def __init__(self, recording: Recording, noise: float, numerics: np.ndarray, lasting: float = LASTING) -> None:
         lag = np.abs(recording.time[:, None] - recording.time[None, :])
         alike = np.exp(-lag / CORRELATION)
         self.channels: list[tuple[np.ndarray, list[tuple[int, int]], np.ndarray]] = []
@@ -177,8 +178,8 @@ class Band:
                 self.channels[known[key]][1].append((m, a))
                 continue
             known[key] = len(self.channels)
-            lasting = LASTING * noise**2 + numerics[m, a] ** 2
-            covariance = (1 - LASTING) * noise**2 * np.eye(len(rows)) + lasting * alike[np.ix_(rows, rows)]
+            slow = lasting * noise**2 + numerics[m, a] ** 2
+            covariance = (1 - lasting) * noise**2 * np.eye(len(rows)) + slow * alike[np.ix_(rows, rows)]
             root = np.linalg.cholesky(covariance)
             self.channels.append((rows, [(m, a)], solve_triangular(root, np.eye(len(rows)), lower=True)))
         self.count = sum(len(rows) * len(pairs) for rows, pairs, _ in self.channels)

@@ -53,6 +53,7 @@ class Thresholds:
         beyond: The same, above which the best effect leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
+        worse: Times the error on trials left out of the effect that predicts them best, at which another is.
     """
 
     alarm: float = 40.0
@@ -61,6 +62,7 @@ class Thresholds:
     beyond: float = 4.0
     share: float = 0.8
     lost: float = 0.85
+    worse: float = 1.3
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -415,8 +417,10 @@ def _proved(
 
 def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: float, t: Thresholds) -> Verdict:
     """The verdict on a ranking whose best leaves ``excess`` times what noise and numerics explain."""
-    proved = any(math.isfinite(c.kept) for c in found)
-    believed = [c for c in found if c.gain > t.alarm and (c.kept <= t.lost or not proved)]
+    believed = [c for c in found if c.gain > t.alarm]
+    if any(math.isfinite(c.kept) for c in found):
+        least = min((c.kept for c in believed if math.isfinite(c.kept)), default=math.nan)
+        believed = [c for c in believed if c.kept <= min(t.lost, t.worse * least)]
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
     if best is None or best.score < t.alarm:
