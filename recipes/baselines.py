@@ -16,10 +16,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import explain
 import numpy as np
 import torch
 import tyro
-from explain import predicted as explained
 from scipy.signal import savgol_filter
 from torch import nn
 
@@ -171,24 +171,38 @@ def features(problem: Problem, fit: Fit) -> torch.Tensor:
     return torch.from_numpy(np.stack(found))
 
 
-def trained(lines: Lines, x: torch.Tensor) -> nn.Module:
+class ForceNetwork(nn.Module):
+    """Forces on patches from what happens there; none before it is trained.
+
+    Args:
+        inputs: Number of features.
+        unit: Size of a force.
+    """
+
+    def __init__(self, inputs: int, unit: float) -> None:
+        super().__init__()
+        self.unit, self.hidden, self.out = unit, nn.Linear(inputs, HIDDEN), nn.Linear(HIDDEN, 3)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+        self.double()
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Forces [..., 3] of features [..., F]."""
+        return self.unit * self.out(torch.tanh(self.hidden(x)))
+
+
+def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
     """The network whose forces leave least of a residual, by the linear response."""
     torch.manual_seed(0)
-    network = nn.Sequential(nn.Linear(x.shape[-1], HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 3)).double()
-    nn.init.zeros_(network[2].weight)
-    nn.init.zeros_(network[2].bias)
     G, d = torch.from_numpy(lines.histories.G.reshape(len(lines.histories.d), -1)), torch.from_numpy(lines.histories.d)
-    unit = float(G.norm() / math.sqrt(G.shape[1])) or 1.0
+    network = ForceNetwork(x.shape[-1], float(d.norm() * math.sqrt(G.shape[1]) / G.norm()))
     optimizer = torch.optim.AdamW(network.parameters(), lr=1e-2, weight_decay=DECAY)
     for _ in range(EPOCHS):
         optimizer.zero_grad()
-        left = d - (G / unit) @ network(x).reshape(-1) * float(d.norm())
+        left = d - G @ network(x).reshape(-1)
         loss = (left @ left) / (d @ d)
         loss.backward()
         optimizer.step()
-    with torch.no_grad():
-        network[2].weight *= float(d.norm()) / unit
-        network[2].bias *= float(d.norm()) / unit
     return network
 
 
@@ -224,6 +238,18 @@ def force_network(problem: Problem) -> Answer:
 # Sparse regression -------------------------------------------------------------------------------------------------
 
 
+def evenly(time: np.ndarray) -> np.ndarray:
+    """Times as far apart as most samples are."""
+    return np.arange(time[0], time[-1], float(np.median(np.diff(time))))
+
+
+def smoothed(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
+    """A derivative of a track, some of whose samples were lost, at even times."""
+    even, good = evenly(time), np.isfinite(track)
+    whole = np.interp(even, time[good], track[good])
+    return np.asarray(savgol_filter(whole, SMOOTH, 3, deriv=order, delta=float(even[1] - even[0])))
+
+
 def terms(problem: Problem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
     """Names of terms, and for each trial their values [N, K] and the residual accelerations [N], by the recordings."""
     names = ["modulus", "stiffening", "viscoelastic", "drag", "friction", "density"]
@@ -234,33 +260,27 @@ def terms(problem: Problem, fit: Fit) -> tuple[list[str], list[np.ndarray], list
     for trial, seen, scenario in zip(problem.trials, fit.seen, problem.scenarios, strict=True):
         assert trial.recording is not None
         t = trial.recording.time
-        even = np.arange(t[0], t[-1], float(np.median(np.diff(t))))
-        step = even[1] - even[0]
-
-        def smooth(track: np.ndarray, order: int, even: np.ndarray = even, t: np.ndarray = t, step: float = step):
-            good = np.isfinite(track)
-            return savgol_filter(np.interp(even, t[good], track[good]), SMOOTH, 3, deriv=order, delta=step)
-
+        even = evenly(t)
         p = np.zeros(len(even))
         if scenario.pressure is not None:
             p = scenario.pressure.at(torch.from_numpy(even)).reshape(-1, len(even))[0].numpy()
-        rate = np.gradient(p, step)
+        rate = np.gradient(p, even)
         rows, accelerations = [], []
         for m, a in np.ndindex(*seen.shape[1:]):
             left = trial.recording.place[:, m, a] - seen[:, m, a]
             if np.isfinite(left).sum() < SMOOTH:
                 continue
-            u = smooth(seen[:, m, a] - seen[0, m, a], 0)
-            v, b = (smooth(seen[:, m, a], k) for k in (1, 2))
+            u = smoothed(t, seen[:, m, a] - seen[0, m, a], 0)
+            v, b = (smoothed(t, seen[:, m, a], k) for k in (1, 2))
             speed = float(np.abs(v).max()) or 1.0
             constant = np.zeros((len(even), seen.shape[2]))
             constant[:, a] = 1.0
             columns = [u, u**3, v, v * np.abs(v), np.tanh(20 * v / speed), b, *constant.T]
             if pressed:
-                way = float(u[np.abs(p).argmax()])
+                way = float(u[int(np.abs(p).argmax())])
                 columns += [p * way, rate * way]
             rows.append(np.stack(columns, -1))
-            accelerations.append(smooth(left, 2))
+            accelerations.append(smoothed(t, left, 2))
         values.append(np.concatenate(rows))
         targets.append(np.concatenate(accelerations))
     return names, values, targets
@@ -311,7 +331,7 @@ def main(options: Options) -> Answer | None:
         ValueError: for an experiment that cannot be read or simulated.
     """
     if options.predict is not None:
-        return explained(options)
+        return explain.predicted(explain.Options(predict=options.predict, trial=options.trial, out=options.out))
     if options.experiment is None:
         raise ValueError("experiment: wanted a folder, or --predict")
     begin = time.perf_counter()

@@ -19,7 +19,7 @@ import numpy as np
 import tyro
 
 from torchsoro.settings import plain_errors
-from torchsoro.sim2real.recording import read_table
+from torchsoro.sim2real.recording import read_table, write_table
 
 DURATION = 2.0  # s from release
 MARKERS = {"tip1": (0.0, 0.015, 0.036), "tip2": (0.0, -0.006, 0.024), "tip3": (0.0, 0.036, 0.006)}
@@ -92,11 +92,9 @@ def main(options: Options) -> None:
                 x = table[f"{key}_{axis}_m"]
                 # Markers were glued to within a millimetre: what counts is how far they moved.
                 columns[f"{key}_{axis}_m"] = place + x[used] - x[still].mean()
-        rows = np.stack(list(columns.values()), -1)[columns["time_s"] <= DURATION]
+        lasts = columns["time_s"] <= DURATION
         folder = options.out / ("heldout" if name in kept else "trials") / name
-        folder.mkdir(parents=True, exist_ok=True)
-        lines = [",".join(columns), *(",".join(f"{v:.6f}" for v in row) for row in rows)]
-        (folder / "markers.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_table(folder / "markers.csv", {key: column[lasts] for key, column in columns.items()})
         if name.startswith("load"):
             (folder / "trial.toml").write_text(LOAD, encoding="utf-8")
     print(options.out)

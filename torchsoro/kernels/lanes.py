@@ -143,17 +143,19 @@ class Case(NamedTuple):
 
 
 @fast
-def _walls(mesh, case, t, d, f, swept, normals):
+def _walls(mesh, case, t, d, f, swept, normals, pressure, room):
     """Pressure on the walls of the chambers, following their motion: p dA = p t1 x t2."""
     chambers = swept.shape[0] // LANES
-    swept[:] = f32(0)
-    place, one, two = np.empty(48, f32), np.empty(48, f32), np.empty(48, f32)
+    for n in range(16 * chambers):
+        swept[n] = f32(0)
+    place, one, two = room[:48], room[48:96], room[96:144]
     for w in range(len(mesh.wall_axis)):
         axis = mesh.wall_axis[w]
         for c in range(3):
-            place[16 * c : 16 * c + 16] = mesh.wall_place[w, c]
-            one[16 * c : 16 * c + 16] = f32(c == (axis + 1) % 3)
-            two[16 * c : 16 * c + 16] = f32(c == (axis + 2) % 3)
+            for lane in range(16):
+                place[16 * c + lane] = mesh.wall_place[w, c]
+                one[16 * c + lane] = f32(c == (axis + 1) % 3)
+                two[16 * c + lane] = f32(c == (axis + 2) % 3)
         for k in range(mesh.wall_begin[w], mesh.wall_begin[w + 1]):
             at = 48 * mesh.wall_node[k]
             x, n, s, r = d[at : at + 48], mesh.wall_value[k, 0], mesh.wall_value[k, 1], mesh.wall_value[k, 2]
@@ -170,7 +172,6 @@ def _walls(mesh, case, t, d, f, swept, normals):
             n2 = area * (one[lane] * two[16 + lane] - one[16 + lane] * two[lane])
             out[lane], out[16 + lane], out[32 + lane] = n0, n1, n2
             volume[lane] += (place[lane] * n0 + place[16 + lane] * n1 + place[32 + lane] * n2) / f32(3)
-    pressure = np.empty(16 * chambers, f32)
     for c in range(chambers):
         for lane in range(16):
             grown = swept[16 * c + lane] / case.volume[c] - f32(1)
@@ -187,10 +188,9 @@ def _walls(mesh, case, t, d, f, swept, normals):
 
 
 @fast
-def _attached(case, t, d, f):
+def _attached(case, t, d, f, push, stretch):
     """Dead forces and springs."""
     now = f32(t * case.dt)
-    push = np.empty(48, f32)
     for g in range(len(case.push_begin) - 1):
         for c in range(3):
             for lane in range(16):
@@ -201,19 +201,20 @@ def _attached(case, t, d, f):
             for q in range(48):
                 o[q] -= share * push[q]
     if len(case.springs) > 0:
-        stretch = np.zeros((len(case.springs), 48), f32)
+        for n in range(48 * len(case.springs)):
+            stretch[n] = f32(0)
         for k in range(len(case.spring_node)):
             x = d[48 * case.spring_node[k] : 48 * case.spring_node[k] + 48]
             number = case.spring_number[k]
             for c in range(3):
                 for lane in range(16):
-                    stretch[number, 16 * c + lane] += case.spring_share[k, lane] * x[16 * c + lane]
+                    stretch[48 * number + 16 * c + lane] += case.spring_share[k, lane] * x[16 * c + lane]
         for k in range(len(case.spring_node)):
             o = f[48 * case.spring_node[k] : 48 * case.spring_node[k] + 48]
             number = case.spring_number[k]
             for c in range(3):
                 for lane in range(16):
-                    pull = case.springs[number, lane] * stretch[number, 16 * c + lane]
+                    pull = case.springs[number, lane] * stretch[48 * number + 16 * c + lane]
                     o[16 * c + lane] += case.spring_share[k, lane] * pull
 
 
@@ -257,7 +258,8 @@ def _meet(mesh, case, d, v):
 @fast
 def _look(mesh, d, v, out):
     """Markers [M * 240]: place, velocity, derivatives of the displacement by x, y, z."""
-    out[:] = f32(0)
+    for n in range(len(out)):
+        out[n] = f32(0)
     for m in range(len(mesh.mark_begin) - 1):
         o = out[MARKED * m : MARKED * m + MARKED]
         for k in range(mesh.mark_begin[m], mesh.mark_begin[m + 1]):
@@ -272,7 +274,6 @@ def _look(mesh, d, v, out):
                 o[192 + q] += s2 * x[q]
 
 
-@fast
 def march(mesh, case, out):
     """Simulate sixteen variations.
 
@@ -281,23 +282,26 @@ def march(mesh, case, out):
         case: The variations.
         out: Filled with samples [samples, markers * 240], the first of the undeformed body.
     """
-    count = len(mesh.held)
-    d, v, f = case.place.copy().reshape(-1), case.velocity.copy().reshape(-1), np.zeros(48 * count, f32)
-    for i in range(count):
-        if mesh.held[i]:
-            d[48 * i : 48 * i + 48] = f32(0)
-            v[48 * i : 48 * i + 48] = f32(0)
-    elements = len(case.series) // 64
-    own = case.own.copy()
-    Z = np.zeros(2 * elements * len(own), f32)
-    X, Y, G, P = np.empty(1728, f32), np.empty(1728, f32), np.zeros(1152, f32), np.zeros(1152, f32)
-    T, Q = np.zeros(96, f32), np.zeros(96, f32)
-    chambers = case.supply.shape[1]
-    swept, normals = np.zeros(16 * chambers, f32), np.zeros(48 * len(mesh.wall_axis), f32)
+    chambers, walls = case.supply.shape[1], len(mesh.wall_axis)
+    moves = ~np.asarray(mesh.held)[:, None, None]
+    d, v = (np.ascontiguousarray(a * moves).reshape(-1) for a in (case.place, case.velocity))
+    history = np.zeros(2 * len(case.series) // 64 * len(case.own), f32)
+    sizes = (
+        len(d), 1728, 1728, 1152, 1152, 96, 96,
+        16 * chambers, 48 * walls, 16 * chambers, 144, 48, 48 * len(case.springs),
+    )  # fmt: skip
+    _march(mesh, case, out, d, v, case.own.copy(), history, *(np.zeros(n, f32) for n in sizes))
+
+
+@fast
+def _march(mesh, case, out, d, v, own, Z, f, X, Y, G, P, T, Q, swept, normals, pressure, room, push, stretch):
+    """The steps; what follows ``out`` changes, and what follows ``Z`` is for their own use."""
+    count, elements, chambers = len(mesh.held), len(case.series) // 64, case.supply.shape[1]
     dt = f32(case.dt)
     _look(mesh, d, v, out[0])
     for t in range(case.steps):
-        f[:] = f32(0)
+        for n in range(48 * count):
+            f[n] = f32(0)
         for cell in range(len(mesh.corners)):
             corner = mesh.corners[cell]
             Wx, Sx = mesh.weights[0, mesh.cells[cell, 0]], mesh.slopes[0, mesh.cells[cell, 0]]
@@ -312,16 +316,16 @@ def march(mesh, case, out):
                 solid(144 * k, G, P, Q, own[48 * p : 48 * p + 48], case.law, case.stiffens, case.softens)
             scatter(f, corner, mesh.stride_x, mesh.stride_y, Wx, Wy, Wz, Sx, Sy, Sz, X, P)
         if chambers > 0:
-            _walls(mesh, case, t, d, f, swept, normals)
-        _attached(case, t, d, f)
+            _walls(mesh, case, t, d, f, swept, normals, pressure, room)
+        _attached(case, t, d, f, push, stretch)
         for i in range(count):
             if not mesh.held[i]:
-                u, push = v[48 * i : 48 * i + 48], f[48 * i : 48 * i + 48]
+                u, force = v[48 * i : 48 * i + 48], f[48 * i : 48 * i + 48]
                 weight, left = case.weight[i], case.left[i]
                 for c in range(3):
                     g, front = case.gravity[c], dt * mesh.front[i, c]
                     for lane in range(16):
-                        moved = u[16 * c + lane] + dt * (g[lane] - weight[lane] * push[16 * c + lane])
+                        moved = u[16 * c + lane] + dt * (g[lane] - weight[lane] * force[16 * c + lane])
                         slowed = f32(1) + front * case.fluid[lane] * weight[lane] * abs(moved)
                         u[16 * c + lane] = left[lane] * moved / slowed
         if len(case.stick) > 0:
