@@ -20,6 +20,7 @@ import explain
 import numpy as np
 import torch
 import tyro
+from scipy.interpolate import CubicSpline
 from scipy.signal import savgol_filter
 from torch import nn
 
@@ -246,7 +247,7 @@ def evenly(time: np.ndarray) -> np.ndarray:
 def smoothed(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
     """A derivative of a track, some of whose samples were lost, at even times."""
     even, good = evenly(time), np.isfinite(track)
-    whole = np.interp(even, time[good], track[good])
+    whole = CubicSpline(time[good], track[good])(even)
     return np.asarray(savgol_filter(whole, SMOOTH, 3, deriv=order, delta=float(even[1] - even[0])))
 
 

@@ -1,0 +1,69 @@
+"""What explanations are compared with: names that are known in advance, forces that were planted, files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def baselines() -> ModuleType:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "recipes")
+        import baselines
+
+        return baselines
+
+
+def test_terms_that_are_not_there_are_dropped(baselines):
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(400, 6)) * np.array([1.0, 100.0, 1.0, 0.01, 1.0, 1.0])
+    y = 3.0 * A[:, 0] - 200.0 * A[:, 3] + 0.1 * rng.normal(size=400)
+    x = baselines.thresholded(A, y)
+    assert np.flatnonzero(x).tolist() == [0, 3]
+    assert x[[0, 3]] == pytest.approx([3.0, -200.0], rel=0.02)
+
+
+def test_a_derivative_of_a_track_bears_lost_samples(baselines):
+    time = np.linspace(0.0, 1.0, 201)
+    track = np.sin(5 * time)
+    track[[7, 50, 51, 120]] = np.nan
+    found = baselines.smoothed(time, track, 2)
+    assert found[10:-10] == pytest.approx(-25 * np.sin(5 * baselines.evenly(time))[10:-10], abs=0.3)
+
+
+def test_a_network_learns_a_force_against_the_velocity(baselines):
+    rng = np.random.default_rng(1)
+    x = torch.from_numpy(rng.uniform(-1, 1, size=(3, 4, 10, 7)))
+    force = -0.02 * x[..., 4:7].numpy()
+    G = rng.normal(size=(200, *force.shape))
+    d = np.einsum("rtpwa,tpwa->r", G, force)
+    lines = SimpleNamespace(histories=SimpleNamespace(G=G, d=d))
+    found = baselines.trained(lines, x)(x).detach().numpy()
+    assert np.corrcoef(found.ravel(), force.ravel())[0, 1] > 0.9
+
+
+@pytest.mark.parametrize(
+    ("method", "verdict", "named"),
+    [
+        ("modulus-and-damping", "explained", {"modulus"}),  # all that it knows
+        ("all-parameters", "cannot_distinguish", {"density"}),
+        ("force-network", "unknown_physics", set()),  # a network has no names
+        ("sparse-regression", None, set()),
+    ],
+)
+def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
+    case = ROOT / "tests" / "judged" / "cases" / "case-111"
+    baselines.main(baselines.Options(experiment=case, out=tmp_path, method=method, budget=2.0))
+    told = json.loads((tmp_path / "explanation.json").read_text())
+    assert verdict is None or told["verdict"] == verdict
+    assert named <= set(told["set"])
+    assert (tmp_path / "model.toml").exists() == (method in ("modulus-and-damping", "all-parameters"))
+    assert all(row["before"] > 0 and row["after"] > 0 for row in told["heldout"])
