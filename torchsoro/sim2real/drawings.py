@@ -81,6 +81,8 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after
             beside = panel.twinx()
             supply = trial.pressure.pressure.reshape(-1, len(trial.pressure.time)).numpy()
             beside.plot(trial.pressure.time.numpy(), supply.T / 1e3, color="0.6", lw=0.8)
+            most = max(float(np.abs(supply).max()) / 1e3, 1e-3)
+            beside.set_ylim(min(0.0, float(supply.min()) / 1e3) - 0.05 * most, 1.8 * most)  # below the names
             beside.set_ylabel("pressure [kPa]", fontsize=8)
             beside.tick_params(labelsize=7)
     panels[-1, 0].set_xlabel("time [s]")
