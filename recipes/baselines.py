@@ -1,9 +1,9 @@
-"""What is done today, on the same experiments and in the same words as explain.py: what it is compared with.
+"""What explain.py is compared with, on the same experiments and in the same words: what others do, and parts of it.
 
     python recipes/baselines.py my-experiment --out runs/baseline --method all-parameters
     python recipes/baselines.py --predict runs/baseline/model.toml --trial trial.toml --out markers.csv
 
-Writes explanation.json and, where there is one, model.toml. None of the methods knows the simulation's own error.
+Writes explanation.json and, where there is one, model.toml.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import explain
 import numpy as np
@@ -38,9 +38,10 @@ from torchsoro.sim2real.model import write_model
 from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.report import effect_rows
 from torchsoro.sim2real.residual import reordered
-from torchsoro.sim2real.verdict import Candidate, judge
+from torchsoro.sim2real.verdict import Candidate, Thresholds, judge
 
-Method = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
+Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
+Ablation = Literal["without-numerics", "without-heldout", "one-trial"]
 
 SURE = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
 PATCHES, WINDOWS = 4, 10  # that the force network acts on, in each trial
@@ -59,11 +60,13 @@ class Options:
     """Folder of the experiment."""
     out: Path
     """Folder for explanation.json and model.toml; with --predict, the file of the markers."""
-    method: Method = "modulus-and-damping"
+    method: Baseline | Ablation = "modulus-and-damping"
     """modulus-and-damping: both fitted. all-parameters: all of the library that need no place, fitted together.
     white-noise: as explain.py, but with independent noise and without the simulation's own error. force-network: a
     network of state and pressure, whose forces on the body explain the residual. sparse-regression: residual
-    accelerations of the markers from a list of terms."""
+    accelerations of the markers from a list of terms. without-numerics: explain.py with a twin that is corrected, but
+    whose error is not part of the band; without-heldout: that believes an effect whatever it predicts; one-trial: that
+    sees the first trial only."""
     predict: Path | None = None
     """A model.toml, to predict a trial with instead."""
     trial: Path | None = None
@@ -135,9 +138,9 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
     return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
 
 
-def white_noise(problem: Problem, budget: float) -> Answer:
-    """The verdict of explain.py, from a likelihood that knows noise only."""
-    verdict = judge(problem, budget=budget, report=lambda line: None)
+def judged(problem: Problem, budget: float, **thresholds: float) -> Answer:
+    """The verdict of explain.py."""
+    verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
     rows = effect_rows(verdict.chosen[0], 1.0, verdict.problem) if verdict.chosen else []
     return Answer(
         verdict=verdict.kind,
@@ -146,6 +149,11 @@ def white_noise(problem: Problem, budget: float) -> Answer:
         heldout=verdict.heldout,
         fit=verdict.chosen[0].fit if verdict.chosen else verdict.nothing,
     )
+
+
+def without_band(problem: Problem) -> Problem:
+    """The same, as if the corrected twin made no error."""
+    return problem.only(problem.trials, numerics=[np.zeros_like(n) for n in problem.numerics])
 
 
 # A network of forces -----------------------------------------------------------------------------------------------
@@ -335,32 +343,44 @@ def main(options: Options) -> Answer | None:
         return explain.predicted(explain.Options(predict=options.predict, trial=options.trial, out=options.out))
     if options.experiment is None:
         raise ValueError("experiment: wanted a folder, or --predict")
-    begin = time.perf_counter()
+    if options.experiment is None:
+        raise ValueError("experiment: wanted a folder, or --predict")
     torch.set_num_threads(1)
-    experiment, _ = reordered(read_experiment(options.experiment))
-    trials = [t for t in experiment.trials if t.recording is not None]
-    twin = choose_twin(experiment.setup, len(trials), 60 * options.budget)
-    problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
+    begin, seconds = time.perf_counter(), 60 * options.budget
+    if options.method in get_args(Ablation):
+        whole = {"budget": options.budget, "threads": options.threads}
+        problem, _ = explain.prepared(explain.Options(experiment=options.experiment, out=options.out, **whole))
+    else:
+        experiment, _ = reordered(read_experiment(options.experiment))
+        trials = [t for t in experiment.trials if t.recording is not None]
+        twin = choose_twin(experiment.setup, len(trials), seconds)
+        problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
         "modulus-and-damping": lambda: parameters(problem, ["modulus", "viscoelastic"]),
         "all-parameters": lambda: parameters(problem, everything),
-        "white-noise": lambda: white_noise(problem, 60 * options.budget),
+        "white-noise": lambda: judged(problem, seconds),
         "force-network": lambda: force_network(problem),
         "sparse-regression": lambda: sparse_regression(problem),
+        "without-numerics": lambda: judged(without_band(problem), seconds),
+        "without-heldout": lambda: judged(problem, seconds, lost=math.inf, worse=math.inf),
+        "one-trial": lambda: judged(problem.only(problem.trials[:1]), seconds),
     }[options.method]()
     told = {
         "verdict": answer.verdict,
         "effects": answer.effects if answer.verdict == "explained" else [],
         "set": answer.names,
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in answer.heldout.items()],
-        "cost": {"simulations": problem.tally.simulations, "seconds": time.perf_counter() - begin},
+        "cost": {
+            "simulations": problem.tally.simulations,
+            "seconds": time.perf_counter() - begin,
+        },
     }
     options.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(options.out / "explanation.json") as file:
         file.write((json.dumps(told, indent=2) + "\n").encode())
     if answer.fit is not None:
-        write_model(options.out / "model.toml", options.experiment / "setup.toml", answer.fit, twin)
+        write_model(options.out / "model.toml", options.experiment / "setup.toml", answer.fit, problem.twin)
     print(f"{options.method}: {answer.verdict} {', '.join(answer.names)}; {told['cost']['seconds']:.0f} s")
     return answer
 

@@ -29,7 +29,7 @@ from torchsoro.sim2real.isolability import isolability
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.next_experiment import next_experiment
-from torchsoro.sim2real.numerics import WALLS, choose_twin, finer, measure
+from torchsoro.sim2real.numerics import WALLS, Numerics, choose_twin, finer, measure
 from torchsoro.sim2real.phases import mismatches
 from torchsoro.sim2real.recording import write_table
 from torchsoro.sim2real.report import Explanation, lead, write
@@ -87,24 +87,19 @@ def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
     return [effect for effect in library() if effect.name in names] or None
 
 
-def main(options: Options) -> Explanation | None:
-    """Explain an experiment, or predict a trial.
+def prepared(options: Options) -> tuple[Problem, Numerics]:
+    """What effects are fitted to: recordings, a twin that the budget can pay, and that twin's own error.
 
     Raises:
         ValueError: for an experiment that cannot be read or simulated.
     """
-    if options.predict is not None:
-        return predicted(options)
     if options.experiment is None:
         raise ValueError("experiment: wanted a folder, or --predict")
-    effects = named(options.effects)
-    begin = time.perf_counter()
     torch.set_num_threads(1)
     experiment, confused = reordered(read_experiment(options.experiment))
     if confused:
         print(confused)
     trials = [t for t in experiment.trials if t.recording is not None]
-    kept = [t for t in experiment.heldout if t.recording is not None]
     if options.edge > 0:
         twin = Twin(experiment.setup, edge=options.edge, walls=options.walls)
     else:
@@ -128,6 +123,22 @@ def main(options: Options) -> Explanation | None:
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
         + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)
     )
+    return problem, numerics
+
+
+def main(options: Options) -> Explanation | None:
+    """Explain an experiment, or predict a trial.
+
+    Raises:
+        ValueError: for an experiment that cannot be read or simulated.
+    """
+    if options.predict is not None:
+        return predicted(options)
+    effects = named(options.effects)
+    begin = time.perf_counter()
+    problem, numerics = prepared(options)
+    trials = list(problem.trials)
+    kept = [t for t in problem.experiment.heldout if t.recording is not None]
     tells = isolability(problem)
     verdict = judge(problem, effects, kept=kept, budget=60 * options.budget)
     problem = verdict.problem
@@ -162,12 +173,13 @@ def main(options: Options) -> Explanation | None:
     settings = {
         "experiment": str(options.experiment),
         "budget_minutes": options.budget,
-        "edge_m": twin.edge,
-        "walls": twin.walls,
+        "edge_m": problem.twin.edge,
+        "walls": problem.twin.walls,
     }
     options.out.mkdir(parents=True, exist_ok=True)
     write(found, everything, options.out, settings)
-    write_model(options.out / "model.toml", options.experiment / "setup.toml", best, fine.twin)
+    assert problem.fine is not None
+    write_model(options.out / "model.toml", problem.experiment.folder / "setup.toml", best, problem.fine.twin)
     print(f"{verdict.kind}: {lead(found)}\n{found.seconds:.0f} s; {options.out / 'report.html'}")
     return found
 
