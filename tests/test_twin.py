@@ -127,7 +127,6 @@ def test_a_load_acts_in_the_middle_of_its_box(trial):
     [
         ({"clamps": (((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)),)}, "wanted one that holds a part of the body"),
         ({"planes": (Boundary(point=(0, 0, 0), normal=(0, 0, 0)),)}, "wanted one that is not zero"),
-        ({"mesh": Path("body.stl")}, "wanted a box"),
         ({"cavities": (Cavity(name="c", box=((0.01, 0.0, 0.01), (0.02, 0.01, 0.015))),)}, "within the body"),
         ({"loads": (Load(box=((0.1, 0, 0), (0.2, 0.1, 0.1)), force=(0, 0, 1)),)}, "wanted a box that meets it"),
     ],

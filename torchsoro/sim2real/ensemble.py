@@ -279,7 +279,7 @@ def mesh_of(twin: Twin) -> Mesh:
         held=twin.held | (weight == 0),
         places=grid.places.astype(f32),
         surface=grid.rim.astype(whole),
-        front=np.stack([grid.facing(n) + grid.facing(-n) for n in np.eye(3)], -1).astype(f32) / 2,
+        front=grid.front.astype(f32),
         wall_begin=np.concatenate([[0], np.cumsum(there.sum(-1))]).astype(whole),
         wall_node=wall_node[there].astype(whole),
         wall_value=wall_value[there].astype(f32),

@@ -23,6 +23,7 @@ import torch
 
 from torchsoro.actuation import Waveform
 from torchsoro.sim2real.recording import Recording, read_table
+from torchsoro.sim2real.solid import Solid, read_solid
 
 SHORTEST = 0.03  # s, three times what a clock may be late
 Vector = tuple[float, float, float]
@@ -76,7 +77,7 @@ class Setup:
         angular_velocity: About the body's centre at the start [rad/s].
         size: Edge lengths of the body's box [m].
         origin: Its lower corner [m].
-        mesh: Surface of the body where it is no box.
+        solid: The body where it is no box.
         density: [kg/m3].
         youngs_modulus: At equilibrium [Pa].
         poisson_ratio: Below 0.5.
@@ -98,7 +99,7 @@ class Setup:
     angular_velocity: Vector
     size: Vector
     origin: Vector
-    mesh: Path | None
+    solid: Solid | None
     density: float
     youngs_modulus: float
     poisson_ratio: float
@@ -182,7 +183,7 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     """
     own = folder / "trial.toml"
     changed = read_tables(own) if own.is_file() else {}
-    setup = setup_of({**tables, **changed}, own if changed else file)
+    setup = setup_of({**tables, **changed}, own if changed else file, file.parent)
     markers, supply = folder / "markers.csv", folder / "pressure.csv"
     recording = None
     if markers.is_file():
@@ -299,12 +300,13 @@ def _vector(found: object, where: str) -> Vector:
     return x, y, z
 
 
-def setup_of(tables: Mapping[str, Any], file: Path) -> Setup:
+def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) -> Setup:
     """What tables of a setup say.
 
     Args:
         tables: As in setup.toml.
         file: Where they come from, for messages.
+        folder: Where the body's mesh lies; that of the file if None.
 
     Raises:
         ValueError: as :func:`read_experiment`.
@@ -314,7 +316,11 @@ def setup_of(tables: Mapping[str, Any], file: Path) -> Setup:
     moving = _Table({} if start == "rest" else start, f"{file}: start")
     body = _Table(top.values.pop("body", None), f"{file}: [body]")
     shape = body.text("shape", "box", among=("box", "mesh"))
-    mesh = file.parent / body.text("file") if shape == "mesh" else None
+    solid = None
+    if shape == "mesh":
+        at = body.vector("origin") if "origin" in body.values else None
+        path = (folder or file.parent) / body.text("file")
+        solid = read_solid(path, body.number("scale", 1.0, least=1e-9), at)
     material = _Table(top.values.pop("material", None), f"{file}: [material]")
     recording = _Table(top.values.pop("recording", {}), f"{file}: [recording]")
     kind: Any = recording.text("kind", "mocap", among=("mocap", "video"))
@@ -328,9 +334,9 @@ def setup_of(tables: Mapping[str, Any], file: Path) -> Setup:
         duration=top.number("duration", least=1e-6),
         velocity=moving.vector("velocity", zero),
         angular_velocity=moving.vector("angular_velocity", zero),
-        size=body.vector("size"),
-        origin=body.vector("origin", zero),
-        mesh=mesh,
+        size=body.vector("size") if solid is None else solid.size,
+        origin=body.vector("origin", zero) if solid is None else solid.origin,
+        solid=solid,
         density=material.number("density", least=1e-9),
         youngs_modulus=material.number("youngs_modulus", least=1e-9),
         poisson_ratio=material.number("poisson_ratio", least=0.0),

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
 
 GAUSS = 0.5 / math.sqrt(3.0)
+BODY, OUTSIDE = -1, -2  # what a cell is that belongs to no chamber
+PARTS = 4  # along each axis of a cell, of which each is body or not
+LEAST = 0.05  # of a cell that is body, below which it is left out
 OUTER = 1.3  # outermost cells are wider than their neighbours, as a spline that ends there is steeper
 
 
@@ -90,17 +93,27 @@ class Grid:
     Args:
         axes: Along x, y and z.
         holes: Boxes [low, high] m that are no body, whose faces lie on planes.
+        filled: Which points of a lattice, given by its coordinates, the body fills, bool [X, Y, Z]; all if None.
     """
 
-    def __init__(self, axes: tuple[Axis, Axis, Axis], holes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> None:
+    def __init__(
+        self,
+        axes: tuple[Axis, Axis, Axis],
+        holes: Sequence[tuple[Sequence[float], Sequence[float]]],
+        filled: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
+    ) -> None:
         self.axes = axes
         self.counts = tuple(a.nodes for a in axes)
         middles = np.meshgrid(*((a.planes[1:] + a.planes[:-1]) / 2 for a in axes), indexing="ij")
-        self.hole = np.full(middles[0].shape, -1)
+        self.hole = np.full(middles[0].shape, BODY)
+        share = np.ones((*self.hole.shape, 8))
+        if filled is not None:
+            share = _shares(axes, filled)
+            self.hole[share.mean(-1) < LEAST] = OUTSIDE
         for number, (low, high) in enumerate(holes):
             inside = [(m > a) & (m < b) for m, a, b in zip(middles, low, high, strict=True)]
             self.hole[inside[0] & inside[1] & inside[2]] = number
-        self.cells = np.argwhere(self.hole < 0)
+        self.cells = np.argwhere(self.hole == BODY)
         parts = [a.points[self.cells[:, i]] for i, a in enumerate(axes)]
         x, y, z = (
             p[:, shape] for p, shape in zip(parts, ([0] * 4 + [1] * 4, [0, 0, 1, 1] * 2, [0, 1] * 4), strict=True)
@@ -108,7 +121,7 @@ class Grid:
         self.points = np.stack([x, y, z], -1).reshape(-1, 3)
         """Of the body [P, 3] m, cell by cell."""
         size = np.prod([np.diff(a.planes)[self.cells[:, i]] for i, a in enumerate(axes)], axis=0)
-        self.volumes = np.repeat(size / 8, 8)
+        self.volumes = (size[:, None] / 8 * share[tuple(self.cells.T)]).reshape(-1)
         """Of the points [P] m3."""
 
     @property
@@ -147,6 +160,13 @@ class Grid:
         slopes = [product(s[0], w[1], w[2]), product(w[0], s[1], w[2]), product(w[0], w[1], s[2])]
         return self.corner(cells)[:, None] + offset, product(*w), np.stack(slopes, -1)
 
+    def nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The places of the body [N, 3] m nearest to points [N, 3] m, and the cells that they lie in."""
+        low = np.stack([a.planes[self.cells[:, i]] for i, a in enumerate(self.axes)], -1)
+        high = np.stack([a.planes[self.cells[:, i] + 1] for i, a in enumerate(self.axes)], -1)
+        at = [int(((np.clip(p, low, high) - p) ** 2).sum(-1).argmin()) for p in x]
+        return np.clip(x, low[at], high[at]), self.cells[at]
+
     def spread(self, x: np.ndarray, amounts: np.ndarray) -> np.ndarray:
         """Amounts [..., N] at points [N, 3] m, over the nodes [..., n]."""
         nodes, weights, _ = self.stencil(x)
@@ -182,9 +202,9 @@ class Grid:
         share = (np.arange(6) + 0.5) / 6
         x = np.stack(np.meshgrid(*(a + share * (b - a) for a, b in zip(low, high, strict=True)), indexing="ij"), -1)
         x = x.reshape(-1, 3)
-        inside = self.hole[tuple(a.cell(x[:, i]) for i, a in enumerate(self.axes))] < 0
+        inside = self.hole[tuple(a.cell(x[:, i]) for i, a in enumerate(self.axes))] == BODY
         if not inside.any():
-            raise ValueError(f"box = {box}: within a chamber, wanted a box that meets the body")
+            raise ValueError(f"box = {box}: no part of the body, wanted a box that meets it")
         return self.spread(x[inside], np.full(int(inside.sum()), 1 / int(inside.sum())))
 
     @cached_property
@@ -195,21 +215,11 @@ class Grid:
             Nodes [W, 27], weights and two slopes along the wall [W, 27, 3], places [W, 3] m, axes [W], areas [W] m2,
             positive if the chamber is on the lower side, and chambers [W].
         """
-        rows = []
-        for cell in self.cells:
-            for axis, side in itertools.product(range(3), (-1, 1)):
-                beside = cell.copy()
-                beside[axis] += side
-                if not 0 <= beside[axis] < self.axes[axis].cells or self.hole[tuple(beside)] < 0:
-                    continue
-                one, two = (axis + 1) % 3, (axis + 2) % 3
-                face = self.axes[axis].planes[cell[axis] + (side > 0)]
-                area = float(np.diff(self.axes[one].planes)[cell[one]] * np.diff(self.axes[two].planes)[cell[two]])
-                for a, b in itertools.product(range(2), range(2)):
-                    place = np.zeros(3)
-                    place[axis] = face
-                    place[one], place[two] = self.axes[one].points[cell[one], a], self.axes[two].points[cell[two], b]
-                    rows.append((cell, place, axis, -side * area / 4, self.hole[tuple(beside)]))
+        rows = [
+            (cell, place, axis, -side * area, self.hole[beside])
+            for cell, beside, place, axis, side, area in self._sides()
+            if beside is not None and self.hole[beside] >= 0
+        ]
         if not rows:
             none = np.zeros(0, int)
             return np.zeros((0, 27), int), np.zeros((0, 27, 3)), np.zeros((0, 3)), none, np.zeros(0), none
@@ -218,6 +228,47 @@ class Grid:
         number = np.arange(len(rows))
         values = np.stack([weights, slopes[number, :, (axes + 1) % 3], slopes[number, :, (axes + 2) % 3]], -1)
         return nodes, values, places, axes, areas, chambers
+
+    def _sides(self) -> Iterator[tuple[np.ndarray, tuple[int, ...] | None, np.ndarray, int, int, float]]:
+        """Four points on each face of a cell behind which there is no body.
+
+        Yields:
+            The cell, what is beside it (None outside of the box), the place [3] m, axis and side, and the area [m2].
+        """
+        for cell in self.cells:
+            for axis, side in itertools.product(range(3), (-1, 1)):
+                beside = cell.copy()
+                beside[axis] += side
+                within = 0 <= beside[axis] < self.axes[axis].cells
+                if within and self.hole[tuple(beside)] == BODY:
+                    continue
+                one, two = (axis + 1) % 3, (axis + 2) % 3
+                area = float(np.diff(self.axes[one].planes)[cell[one]] * np.diff(self.axes[two].planes)[cell[two]])
+                for a, b in itertools.product(range(2), range(2)):
+                    place = np.zeros(3)
+                    place[axis] = self.axes[axis].planes[cell[axis] + (side > 0)]
+                    place[one], place[two] = self.axes[one].points[cell[one], a], self.axes[two].points[cell[two], b]
+                    yield cell, tuple(beside) if within else None, place, axis, side, area / 4
+
+    @cached_property
+    def front(self) -> np.ndarray:
+        """Area across each axis, as shares of nodes [n, 3] m2: the mean of both sides."""
+        sides = [s for s in self._sides() if s[1] is None or self.hole[s[1]] == OUTSIDE]
+        cells, places = np.array([s[0] for s in sides]), np.array([s[2] for s in sides])
+        axes, areas = np.array([s[3] for s in sides]), np.array([s[5] for s in sides])
+        nodes, weights, _ = self.stencil(places, cells)
+        found = np.zeros((self.nodes, 3))
+        np.add.at(found, (nodes, axes[:, None]), weights * areas[:, None] / 2)
+        return found
+
+    @property
+    def open(self) -> bool:
+        """Whether a chamber has no wall somewhere."""
+        for axis in range(3):
+            one, other = (np.moveaxis(self.hole, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+            if (((one >= 0) & (other == OUTSIDE)) | ((one == OUTSIDE) & (other >= 0))).any():
+                return True
+        return False
 
     @cached_property
     def rim(self) -> np.ndarray:
@@ -243,3 +294,13 @@ class Grid:
         at[axis] = layer
         area[tuple(at)] = np.outer(*parts)
         return area.reshape(-1)
+
+
+def _shares(axes: Sequence[Axis], filled: Callable[..., np.ndarray]) -> np.ndarray:
+    """Of each cell's eight parts, z fastest, what the body fills [X, Y, Z, 8]."""
+    part = (np.arange(PARTS) + 0.5) / PARTS
+    lattice = [(a.planes[:-1, None] + np.diff(a.planes)[:, None] * part).reshape(-1) for a in axes]
+    half = PARTS // 2
+    shape = [n for a in axes for n in (a.cells, 2, half)]
+    parts = filled(*lattice).reshape(shape).mean((2, 5, 8))
+    return parts.transpose(0, 2, 4, 1, 3, 5).reshape(*(a.cells for a in axes), 8)

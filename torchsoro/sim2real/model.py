@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
 
     Args:
         path: Of the model; its folder exists.
-        setup: The setup.toml that was believed, which is copied.
+        setup: The setup.toml that was believed, which is copied, as is the body's mesh beside it.
         fit: What was found.
         twin: To predict with; one as fine as that which corrected the fit's.
     """
@@ -88,6 +89,10 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
             lines.append(f"{quantity.name} = {value!r} # {quantity.unit}")
         if effect.local:
             lines.append(f"at = {values[count:].tolist()!r} # m")
+    mesh = read_tables(setup)["body"].get("file")
+    if mesh is not None and not Path(mesh).is_absolute() and path.parent.resolve() != setup.parent.resolve():
+        (path.parent / mesh).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(setup.parent / mesh, path.parent / mesh)
     with atomic_write(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
 

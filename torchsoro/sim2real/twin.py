@@ -70,12 +70,13 @@ class Twin:
 
     Raises:
         ValueError: for a clamp that holds no part of a face, a chamber that does not lie inside the body, or a body
-            with a mesh.
+            of a mesh beside planes.
     """
 
     def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
-        if setup.mesh is not None:
-            raise ValueError(f"setup: body of {setup.mesh.name}, wanted a box")
+        solid = setup.solid
+        if solid is not None and setup.planes:
+            raise ValueError("plane: with a body of a mesh, wanted a box where there are planes")
         self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
         axes = []
         for axis in range(3):
@@ -86,15 +87,20 @@ class Twin:
                     f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
                     f"{end:g} m, within the body"
                 )
+            faces = [] if solid is None else solid.faces[axis]
+            near = 1e-3 * setup.size[axis]
+            inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
             breaks = [begin, *inner, end]
-            least = [walls] * (len(breaks) - 1) if inner else [across]
+            least = [walls if setup.cavities else 1] * (len(breaks) - 1)
             # Where every interval has one cell, what is quadratic along two axes has no strain at the points.
             widest = int(np.diff(breaks).argmax())
-            least[widest] = max(least[widest], 2)
+            least[widest] = max(least[widest], 2, 0 if setup.cavities else across - len(inner))
             # Two walls that share a node would pull at each other across the chamber.
             axes.append(Axis(divide(breaks, least, edge), inner))
         x, y, z = axes
-        self.grid = Grid((x, y, z), [c.box for c in setup.cavities])
+        self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if solid is None else solid.filled)
+        if self.grid.open:
+            raise ValueError("chamber: opens to the outside of the mesh, wanted walls all around")
         self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]
         self.held = np.zeros(self.grid.nodes, bool)
         tiny = 1e-9
@@ -135,17 +141,14 @@ class Twin:
 
     def at(self, places: Tensor) -> Tensor:
         """Shares of the nodes [B, n] of what is attached at places [B, 3] m, the nearest of the body."""
-        low = torch.tensor(self.setup.origin, dtype=torch.float64)
-        inside = torch.minimum(torch.maximum(places, low), low + torch.tensor(self.setup.size, dtype=torch.float64))
-        nodes, weights, _ = (torch.from_numpy(a) for a in self.grid.stencil(inside.numpy()))
+        nodes, weights, _ = (torch.from_numpy(a) for a in self.grid.stencil(*self.grid.nearest(places.numpy())))
         return torch.zeros(len(places), self.grid.nodes, dtype=torch.float64).scatter_add(1, nodes, weights)
 
     def marks(self) -> tuple[np.ndarray, np.ndarray]:
         """Nodes [M, 27] of the markers, and weights and slopes [M, 27, 4]: they move with the nearest surface point."""
         at = np.array([m.at for m in self.setup.markers], float)
-        low = np.array(self.setup.origin)
-        on = np.clip(at, low, low + np.array(self.setup.size))
-        nodes, weights, slopes = self.grid.stencil(on)
+        on, cells = self.grid.nearest(at)
+        nodes, weights, slopes = self.grid.stencil(on, cells)
         off = np.einsum("mka,ma->mk", slopes, at - on)
         return nodes, np.concatenate([(weights + off)[..., None], slopes], -1)
 

@@ -1,0 +1,113 @@
+"""Bodies that are no boxes: a closed surface, where it has flat faces, and what lies inside of it."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+FLAT = 0.999  # cosine of the angle to an axis, above which a triangle lies across it
+WIDE = 0.05  # of the area of the body's box across an axis, from which on faces at one place count
+SHARP = 0.5  # rad between two triangles, from which on their edge is drawn
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Solid:
+    """A closed surface.
+
+    Attributes:
+        mesh: In m.
+    """
+
+    mesh: trimesh.Trimesh
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Lower corner of its box [m]."""
+        x, y, z = self.mesh.bounds[0].tolist()
+        return x, y, z
+
+    @property
+    def size(self) -> tuple[float, float, float]:
+        """Edge lengths of its box [m]."""
+        x, y, z = self.mesh.extents.tolist()
+        return x, y, z
+
+    @functools.cached_property
+    def faces(self) -> tuple[list[float], list[float], list[float]]:
+        """Where along each axis it has flat faces across it, apart from the ends of its box [m]."""
+        normals, areas, middles = self.mesh.face_normals, self.mesh.area_faces, self.mesh.triangles_center
+        found: tuple[list[float], list[float], list[float]] = ([], [], [])
+        for axis in range(3):
+            low, length = self.origin[axis], self.size[axis]
+            across = np.abs(normals[:, axis]) > FLAT
+            at, area = middles[across, axis], areas[across]
+            shares = np.round((at - low) / length, 4)
+            for share in np.unique(shares):
+                mine = shares == share
+                if 0 < share < 1 and area[mine].sum() > WIDE * np.prod(self.size) / length:
+                    found[axis].append(float(at[mine].mean()))
+        return found
+
+    @functools.cached_property
+    def edges(self) -> np.ndarray:
+        """Sharp edges, for pictures [E, 2, 3] m."""
+        sharp = self.mesh.face_adjacency_angles > SHARP
+        return np.asarray(self.mesh.vertices)[self.mesh.face_adjacency_edges[sharp]]
+
+    def filled(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Which points of a lattice lie inside, bool [X, Y, Z]: those with an odd number of surfaces below them.
+
+        Args:
+            x: Coordinates [X] m.
+            y: Coordinates [Y] m.
+            z: Coordinates [Z] m, increasing.
+        """
+        columns = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
+        # A little aside, as a column that meets an edge would meet two triangles.
+        start = np.column_stack([columns + 1e-7 * max(self.size), np.full(len(columns), self.origin[2] - 1.0)])
+        upwards = np.tile([0.0, 0.0, 1.0], (len(start), 1))
+        places, rays, _ = self.mesh.ray.intersects_location(start, upwards, multiple_hits=True)
+        found = np.zeros((len(columns), len(z)), bool)
+        order = np.argsort(rays, kind="stable")
+        heights, rays = places[order, 2], rays[order]
+        begins = np.searchsorted(rays, np.arange(len(columns) + 1))
+        for k, (begin, end) in enumerate(itertools.pairwise(begins)):
+            found[k] = np.searchsorted(np.sort(heights[begin:end]), z) % 2 == 1
+        return found.reshape(len(x), len(y), len(z))
+
+
+def read_solid(path: Path, scale: float = 1.0, origin: tuple[float, float, float] | None = None) -> Solid:
+    """Read a closed surface.
+
+    Args:
+        path: STL, OBJ or PLY file.
+        scale: Metres for each unit of the file.
+        origin: Where the lower corner of its box is to be [m]; where it is in the file if None.
+
+    Raises:
+        ValueError: if the file cannot be read, or its surface is not closed.
+    """
+    if not path.is_file():
+        raise ValueError(f"{path}: no such file, wanted the body's surface")
+    return _read(path, path.stat().st_mtime_ns, scale, origin)
+
+
+@functools.lru_cache(maxsize=4)
+def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, float] | None) -> Solid:
+    try:
+        mesh = trimesh.load_mesh(path)
+    except Exception as error:  # whatever the reader of that format raises
+        raise ValueError(f"{path}: {error}; wanted a surface as STL, OBJ or PLY") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise ValueError(f"{path}: holds no surface, wanted triangles")
+    if not mesh.is_watertight:
+        raise ValueError(f"{path}: the surface is open, wanted a closed one: repair it where it was drawn")
+    mesh.apply_scale(scale)
+    if origin is not None:
+        mesh.apply_translation(np.array(origin) - mesh.bounds[0])
+    return Solid(mesh=mesh)
