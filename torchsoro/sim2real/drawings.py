@@ -18,6 +18,7 @@ from torchsoro.sim2real.phases import BEYOND, Mismatch, together
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 PLACE, BODY = "#a3154a", "#9aa5b1"
+EDGES = 400  # of a body, that are drawn at most
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
 BANDS = ("#e9eef4", "#f8f4ea")  # of phases, in turn
 
@@ -109,9 +110,8 @@ def draw_body(
     for k, title in enumerate(("before", said)):
         panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
         panels.append(panel)
-        for begin, end in itertools.combinations(itertools.product((0, 1), repeat=3), 2):
-            if sum(a != b for a, b in zip(begin, end, strict=True)) == 1:
-                panel.plot(*np.stack([low + size * begin, low + size * end], -1), color=BODY, lw=0.9)
+        for edge in _outline(setup):
+            panel.plot(*(1e3 * edge.T), color=BODY, lw=0.9)
         for box in setup.clamps:
             one, other = (np.clip(1e3 * np.array(corner), low, low + size) for corner in box)
             ends = itertools.product(*zip(one, other, strict=True))
@@ -141,6 +141,15 @@ def draw_body(
     assert points is not None
     figure.colorbar(points, ax=panels, shrink=0.7, label="off by [mm]")
     return figure
+
+
+def _outline(setup: Setup) -> np.ndarray:
+    """Edges of the body, or of its box where it has too many [E, 2, 3] m."""
+    if setup.solid is not None and len(setup.solid.edges) <= EDGES:
+        return setup.solid.edges
+    pairs = itertools.combinations(itertools.product((0, 1), repeat=3), 2)
+    ends = [pair for pair in pairs if np.abs(np.subtract(*pair)).sum() == 1]
+    return np.array(setup.origin) + np.array(setup.size) * np.array(ends)
 
 
 def draw_forces(forces: ForceMap, setup: Setup) -> Figure:
