@@ -162,22 +162,22 @@ def without_band(problem: Problem) -> Problem:
 def features(problem: Problem, fit: Fit) -> torch.Tensor:
     """Of each patch and window [T, P, W, F], about one: place, motion of the marker next to it, pressures."""
     places, _ = patches(problem.twin, PATCHES)
-    size = max(problem.experiment.setup.size)
-    marks = np.array([m.at for m in problem.experiment.setup.markers])
-    nearest = np.linalg.norm(places[:, None] - marks[None], axis=-1).argmin(1)
-    found = []
+    setup = problem.experiment.setup
+    longest = int(np.argmax(setup.size))
+    along = (places[:, longest] - setup.origin[longest]) / setup.size[longest]
+    nearest = np.linalg.norm(places[:, None] - np.array([m.at for m in setup.markers]), axis=-1).argmin(1)
+    moved, speeds, pressures = [], [], []
     for motion, scenario in zip(fit.end.motions, problem.scenarios, strict=True):
         middle = (np.arange(WINDOWS) + 0.5) / WINDOWS * scenario.duration
         at = np.minimum(np.searchsorted(motion.time, middle), len(motion.time) - 1)
-        moved = (motion.place - motion.place[:1])[at][:, nearest]
-        speed = motion.velocity[at][:, nearest]
-        along = np.broadcast_to((places.max(1) / size)[:, None], (WINDOWS, PATCHES, 1))
-        parts = [along, moved / (np.abs(moved).max() + 1e-12), speed / (np.abs(speed).max() + 1e-12)]
+        moved.append((motion.place - motion.place[:1])[at][:, nearest])
+        speeds.append(motion.velocity[at][:, nearest])
         if scenario.pressure is not None:
             p = scenario.pressure.at(torch.from_numpy(middle)).reshape(-1, WINDOWS).T.numpy()
-            parts.append(np.broadcast_to((p / (np.abs(p).max() + 1e-12))[:, None], (WINDOWS, PATCHES, p.shape[1])))
-        found.append(np.concatenate(parts, -1).swapaxes(0, 1))
-    return torch.from_numpy(np.stack(found))
+            pressures.append(np.broadcast_to(p[:, None], (WINDOWS, PATCHES, p.shape[1])))
+    parts = [np.broadcast_to(along[:, None], (len(moved), WINDOWS, PATCHES, 1))]
+    parts += [np.stack(part) / (np.abs(part).max() + 1e-12) for part in (moved, speeds, pressures) if part]
+    return torch.from_numpy(np.concatenate(parts, -1).swapaxes(1, 2))
 
 
 class ForceNetwork(nn.Module):
@@ -233,11 +233,11 @@ def force_network(problem: Problem) -> Answer:
         still = problem.without(nothing, i)
         lines = Lines(where, still.errors, nothing.point, [motions[k] for k in others], none[others])
         forces = trained(lines, x[others])(x[i]).detach().numpy()
-        common, errors = still.point, still.errors
         jumps = np.diff(forces, axis=1, prepend=0.0).reshape(-1)
-        fit = dataclasses.replace(still, effects=steps, point=np.concatenate([common, jumps]), errors=errors)
-        found = predict(where, fit, [trial])
-        return found[0].total if found else math.inf
+        fit = dataclasses.replace(still, effects=steps, point=np.concatenate([still.point, jumps]))
+        # Without forces where the body does not bear them.
+        found = predict(where, fit, [trial]) or predict(where, still, [trial])
+        return found[0].total
 
     held = left_out(problem, after)
     (one, other) = (math.sqrt(sum(v[k] ** 2 for v in held.values())) for k in (0, 1))
