@@ -42,7 +42,7 @@ settings
 archive
 robot
 results
-sim2real.recording sim2real.solid
+sim2real.recording sim2real.surface
 sim2real.experiment sim2real.scenario sim2real.grid sim2real.tracking
 sim2real.twin
 sim2real.ensemble

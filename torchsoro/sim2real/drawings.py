@@ -145,8 +145,8 @@ def draw_body(
 
 def _outline(setup: Setup) -> np.ndarray:
     """Edges of the body, or of its box where it has too many [E, 2, 3] m."""
-    if setup.solid is not None and len(setup.solid.edges) <= EDGES:
-        return setup.solid.edges
+    if setup.surface is not None and len(setup.surface.edges) <= EDGES:
+        return setup.surface.edges
     pairs = itertools.combinations(itertools.product((0, 1), repeat=3), 2)
     ends = [pair for pair in pairs if np.abs(np.subtract(*pair)).sum() == 1]
     return np.array(setup.origin) + np.array(setup.size) * np.array(ends)

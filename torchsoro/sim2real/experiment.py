@@ -23,7 +23,7 @@ import torch
 
 from torchsoro.actuation import Waveform
 from torchsoro.sim2real.recording import Recording, read_table
-from torchsoro.sim2real.solid import Solid, read_solid
+from torchsoro.sim2real.surface import Surface, read_surface
 
 SHORTEST = 0.03  # s, three times what a clock may be late
 Vector = tuple[float, float, float]
@@ -77,7 +77,7 @@ class Setup:
         angular_velocity: About the body's centre at the start [rad/s].
         size: Edge lengths of the body's box [m].
         origin: Its lower corner [m].
-        solid: The body where it is no box.
+        surface: The body where it is no box.
         density: [kg/m3].
         youngs_modulus: At equilibrium [Pa].
         poisson_ratio: Below 0.5.
@@ -99,7 +99,7 @@ class Setup:
     angular_velocity: Vector
     size: Vector
     origin: Vector
-    solid: Solid | None
+    surface: Surface | None
     density: float
     youngs_modulus: float
     poisson_ratio: float
@@ -316,11 +316,11 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
     moving = _Table({} if start == "rest" else start, f"{file}: start")
     body = _Table(top.values.pop("body", None), f"{file}: [body]")
     shape = body.text("shape", "box", among=("box", "mesh"))
-    solid = None
+    surface = None
     if shape == "mesh":
         at = body.vector("origin") if "origin" in body.values else None
         path = (folder or file.parent) / body.text("file")
-        solid = read_solid(path, body.number("scale", 1.0, least=1e-9), at)
+        surface = read_surface(path, body.number("scale", 1.0, least=1e-9), at)
     material = _Table(top.values.pop("material", None), f"{file}: [material]")
     recording = _Table(top.values.pop("recording", {}), f"{file}: [recording]")
     kind: Any = recording.text("kind", "mocap", among=("mocap", "video"))
@@ -334,9 +334,9 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
         duration=top.number("duration", least=1e-6),
         velocity=moving.vector("velocity", zero),
         angular_velocity=moving.vector("angular_velocity", zero),
-        size=body.vector("size") if solid is None else solid.size,
-        origin=body.vector("origin", zero) if solid is None else solid.origin,
-        solid=solid,
+        size=body.vector("size") if surface is None else surface.size,
+        origin=body.vector("origin", zero) if surface is None else surface.origin,
+        surface=surface,
         density=material.number("density", least=1e-9),
         youngs_modulus=material.number("youngs_modulus", least=1e-9),
         poisson_ratio=material.number("poisson_ratio", least=0.0),

@@ -74,8 +74,8 @@ class Twin:
     """
 
     def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
-        solid = setup.solid
-        if solid is not None and setup.planes:
+        surface = setup.surface
+        if surface is not None and setup.planes:
             raise ValueError("plane: with a body of a mesh, wanted a box where there are planes")
         self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
         axes = []
@@ -87,7 +87,7 @@ class Twin:
                     f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
                     f"{end:g} m, within the body"
                 )
-            faces = [] if solid is None else solid.faces[axis]
+            faces = [] if surface is None else surface.faces[axis]
             near = 1e-3 * setup.size[axis]
             inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
             breaks = [begin, *inner, end]
@@ -98,7 +98,7 @@ class Twin:
             # Two walls that share a node would pull at each other across the chamber.
             axes.append(Axis(divide(breaks, least, edge), inner))
         x, y, z = axes
-        self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if solid is None else solid.filled)
+        self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
         if self.grid.open:
             raise ValueError("chamber: opens to the outside of the mesh, wanted walls all around")
         self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]

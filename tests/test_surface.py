@@ -13,7 +13,7 @@ from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.model import predict_trial, read_model, write_model
-from torchsoro.sim2real.solid import Solid, read_solid
+from torchsoro.sim2real.surface import Surface, read_surface
 from torchsoro.sim2real.twin import Twin
 
 SETUP = """
@@ -71,7 +71,7 @@ def folder(path: Path, mesh, body=MESH, duration=0.1, more=""):
 
 
 def test_points_lie_inside_of_a_ball():
-    ball = Solid(mesh=trimesh.creation.icosphere(subdivisions=4, radius=0.02))
+    ball = Surface(mesh=trimesh.creation.icosphere(subdivisions=4, radius=0.02))
     rng = np.random.default_rng(0)
     x, y, z = (np.sort(rng.uniform(-0.021, 0.021, 24)) for _ in range(3))
     radius = np.sqrt(x[:, None, None] ** 2 + y[:, None] ** 2 + z**2)
@@ -81,9 +81,9 @@ def test_points_lie_inside_of_a_ball():
 
 
 def test_flat_faces_are_found():
-    solid = Solid(mesh=prism(CORNERS, 0, 20))
-    assert solid.faces == ([pytest.approx(30.0)], [], [pytest.approx(8.0)])
-    assert len(solid.edges) == 18
+    surface = Surface(mesh=prism(CORNERS, 0, 20))
+    assert surface.faces == ([pytest.approx(30.0)], [], [pytest.approx(8.0)])
+    assert len(surface.edges) == 18
 
 
 def test_a_box_of_triangles_moves_as_a_box(tmp_path):
@@ -167,4 +167,4 @@ def test_what_is_no_body_is_refused(tmp_path, change, more, message):
 def test_an_empty_file_is_no_surface(tmp_path):
     (tmp_path / "a.obj").write_text("# nothing\n")
     with pytest.raises(ValueError, match="wanted"):
-        read_solid(tmp_path / "a.obj")
+        read_surface(tmp_path / "a.obj")

@@ -16,7 +16,7 @@ SHARP = 0.5  # rad between two triangles, from which on their edge is drawn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Solid:
+class Surface:
     """A closed surface.
 
     Attributes:
@@ -81,7 +81,7 @@ class Solid:
         return found.reshape(len(x), len(y), len(z))
 
 
-def read_solid(path: Path, scale: float = 1.0, origin: tuple[float, float, float] | None = None) -> Solid:
+def read_surface(path: Path, scale: float = 1.0, origin: tuple[float, float, float] | None = None) -> Surface:
     """Read a closed surface.
 
     Args:
@@ -98,7 +98,7 @@ def read_solid(path: Path, scale: float = 1.0, origin: tuple[float, float, float
 
 
 @functools.lru_cache(maxsize=4)
-def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, float] | None) -> Solid:
+def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, float] | None) -> Surface:
     try:
         mesh = trimesh.load_mesh(path)
     except Exception as error:  # whatever the reader of that format raises
@@ -110,4 +110,4 @@ def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, flo
     mesh.apply_scale(scale)
     if origin is not None:
         mesh.apply_translation(np.array(origin) - mesh.bounds[0])
-    return Solid(mesh=mesh)
+    return Surface(mesh=mesh)
