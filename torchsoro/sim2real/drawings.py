@@ -17,7 +17,7 @@ from torchsoro.sim2real.isolability import Isolability
 from torchsoro.sim2real.phases import BEYOND, Mismatch, together
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
-PLACE, BODY = "#a3154a", "#9aa5b1"
+PLACE, BODY = "#a3154a", "#52606d"
 EDGES = 400  # of a body, that are drawn at most
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
 BANDS = ("#e9eef4", "#f8f4ea")  # of phases, in turn
@@ -111,7 +111,7 @@ def draw_body(
         panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
         panels.append(panel)
         for edge in _outline(setup):
-            panel.plot(*(1e3 * edge.T), color=BODY, lw=0.9)
+            panel.plot(*(1e3 * edge.T), color=BODY, lw=1.3)
         for box in setup.clamps:
             one, other = (np.clip(1e3 * np.array(corner), low, low + size) for corner in box)
             ends = itertools.product(*zip(one, other, strict=True))
