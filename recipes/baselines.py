@@ -33,12 +33,12 @@ from torchsoro.sim2real.forcemap import StepForce, patches
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.histories import Lines, simulate
 from torchsoro.sim2real.library import library
-from torchsoro.sim2real.likelihood import BREAKS
+from torchsoro.sim2real.likelihood import BREAKS, Effects
 from torchsoro.sim2real.model import write_model
 from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.report import effect_rows
 from torchsoro.sim2real.residual import reordered
-from torchsoro.sim2real.verdict import Candidate, Thresholds, judge
+from torchsoro.sim2real.verdict import Thresholds, judge
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
 Ablation = Literal["without-numerics", "without-heldout", "one-trial"]
@@ -96,11 +96,22 @@ class Answer:
     fit: Fit | None = None
 
 
-def left_out(problem: Problem, other: Callable[[int, Problem, Trial], float]) -> dict[str, tuple[float, float]]:
-    """The error of each trial as believed, and what a function of its number, the other trials and it gives."""
-    (nothing,) = problem.fit([((), None)], rounds=6)
-    if nothing is None:
+def fitted(problem: Problem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
+    """A fit.
+
+    Raises:
+        ValueError: if the simulation breaks down.
+    """
+    (found,) = problem.fit([(effects, start)], rounds=rounds)
+    if found is None:
         raise ValueError(BREAKS)
+    return found
+
+
+def left_out(
+    problem: Problem, nothing: Fit, other: Callable[[int, Problem, Trial], float]
+) -> dict[str, tuple[float, float]]:
+    """The error of each trial as believed, and what a function of its number, the other trials and it gives."""
     found = {}
     for i, trial in enumerate(problem.trials):
         where = problem.only([t for t in problem.trials if t is not trial])
@@ -118,11 +129,9 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
         begin = np.zeros(len(effect.quantities)) if effect.joint else np.array(effect.starts[0], float)
         begin[0] = 0.0
         start.append(begin)
-    (fit,) = problem.fit([(effects, np.concatenate(start))], rounds=20)
-    if fit is None:
-        raise ValueError(BREAKS)
+    fit = fitted(problem, effects, np.concatenate(start), rounds=20)
     spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
-    rows = {r["name"]: r for r in effect_rows(Candidate(fit=fit, score=0.0, gain=0.0, explained=0.0), 1.0, problem)}
+    rows = {r["name"]: r for r in effect_rows(fit, 1.0, problem)}
     sure = []
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         strengths = len(effect.quantities) if effect.joint else 1
@@ -134,14 +143,14 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
         return predict(where, problem.without(fit, i), [trial])[0].total
 
     kind = {0: "nothing_missing", 1: "explained"}.get(len(sure), "cannot_distinguish")
-    held = left_out(problem, after)
+    held = left_out(problem, fitted(problem), after)
     return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
 
 
 def judged(problem: Problem, budget: float, **thresholds: float) -> Answer:
     """The verdict of explain.py."""
     verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
-    rows = effect_rows(verdict.chosen[0], 1.0, verdict.problem) if verdict.chosen else []
+    rows = effect_rows(verdict.chosen[0].fit, 1.0, verdict.problem) if verdict.chosen else []
     return Answer(
         verdict=verdict.kind,
         effects=rows,
@@ -217,9 +226,7 @@ def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
 
 def force_network(problem: Problem) -> Answer:
     """Forces by a network, learned from all trials but one."""
-    (nothing,) = problem.fit([((), None)], rounds=6)
-    if nothing is None:
-        raise ValueError(BREAKS)
+    nothing = fitted(problem)
     s = problem.experiment.setup
     small = 1e-3 * s.youngs_modulus * min(s.size) ** 3 / max(s.size)
     _, shares = patches(problem.twin, PATCHES)
@@ -239,7 +246,7 @@ def force_network(problem: Problem) -> Answer:
         found = predict(where, fit, [trial]) or predict(where, still, [trial])
         return found[0].total
 
-    held = left_out(problem, after)
+    held = left_out(problem, nothing, after)
     (one, other) = (math.sqrt(sum(v[k] ** 2 for v in held.values())) for k in (0, 1))
     return Answer(verdict="unknown_physics" if other < HELPS * one else "nothing_missing", heldout=held)
 
@@ -312,9 +319,7 @@ def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def sparse_regression(problem: Problem) -> Answer:
     """Terms that the residual accelerations are made of."""
-    (nothing,) = problem.fit([((), None)], rounds=6)
-    if nothing is None:
-        raise ValueError(BREAKS)
+    nothing = fitted(problem)
     names, values, targets = terms(problem, nothing)
     left = whole = 0.0
     for i, (A, y) in enumerate(zip(values, targets, strict=True)):
@@ -341,8 +346,6 @@ def main(options: Options) -> Answer | None:
     """
     if options.predict is not None:
         return explain.predicted(explain.Options(predict=options.predict, trial=options.trial, out=options.out))
-    if options.experiment is None:
-        raise ValueError("experiment: wanted a folder, or --predict")
     if options.experiment is None:
         raise ValueError("experiment: wanted a folder, or --predict")
     torch.set_num_threads(1)

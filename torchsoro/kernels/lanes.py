@@ -285,7 +285,7 @@ def march(mesh, case, out):
     chambers, walls = case.supply.shape[1], len(mesh.wall_axis)
     moves = ~np.asarray(mesh.held)[:, None, None]
     d, v = (np.ascontiguousarray(a * moves).reshape(-1) for a in (case.place, case.velocity))
-    history = np.zeros(2 * len(case.series) // 64 * len(case.own), f32)
+    history = np.zeros(2 * (len(case.series) // 64) * len(case.own), f32)
     sizes = (
         len(d), 1728, 1728, 1152, 1152, 96, 96,
         16 * chambers, 48 * walls, 16 * chambers, 144, 48, 48 * len(case.springs),

@@ -68,10 +68,9 @@ class Explanation:
         return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.nothing
 
 
-def effect_rows(candidate: Candidate, weight: float, problem: Problem) -> list[dict[str, Any]]:
-    """The effects of a candidate, as in explanation.json; intervals by the law of errors, within bounds."""
+def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any]]:
+    """The effects of a fit, as in explanation.json; intervals by the law of errors, within bounds."""
     wide, rows, scenario = float(norm.ppf((1 + LEVEL) / 2)), [], problem.scenarios[0]
-    fit = candidate.fit
     spread = max(1.0, fit.misfit / fit.samples) * correlation(fit)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
@@ -115,7 +114,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "verdict": v.kind,
-        "effects": effect_rows(v.chosen[0], float(weights[0]), problem) if v.chosen else [],
+        "effects": effect_rows(v.chosen[0].fit, float(weights[0]), problem) if v.chosen else [],
         "set": [c.fit.name for c in v.chosen],
         "ranking": [
             {
@@ -128,7 +127,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "gain": c.gain,
                 "alike": correlation(c.fit),
                 "heldout_over_nothing": None if math.isnan(c.kept) else c.kept,
-                "effects": effect_rows(c, 0.0, problem),
+                "effects": effect_rows(c.fit, 0.0, problem),
             }
             for c in v.ranking
         ],
@@ -262,7 +261,7 @@ def _beyond(e: Explanation) -> str:
 
 def _said(candidate: Candidate, problem: Problem) -> str:
     parts = []
-    for row in effect_rows(candidate, 0.0, problem):
+    for row in effect_rows(candidate.fit, 0.0, problem):
         numbers = ", ".join(
             f"{name} {p['value']:.3g} {p['unit']} (90 %: {p['low']:.3g} to {p['high']:.3g})"
             for name, p in row["parameters"].items()
@@ -302,7 +301,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     places = [
         (row["name"], np.array(row["location_m"]))
         for c in e.verdict.chosen
-        for row in effect_rows(c, 0.0, e.problem)
+        for row in effect_rows(c.fit, 0.0, e.problem)
         if row["location_m"] is not None
     ]
     page.figure(
