@@ -27,7 +27,7 @@ from torch import nn
 from torchsoro.archive import atomic_write
 from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Trial, read_experiment
+from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.forcemap import StepForce, patches
 from torchsoro.sim2real.heldout import predict
@@ -35,9 +35,7 @@ from torchsoro.sim2real.histories import Lines, simulate
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.likelihood import BREAKS, Effects
 from torchsoro.sim2real.model import write_model
-from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.report import effect_rows
-from torchsoro.sim2real.residual import reordered
 from torchsoro.sim2real.verdict import Thresholds, judge
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
@@ -346,17 +344,14 @@ def main(options: Options) -> Answer | None:
     """
     if options.predict is not None:
         return explain.predicted(explain.Options(predict=options.predict, trial=options.trial, out=options.out))
-    if options.experiment is None:
-        raise ValueError("experiment: wanted a folder, or --predict")
-    torch.set_num_threads(1)
     begin, seconds = time.perf_counter(), 60 * options.budget
+    whole = explain.Options(
+        experiment=options.experiment, out=options.out, budget=options.budget, threads=options.threads
+    )
     if options.method in get_args(Ablation):
-        whole = {"budget": options.budget, "threads": options.threads}
-        problem, _ = explain.prepared(explain.Options(experiment=options.experiment, out=options.out, **whole))
+        problem, _ = explain.prepared(whole)
     else:
-        experiment, _ = reordered(read_experiment(options.experiment))
-        trials = [t for t in experiment.trials if t.recording is not None]
-        twin = choose_twin(experiment.setup, len(trials), seconds)
+        experiment, trials, twin = explain.begun(whole)
         problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
@@ -383,7 +378,7 @@ def main(options: Options) -> Answer | None:
     with atomic_write(options.out / "explanation.json") as file:
         file.write((json.dumps(told, indent=2) + "\n").encode())
     if answer.fit is not None:
-        write_model(options.out / "model.toml", options.experiment / "setup.toml", answer.fit, problem.twin)
+        write_model(options.out / "model.toml", problem.experiment.folder / "setup.toml", answer.fit, problem.twin)
     print(f"{options.method}: {answer.verdict} {', '.join(answer.names)}; {told['cost']['seconds']:.0f} s")
     return answer
 

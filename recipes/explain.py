@@ -20,7 +20,7 @@ import tyro
 
 from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import THREADS, Ensemble
-from torchsoro.sim2real.experiment import read_experiment
+from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.forcemap import force_map
 from torchsoro.sim2real.heldout import predict
@@ -87,8 +87,8 @@ def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
     return [effect for effect in library() if effect.name in names] or None
 
 
-def prepared(options: Options) -> tuple[Problem, Numerics]:
-    """What effects are fitted to: recordings, a twin that the budget can pay, and that twin's own error.
+def begun(options: Options) -> tuple[Experiment, list[Trial], Twin]:
+    """The experiment, its trials with a recording, and a twin that the budget can pay.
 
     Raises:
         ValueError: for an experiment that cannot be read or simulated.
@@ -101,9 +101,17 @@ def prepared(options: Options) -> tuple[Problem, Numerics]:
         print(confused)
     trials = [t for t in experiment.trials if t.recording is not None]
     if options.edge > 0:
-        twin = Twin(experiment.setup, edge=options.edge, walls=options.walls)
-    else:
-        twin = choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
+        return experiment, trials, Twin(experiment.setup, edge=options.edge, walls=options.walls)
+    return experiment, trials, choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
+
+
+def prepared(options: Options) -> tuple[Problem, Numerics]:
+    """What effects are fitted to: recordings, a twin, and that twin's own error.
+
+    Raises:
+        ValueError: for an experiment that cannot be read or simulated.
+    """
+    experiment, trials, twin = begun(options)
     print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
     ensemble = Ensemble(twin, options.threads or THREADS)
     fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads)
