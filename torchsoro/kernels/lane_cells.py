@@ -20,6 +20,13 @@ f32 = np.float32
 
 
 @fast
+def clear(a):
+    """Fill an array with zeros."""
+    for n in range(len(a)):
+        a[n] = f32(0)
+
+
+@fast
 def at_least(x, least):
     """The larger of two numbers, without a branch."""
     return f32(0.5) * (x + least + abs(x - least))
@@ -216,8 +223,7 @@ def remember(at, G, T, Q, Z, series, law, stiffens, elements):
         iso = factor / J
         T[lane], T[16 + lane], T[32 + lane] = scale * k00 + iso, scale * k11 + iso, scale * k22 + iso
         T[48 + lane], T[64 + lane], T[80 + lane] = scale * k01, scale * k12, scale * k02
-    for n in range(96):
-        Q[n] = f32(0)
+    clear(Q)
     for e in range(elements):
         z, maxwell = Z[96 * e : 96 * e + 96], series[64 * e : 64 * e + 64]
         for lane in range(16):

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchsoro.kernels.lane_cells import f32, fast, gather, remember, scatter, solid
+from torchsoro.kernels.lane_cells import clear, f32, fast, gather, remember, scatter, solid
 
 LANES = 16
 TOUCH = 1e-6  # m in front of a plane within which adhesion holds
@@ -146,8 +146,7 @@ class Case(NamedTuple):
 def _walls(mesh, case, t, d, f, swept, normals, pressure, room):
     """Pressure on the walls of the chambers, following their motion: p dA = p t1 x t2."""
     chambers = swept.shape[0] // LANES
-    for n in range(16 * chambers):
-        swept[n] = f32(0)
+    clear(swept)
     place, one, two = room[:48], room[48:96], room[96:144]
     for w in range(len(mesh.wall_axis)):
         axis = mesh.wall_axis[w]
@@ -201,8 +200,7 @@ def _attached(case, t, d, f, push, stretch):
             for q in range(48):
                 o[q] -= share * push[q]
     if len(case.springs) > 0:
-        for n in range(48 * len(case.springs)):
-            stretch[n] = f32(0)
+        clear(stretch)
         for k in range(len(case.spring_node)):
             x = d[48 * case.spring_node[k] : 48 * case.spring_node[k] + 48]
             number = case.spring_number[k]
@@ -258,8 +256,7 @@ def _meet(mesh, case, d, v):
 @fast
 def _look(mesh, d, v, out):
     """Markers [M * 240]: place, velocity, derivatives of the displacement by x, y, z."""
-    for n in range(len(out)):
-        out[n] = f32(0)
+    clear(out)
     for m in range(len(mesh.mark_begin) - 1):
         o = out[MARKED * m : MARKED * m + MARKED]
         for k in range(mesh.mark_begin[m], mesh.mark_begin[m + 1]):
@@ -300,8 +297,7 @@ def _march(mesh, case, out, d, v, own, Z, f, X, Y, G, P, T, Q, swept, normals, p
     dt = f32(case.dt)
     _look(mesh, d, v, out[0])
     for t in range(case.steps):
-        for n in range(48 * count):
-            f[n] = f32(0)
+        clear(f)
         for cell in range(len(mesh.corners)):
             corner = mesh.corners[cell]
             Wx, Sx = mesh.weights[0, mesh.cells[cell, 0]], mesh.slopes[0, mesh.cells[cell, 0]]
