@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from pathlib import Path
+from typing import Literal
 
 import torch
 import tyro
@@ -60,6 +61,8 @@ class Options:
     """Names of the effects to think of; all of the library if none is given."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """What simulates; "auto" is a GPU where there is one and the package numba-cuda."""
 
 
 def predicted(options: Options) -> None:
@@ -113,8 +116,8 @@ def prepared(options: Options) -> tuple[Problem, Numerics]:
     """
     experiment, trials, twin = begun(options)
     print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
-    ensemble = Ensemble(twin, options.threads or THREADS)
-    fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads)
+    ensemble = Ensemble(twin, options.threads or THREADS, options.device)
+    fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads, options.device)
     print(f"corrected by one of {fine.twin.count} points")
     numerics = measure(experiment, ensemble, fine)
     problem = Problem(

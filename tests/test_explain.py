@@ -280,6 +280,19 @@ def test_candidates_are_scored_by_the_best_of_them(made):
         assert told["drag"] == pytest.approx(simple.score - cost)
 
 
+@pytest.mark.parametrize(
+    ("excess", "explained", "kind"),
+    [(1.2, 0.3, "explained"), (1.6, 0.6, "explained"), (1.6, 0.4, "unknown_physics"), (5.0, 0.7, "unknown_physics")],
+)
+def test_an_effect_that_takes_away_too_little_is_not_what_is_missing(made, excess, explained, kind):
+    twin, ensemble, record = made
+    problem = Problem(record(None), twin, ensemble=ensemble)
+    nothing = problem.fit([((), None)], rounds=3)[0]
+    fit = dataclasses.replace(nothing, effects=(effect("drag"),))
+    found = [Candidate(fit=fit, score=400.0, gain=400.0, explained=explained, kept=0.6)]
+    assert decide(problem, nothing, found, excess, Thresholds()).kind == kind
+
+
 def test_what_predicts_far_worse_than_another_is_not_believed(made):
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)

@@ -258,6 +258,30 @@ def test_a_block_slides_as_far_as_friction_lets_it(trial, tilt):
         assert (seen[:, 0] @ normal - offset).min() > -1e-4
 
 
+@pytest.mark.parametrize(("gap", "speed", "expected"), [(0.0, 0.2, 0.03**0.5), (3e-4, 0.0, -0.05), (6e-4, 0.0, 0.0)])
+def test_adhesion_pulls_as_far_as_it_reaches(trial, gap, speed, expected):
+    """A block that is thrown off loses what it takes to separate; one within reach is drawn in, one beyond is not."""
+    low = np.array(trial.setup.origin)
+    t = changed(
+        trial,
+        clamps=(),
+        gravity=(0.0, 0.0, 0.0),
+        velocity=(0.0, 0.0, speed),
+        youngs_modulus=1e6,
+        planes=(Boundary(point=tuple(low - [0.0, 0.0, gap]), normal=(0.0, 0.0, 1.0), friction=0.3),),
+        duration=0.01,
+    )
+    height, density = t.setup.size[2], t.setup.density
+    traction, reach = 0.5 * density * height * 0.1**2 / 5e-4, 5e-4  # together the energy of 0.1 m/s
+    twin = Twin(t.setup, edge=EDGE)
+    effect = next(e for e in library() if e.name == "adhesion")
+    values = torch.tensor([[traction, math.log(reach)]], dtype=torch.float64)
+    assert effect.told(values[0].numpy(), twin.scenario(t))["energy_j_m2"][0] == pytest.approx(traction * reach)
+    motion = Ensemble(twin)([effect(twin.scenario(t), values, twin)])[0].alone()
+    last = 2 if expected < 0 else -1  # before it meets the plane
+    assert motion.velocity[last, :, 2].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
+
+
 def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
     t = hollow(trial, duration=0.2, gravity=(0.0, 0.0, 0.0))
     grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).place for k in (0.0, 2e4)]

@@ -17,7 +17,7 @@ import numpy as np
 from torchsoro.kernels.lane_cells import clear, f32, fast, gather, remember, scatter, solid
 
 LANES = 16
-TOUCH = 1e-6  # m in front of a plane within which adhesion holds
+TOUCH = 1e-6  # m in front of a plane within which a node lies on it
 SURFACE = 0.5  # stiffness of planes for a node, in its mass over the square of the step: what the step still bears
 MARKED = 5 * 3 * LANES  # numbers of a marker: place, velocity, derivatives by the reference place
 
@@ -104,7 +104,8 @@ class Case(NamedTuple):
         stick: Whether planes hold what is pressed on them [A].
         offset: Of planes along their normals [A, 16].
         friction: Coulomb coefficients [A, 16].
-        adhesion: Tractions [A, 16].
+        adhesion: Tractions that pull towards planes [A, 16].
+        reach: So far [A, 16].
         area: Of nodes that face planes [A, n].
     """
 
@@ -139,6 +140,7 @@ class Case(NamedTuple):
     offset: np.ndarray
     friction: np.ndarray
     adhesion: np.ndarray
+    reach: np.ndarray
     area: np.ndarray
 
 
@@ -231,10 +233,10 @@ def _meet(mesh, case, d, v):
             x, u = d[48 * node : 48 * node + 48], v[48 * node : 48 * node + 48]
             for lane in range(16):
                 gap = X + x[lane] * n0 + x[16 + lane] * n1 + x[32 + lane] * n2 - case.offset[a, lane]
+                hold = case.adhesion[a, lane] * case.area[a, node] * dt * case.weight[node, lane]
                 if gap < f32(TOUCH):
                     u0, u1, u2 = u[lane], u[16 + lane], u[32 + lane]
                     normal = u0 * n0 + u1 * n1 + u2 * n2
-                    hold = case.adhesion[a, lane] * case.area[a, node] * dt * case.weight[node, lane]
                     # What the plane gives, and what adhesion takes.
                     pressed = max(-gap, f32(0)) * push
                     held = max(min(normal + pressed, hold), f32(0))
@@ -251,6 +253,10 @@ def _meet(mesh, case, d, v):
                     u[lane] = t0 * rest + normal * n0
                     u[16 + lane] = t1 * rest + normal * n1
                     u[32 + lane] = t2 * rest + normal * n2
+                elif gap < case.reach[a, lane]:
+                    u[lane] -= hold * n0
+                    u[16 + lane] -= hold * n1
+                    u[32 + lane] -= hold * n2
 
 
 @fast

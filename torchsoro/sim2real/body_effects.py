@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.material import Prony
-from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
+from torchsoro.sim2real.hypothesis import LAW, Hypothesis, Quantity
 from torchsoro.sim2real.scenario import Scenario, Tie
 from torchsoro.sim2real.twin import Twin
 
@@ -34,7 +34,7 @@ class Modulus(Hypothesis):
 class Viscoelastic(Hypothesis):
     """A Maxwell element is missing."""
 
-    name, seam = "viscoelastic", "Prony series"
+    name, seam, form = "viscoelastic", "Prony series", LAW
     quantities = (
         Quantity("modulus_over_equilibrium", "1", 0.2, 0.0, 100.0),
         Quantity("ln_time", "ln s", 1.0, -9.0, 1.5),
@@ -66,7 +66,7 @@ class Viscoelastic(Hypothesis):
 class Stiffening(Hypothesis):
     """The solid stiffens with stretch: mu (1 + a x + a^2 x^2), x = I1b - 3, the first terms of Gent's 1 / (1 - a x)."""
 
-    name, seam = "stiffening", "stress at large strain"
+    name, seam, form = "stiffening", "stress at large strain", LAW
     quantities = (Quantity("coefficient", "1", 0.3, 0.0, 10.0),)
     starts = ((1.0,), (3.0,))
 
@@ -78,7 +78,7 @@ class Stiffening(Hypothesis):
 class Softening(Hypothesis):
     """Stress is lower below the largest stretch so far (Mullins)."""
 
-    name, seam = "softening", "stress below the largest stretch so far"
+    name, seam, form = "softening", "stress below the largest stretch so far", LAW
     quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))
     starts = tuple((d, r) for d in (1.0, 3.0) for r in (-7.0, -5.0, -3.0))
 
@@ -90,7 +90,7 @@ class Softening(Hypothesis):
 class Density(Hypothesis):
     """The solid is heavier or lighter than believed."""
 
-    name, seam = "density", "density"
+    name, seam, form = "density", "density", 0.2
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
 
@@ -106,7 +106,7 @@ class Density(Hypothesis):
 class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 
-    name, seam = "soft_side", "Young's modulus over the body"
+    name, seam, form = "soft_side", "Young's modulus over the body", LAW
     quantities = tuple(Quantity(f"slope_{axis}", "1 over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
@@ -193,7 +193,7 @@ class LoadInertia(Hypothesis):
 class Tether(Hypothesis):
     """A spring, a dashpot and a mass at a place of the body, as a tube is."""
 
-    name, seam, local = "tether", "spring, drag and mass at a place", True
+    name, seam, local, form = "tether", "spring, drag and mass at a place", True, LAW
     quantities = (
         Quantity("stiffness_n_m", "N/m", 2.0, 0.0, 1000.0),
         Quantity("damping_n_s_m", "N s/m", 0.05, 0.0, 1000.0),

@@ -1,7 +1,8 @@
-"""Scenarios of a body, many variations at once, sixteen to a group and a group to a thread."""
+"""Scenarios of a body, many variations at once: sixteen to a group and a group to a thread, or all of them on a GPU."""
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
 from collections.abc import Sequence
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.actuation import Waveform
+from torchsoro.kernels import blocks
 from torchsoro.kernels.lanes import LANES, MARKED, Case, Mesh, march
 from torchsoro.material import Prony
 from torchsoro.sim2real.scenario import Scenario
@@ -30,11 +32,18 @@ class Ensemble:
     Args:
         twin: The body.
         threads: That work side by side.
+        device: "cpu", "cuda", or "auto" for a GPU where there is one.
+
+    Attributes:
+        room: Variations that take no longer than one.
     """
 
-    def __init__(self, twin: Twin, threads: int = THREADS) -> None:
-        self.twin, self.threads = twin, threads
+    def __init__(self, twin: Twin, threads: int = THREADS, device: str = "auto") -> None:
+        self.twin, self.threads, self.device = twin, threads, device
         self.mesh = mesh_of(twin)
+        there = device == "cuda" or (device == "auto" and blocks.available())
+        self.body = blocks.body_of(self.mesh) if there else None
+        self.room = blocks.ROOM if there else LANES * threads
         grid = twin.grid
         _, _, places, axes, areas, chambers = grid.walls
         shape = np.zeros(len(twin.setup.cavities))
@@ -56,19 +65,22 @@ class Ensemble:
         alike: dict[object, list[Lane]] = {}
         for lane in lanes:
             alike.setdefault(_common(scenarios[lane[0]]), []).append(lane)
-        groups = []
+        kinds = []
         for members in alike.values():
             members.sort(key=lambda lane: steps[lane[0]][lane[1]])
-            groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
+            kinds.append([members[k : k + LANES] for k in range(0, len(members), LANES)])
         markers = len(self.twin.setup.markers)
         longest = max(s.duration for s in scenarios)
         samples = math.ceil(longest / SAMPLE - 1e-9) + 1
         seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
 
-        def run(group: list[Lane]) -> float:
+        def prepared(group: list[Lane]) -> Case:
             dt = min(steps[i][b] for i, b in group)
             every = math.ceil(SAMPLE / dt)
-            case = self.case(scenarios, group, SAMPLE / every, every, samples)
+            return self.case(scenarios, group, SAMPLE / every, every, samples)
+
+        def run(group: list[Lane]) -> float:
+            case = prepared(group)
             out = np.zeros((samples, MARKED * markers), np.float32)
             march(self.mesh, case, out)
             found = out.reshape(samples, markers, 5, 3, LANES)
@@ -76,8 +88,19 @@ class Ensemble:
                 seen[i][b] = found[..., k]
             return case.dt
 
-        with ThreadPoolExecutor(self.threads) as pool:
-            largest = max(pool.map(run, groups))
+        def run_there(kind: list[list[Lane]]) -> float:
+            assert self.body is not None
+            cases = [prepared(group) for group in kind]
+            found = blocks.march_all(self.body, cases, [len(group) for group in kind], samples)
+            for (i, b), one in zip(itertools.chain(*kind), found, strict=True):
+                seen[i][b] = one
+            return max(case.dt for case in cases)
+
+        if self.body is None:
+            with ThreadPoolExecutor(self.threads) as pool:
+                largest = max(pool.map(run, itertools.chain(*kinds)))
+        else:
+            largest = max(run_there(kind) for kind in kinds)
         at = np.array([m.at for m in self.twin.setup.markers], float)
         time = np.arange(samples) * SAMPLE
         return [
@@ -190,6 +213,7 @@ class Ensemble:
             offset=_rows(lanes, grounds, "offset"),
             friction=_rows(lanes, grounds, "friction"),
             adhesion=_rows(lanes, grounds, "adhesion"),
+            reach=_rows(lanes, grounds, "reach"),
             area=np.array([self.twin.grid.facing(n) for n in normals], np.float32).reshape(
                 len(normals), self.twin.grid.nodes
             ),

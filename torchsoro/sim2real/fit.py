@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from torchsoro.kernels.lanes import LANES
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.twin import Motion
@@ -206,9 +205,9 @@ class Problem(Likelihood):
         asked = {i: next(search) for i, search in enumerate(searches)}
         while asked:
             order = list(asked)
-            # Derivatives are for nothing where lanes would be empty.
+            # Derivatives are for nothing where there is room.
             wide = sum(1 + len(self.scales(tasks[i][0])) for i in order) * len(self.trials)
-            self.eager = wide <= LANES * self.ensemble.threads
+            self.eager = wide <= self.ensemble.room
             answers = self.simulate([asked[i] for i in order])
             for i, motions in zip(order, answers, strict=True):
                 try:

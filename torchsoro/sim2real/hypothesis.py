@@ -22,6 +22,8 @@ from torch import Tensor, nn
 from torchsoro.sim2real.scenario import Scenario
 from torchsoro.sim2real.twin import Twin
 
+LAW = 0.35  # see Hypothesis.form; of cases whose truth is known, what covers 90 %
+
 
 @dataclass(frozen=True)
 class Quantity:
@@ -52,6 +54,8 @@ class Hypothesis(nn.Module):
         local: Whether it acts at a place, which is then inferred along with them.
         starts: Strengths to look at first, in scales: alternatives, or, if ``joint``, one of each parameter.
         joint: Whether the parameters add up, as components of a vector do.
+        form: Share of a parameter that stays unknown, as nature's form of the effect is not the hypothesis': small for
+            a number that a body has, larger for one that stands for a law.
     """
 
     name: ClassVar[str]
@@ -60,6 +64,7 @@ class Hypothesis(nn.Module):
     local: ClassVar[bool] = False
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
+    form: ClassVar[float] = 0.1
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The scenario with the effect.

@@ -81,7 +81,7 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
     still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
     asked = [((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, looks, strict=True)]
     problem = problem.only(problem.trials)
-    problem.ensemble = Even(problem.twin, problem.ensemble.threads)
+    problem.ensemble = Even(problem.twin, problem.ensemble.threads, problem.ensemble.device)
     base, *found = problem.simulate([((), still), *asked])
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)

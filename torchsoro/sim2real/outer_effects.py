@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.actuation import Waveform
-from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
+from torchsoro.sim2real.hypothesis import LAW, Hypothesis, Quantity
 from torchsoro.sim2real.scenario import Ground, Scenario
 from torchsoro.sim2real.twin import Twin
 
@@ -19,7 +19,7 @@ from torchsoro.sim2real.twin import Twin
 class PressureGain(Hypothesis):
     """The chamber gets less, or more, than the supply's pressure."""
 
-    name, seam = "pressure_loss", "chamber pressure"
+    name, seam, form = "pressure_loss", "chamber pressure", LAW
     quantities = (Quantity("ln_factor", "1", 0.05, -30.0, 12.0),)
     starts = ((-1.0,), (-4.0,), (-10.0,))
 
@@ -64,7 +64,7 @@ def lagged(scenario: Scenario, tau: Tensor) -> Waveform:
 class PressureLag(Hypothesis):
     """The line fills and empties with a lag: tau p' = p_supply - p."""
 
-    name, seam = "pressure_lag", "chamber pressure"
+    name, seam, form = "pressure_lag", "chamber pressure", LAW
     quantities = (Quantity("time_constant_s", "s", 0.01, 0.0, 100.0),)
     starts = ((1.0,), (3.0,), (8.0,))
 
@@ -80,7 +80,7 @@ class PressureLag(Hypothesis):
 class AirStiffness(Hypothesis):
     """The chamber's pressure falls as it grows: p = p_supply - k (V/V0 - 1)."""
 
-    name, seam = "air_stiffness", "chamber pressure by its volume"
+    name, seam, form = "air_stiffness", "chamber pressure by its volume", LAW
     quantities = (Quantity("air_stiffness_pa", "Pa", 2e4, 0.0, 50.0),)
     starts = ((1.0,), (5.0,))
 
@@ -96,7 +96,7 @@ class AirStiffness(Hypothesis):
 class Leak(Hypothesis):
     """A part of the supply is lost behind a line that fills slowly: tau p' = (1 - a) p_supply - p."""
 
-    name, seam = "leak", "chamber pressure"
+    name, seam, form = "leak", "chamber pressure", LAW
     quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
     starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
 
@@ -115,7 +115,7 @@ class Leak(Hypothesis):
 class FluidDrag(Hypothesis):
     """The surrounding fluid slows the body, with the square of the velocity, on the area that moves through it."""
 
-    name, seam = "drag", "drag of what surrounds the body"
+    name, seam, form = "drag", "drag of what surrounds the body", LAW
     # Water, and a plate across its motion: 1000 kg/m3 times 2.
     quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 125.0),)
     starts = ((1.0,), (5.0,), (25.0,))
@@ -171,15 +171,25 @@ class Friction(Hypothesis):
 
 
 class Adhesion(Hypothesis):
-    """Planes hold the body back as it lifts off."""
+    """Planes hold the body back as it lifts off, with the same traction as far as they reach (Dugdale)."""
 
-    name, seam = "adhesion", "adhesion of the planes"
-    quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0),)
-    starts = ((0.5,), (2.0,), (8.0,))
+    name, seam, form = "adhesion", "adhesion of the planes", LAW
+    quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0), Quantity("ln_reach", "ln m", 1.0, -11.5, -5.0))
+    starts = ((2.0, -8.5), (8.0, -8.5), (30.0, -8.5), (8.0, -7.0))
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """Traction, reach, and the energy that it takes to separate."""
+        reach = math.exp(values[1])
+        return {
+            "traction": (float(values[0]), "Pa"),
+            "reach_m": (reach, "m"),
+            "energy_j_m2": (float(values[0]) * reach, "J/m2"),
+        }
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Traction to overcome."""
-        return _planes(scenario, lambda g: {"adhesion": g.adhesion + values[:, 0]})
+        """Traction within reach."""
+        reach = values[:, 1].exp()
+        return _planes(scenario, lambda g: {"adhesion": g.adhesion + values[:, 0], "reach": reach})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane."""
@@ -210,7 +220,7 @@ def _planes(scenario: Scenario, change: Callable[[Ground], dict[str, Tensor | No
 class GravityTilt(Hypothesis):
     """The body stands at an angle: gravity is turned about two axes."""
 
-    name, seam = "gravity_tilt", "direction of gravity"
+    name, seam, form = "gravity_tilt", "direction of gravity", 0.2
     quantities = (Quantity("about_first", "rad", 0.03, -20.0, 20.0), Quantity("about_second", "rad", 0.03, -20.0, 20.0))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
@@ -231,7 +241,7 @@ class GravityTilt(Hypothesis):
 class InitialMotion(Hypothesis):
     """The body is not at rest, or moves otherwise, at the start."""
 
-    name, seam = "initial_motion", "velocity at the start"
+    name, seam, form = "initial_motion", "velocity at the start", LAW
     quantities = tuple(Quantity(f"velocity_{axis}", "m/s", 0.02, -50.0, 50.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 

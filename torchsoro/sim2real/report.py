@@ -27,7 +27,6 @@ from torchsoro.sim2real.phases import Mismatch
 from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
 from torchsoro.storage import atomic_write
 
-FORM = 0.1  # of a number, that is due to an effect's form
 LEVEL = 0.9
 BELIEVED = 3.0  # standard deviations of a measurement error that are believed
 
@@ -74,10 +73,9 @@ def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any
     spread = max(1.0, fit.misfit / fit.samples) * correlation(fit)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
-        # Nature's form is not the hypothesis': of no number more is known than some share.
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
         own = np.where(logarithm, 1.0, values[:count])
-        whole = spread * covariance[:count, :count] + np.diag((FORM * own) ** 2)
+        whole = spread * covariance[:count, :count] + np.diag((effect.form * own) ** 2)
         steps = 1e-4 * np.array([q.scale for q in effect.quantities])
         told = effect.told(values[:count], scenario)
         ahead = [effect.told(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]

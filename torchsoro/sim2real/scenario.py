@@ -21,13 +21,15 @@ class Ground:
         normal: Unit normal to the body's side [3].
         offset: Of the plane along it [...] m.
         friction: Coulomb coefficient [...]; None if it holds what is pressed on it.
-        adhesion: Traction that must be overcome to lift off, which also presses on for friction [...] Pa.
+        adhesion: Traction that pulls towards it, and presses on for friction [...] Pa.
+        reach: So far from it [...] m.
     """
 
     normal: Tensor
     offset: Tensor
     friction: Tensor | None
     adhesion: Tensor
+    reach: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,7 +114,7 @@ class Scenario:
         ranks = [(self.stiffness, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
         ranks += [(self.air_stiffness, 1), (self.gravity, 1), (self.mass, 1), (self.drag, 1)]
         ranks += [(self.softening, 1), (self.fluid, 0), (self.displacement, 2), (self.velocity, 2)]
-        ranks += [(t, 0) for g in self.grounds for t in (g.offset, g.adhesion, g.friction) if t is not None]
+        ranks += [(t, 0) for g in self.grounds for t in (g.offset, g.adhesion, g.reach, g.friction) if t is not None]
         ranks += [(p.force, 1) for p in self.pushes] + [(s.stiffness, 0) for s in self.springs]
         if self.prony is not None:
             ranks.append((self.prony.moduli, 1))

@@ -219,4 +219,5 @@ def _ground(plane: Boundary) -> Ground:
         offset=unit @ torch.tensor(plane.point, dtype=torch.float64),
         friction=None if isinstance(plane.friction, str) else zero + plane.friction,
         adhesion=zero,
+        reach=zero,
     )

@@ -48,19 +48,23 @@ class Thresholds:
 
     Attributes:
         alarm: Score and gain below which nothing is missing.
-        margin: Of the score, within which two effects are not told apart: odds of twenty to one.
+        margin: Of the score, within which two effects are not told apart: 2 % of what the best takes away.
         quiet: Times what noise and numerics explain, below which nothing is missing if no effect is believed.
         beyond: The same, above which the best effect leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
+        some: As ``beyond``, above which the best effect must take away ``part`` of the misfit.
+        part: The least share of one that is believed.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
     """
 
     alarm: float = 40.0
-    margin: float = 3.0
+    margin: float = 10.0
     quiet: float = 1.8
     beyond: float = 4.0
     share: float = 0.8
+    some: float = 1.3
+    part: float = 0.5
     lost: float = 0.85
     worse: float = 1.3
 
@@ -425,7 +429,7 @@ def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: f
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
     if best is None or best.score < t.alarm:
         return Verdict(kind="nothing_missing" if excess < t.quiet else "unknown_physics", **common)
-    if excess > t.beyond and best.explained < t.share:
+    if (excess > t.beyond and best.explained < t.share) or (excess > t.some and best.explained < t.part):
         return Verdict(kind="unknown_physics", **common)
     close = tuple(c for c in believed if c.score > best.score - t.margin)
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
