@@ -22,7 +22,7 @@ from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
 from torchsoro.sim2real.twin import Motion, Twin
-from torchsoro.sim2real.verdict import Candidate, Thresholds, decide, judge, rank
+from torchsoro.sim2real.verdict import Candidate, Thresholds, _freed, decide, judge, rank
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 EDGE = 0.01
@@ -281,16 +281,35 @@ def test_candidates_are_scored_by_the_best_of_them(made):
 
 
 @pytest.mark.parametrize(
-    ("excess", "explained", "kind"),
-    [(1.2, 0.3, "explained"), (1.6, 0.6, "explained"), (1.6, 0.4, "unknown_physics"), (5.0, 0.7, "unknown_physics")],
+    ("start", "excess", "explained", "gain", "kept", "kind"),
+    [
+        (1.2, 1.1, 0.3, 400.0, 0.8, "explained"),  # of so little no share is known
+        (1.6, 1.3, 0.6, 400.0, 0.8, "explained"),
+        (1.6, 1.4, 0.4, 400.0, 0.8, "nothing_missing"),
+        (2.5, 1.9, 0.4, 400.0, 0.8, "unknown_physics"),
+        (9.0, 5.0, 0.7, 400.0, 0.8, "unknown_physics"),
+        (1.1, 1.0, 1.0, 300.0, 0.9, "explained"),  # noise hides how much better it predicts
+        (1.1, 1.0, 1.0, 100.0, 0.9, "nothing_missing"),
+        (5.0, 1.1, 1.0, 300.0, 0.9, "unknown_physics"),  # it fits, but does not predict
+    ],
 )
-def test_an_effect_that_takes_away_too_little_is_not_what_is_missing(made, excess, explained, kind):
+def test_what_is_said_of_the_best_effect(made, start, excess, explained, gain, kept, kind):
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)
     nothing = problem.fit([((), None)], rounds=3)[0]
     fit = dataclasses.replace(nothing, effects=(effect("drag"),))
-    found = [Candidate(fit=fit, score=400.0, gain=400.0, explained=explained, kept=0.6)]
-    assert decide(problem, nothing, found, excess, Thresholds()).kind == kind
+    found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, kept=kept)]
+    assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
+
+
+def test_a_strained_belief_is_set_free_too(made):
+    twin, ensemble, record = made
+    problem = Problem(record(None), twin, ensemble=ensemble)
+    nothing = problem.fit([((), None)], rounds=1)[0]
+    assert not _freed(problem, library(), nothing)
+    ((chosen, begin),) = _freed(problem, library(), dataclasses.replace(nothing, point=np.array([3.5])))
+    assert [e.name for e in chosen] == ["modulus"]
+    assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
 
 
 def test_what_predicts_far_worse_than_another_is_not_believed(made):
@@ -304,7 +323,7 @@ def test_what_predicts_far_worse_than_another_is_not_believed(made):
             Candidate(fit=tether, score=480.0, kept=kept, **common),
             Candidate(fit=drag, score=460.0, kept=0.3, **common),
         ]
-        told = decide(problem, nothing, found, 1.5, Thresholds())
+        told = decide(problem, nothing, found, 1.5, Thresholds(), start=9.0)
         assert [c.fit.name for c in told.chosen] == [chosen]
 
 

@@ -231,6 +231,15 @@ def test_a_free_body_keeps_its_momentum_and_falls(trial):
     np.testing.assert_allclose(np.linalg.norm(edge, axis=-1), t.setup.size[0], rtol=0.01)
 
 
+def test_a_spin_that_was_left_out_is_one_that_is_believed(trial):
+    t = changed(trial, clamps=(), velocity=(0.0, 0.0, 0.0), duration=0.05)
+    effect = next(e for e in library() if type(e).__name__ == "InitialSpin")
+    twin = Twin(t.setup, edge=EDGE)
+    spun = effect(twin.scenario(t), torch.tensor([[0.0, 20.0, 5.0]], dtype=torch.float64), twin)
+    found = Ensemble(twin)([spun])[0].alone()
+    np.testing.assert_allclose(found.place, run(changed(t, angular_velocity=(0.0, 20.0, 5.0))).place, atol=1e-6)
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 def test_a_block_slides_as_far_as_friction_lets_it(trial, tilt):
     """On a plane, level or not, which is the same to the block if gravity is as steep to it."""
@@ -319,7 +328,7 @@ def test_a_variation_that_breaks_down_is_said_to_be_unsound(trial):
 
 @pytest.mark.parametrize("effect", library(), ids=lambda e: type(e).__name__)
 def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
-    free = type(effect).__name__ == "InitialTilt"
+    free = type(effect).__name__ in ("InitialTilt", "InitialSpin")
     load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
     stick = "stick" if type(effect).__name__ == "Slip" else 0.4
     t = hollow(

@@ -22,6 +22,7 @@ from torchsoro.sim2real.outer_effects import (
     Friction,
     GravityTilt,
     InitialMotion,
+    InitialSpin,
     InitialTilt,
     Leak,
     PressureGain,
@@ -36,6 +37,6 @@ def library() -> tuple[Hypothesis, ...]:
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness),
-        *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialTilt),
+        *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
     )
     return tuple(kind() for kind in kinds)

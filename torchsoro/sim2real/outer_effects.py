@@ -257,6 +257,23 @@ class InitialMotion(Hypothesis):
         return scenario.replace(velocity=scenario.velocity + values[:, None, :] * shape[:, None])
 
 
+class InitialSpin(Hypothesis):
+    """A free body turns at the start, or turns otherwise."""
+
+    name, seam, form = "initial_motion", "angular velocity at the start", LAW
+    quantities = tuple(Quantity(f"spin_{axis}", "rad/s", 0.5, -100.0, 100.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """About the body's centre."""
+        arms = twin.places - torch.tensor(twin.setup.center, dtype=torch.float64)
+        return scenario.replace(velocity=scenario.velocity + torch.linalg.cross(values[:, None], arms[None]))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a body that nothing holds."""
+        return not twin.held.any()
+
+
 class InitialTilt(Hypothesis):
     """A free body is turned at the start."""
 

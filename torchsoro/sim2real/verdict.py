@@ -49,23 +49,28 @@ class Thresholds:
     Attributes:
         alarm: Score and gain below which nothing is missing.
         margin: Of the score, within which two effects are not told apart: 2 % of what the best takes away.
-        quiet: Times what noise and numerics explain, below which nothing is missing if no effect is believed.
-        beyond: The same, above which the best effect leaves something.
+        quiet: Times what noise and numerics explain, without an effect, below which nothing is missing if none is
+            believed.
+        some: The same, above which an effect must take away ``part`` of it.
+        part: The least share of the misfit.
+        beyond: As ``quiet``, with the best effect, above which it leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
-        some: As ``beyond``, above which the best effect must take away ``part`` of the misfit.
-        part: The least share of one that is believed.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
+        noisy: The same where noise and numerics explain most and the gain is above ``sure``.
+        sure: Such a gain; without anything missing it has never been found.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
     """
 
     alarm: float = 40.0
     margin: float = 10.0
-    quiet: float = 1.8
-    beyond: float = 4.0
-    share: float = 0.8
+    quiet: float = 1.9
     some: float = 1.3
     part: float = 0.5
+    beyond: float = 4.0
+    share: float = 0.8
     lost: float = 0.85
+    noisy: float = 0.95
+    sure: float = 150.0
     worse: float = 1.3
 
 
@@ -161,6 +166,7 @@ def judge(
         tried.sort(key=lambda fit: fit.misfit)
         behind = tried[0].misfit + BEHIND * max(nothing.misfit - tried[0].misfit, 0.0)
         tasks = [(f.effects, f.point) for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
+    tasks += _freed(problem, effects, nothing)
     best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]])
     if best and best[0].misfit > FAR * best[0].samples and each < PAIRS * budget:
         left = best[0].misfit - best[0].samples
@@ -168,6 +174,7 @@ def judge(
         best = _best([*best, *pairs])
     believed = _within(problem, nothing)
     plain = rank(best, nothing, believed, problem.camera.deviations)
+    start = nothing.misfit / nothing.samples
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
     own = problem
     problem, nothing, fits = _priced(problem, nothing, best, report)
@@ -181,9 +188,21 @@ def judge(
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
-    verdict = decide(problem, nothing, found, excess, thresholds or Thresholds())
+    verdict = decide(problem, nothing, found, excess, thresholds or Thresholds(), start=start)
     shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
     return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
+
+
+def _freed(problem: Problem, effects: Sequence[Hypothesis], nothing: Fit) -> list[Task]:
+    """Where a belief is strained: what sets it free, which every other effect must do better than."""
+    found: list[Task] = []
+    for i, (common, tolerance) in enumerate(problem.common):
+        for effect in effects:
+            if type(effect) is type(common) and abs(nothing.point[i]) > BELIEVED:
+                rest = np.where(np.arange(len(nothing.point)) == i, 0.0, nothing.point)
+                strength = nothing.point[i] * tolerance / effect.quantities[0].scale
+                found.append(((effect,), np.append(rest, strength)))
+    return found
 
 
 def _looks(problem: Problem, nothing: Fit, effects: Sequence[Hypothesis]) -> list[tuple[float, Hypothesis, np.ndarray]]:
@@ -275,7 +294,9 @@ def _nothing(
 ) -> tuple[Problem, Fit]:
     """The fit without effects, and the problem with slips of markers where they explain most of what is left."""
     while True:
+        # What did well on the beginning of the trials may break down later.
         ends = [f for f in problem.fit(tasks, rounds=rounds) if f is not None]
+        ends = ends or [f for f in problem.fit([((), None)], rounds=rounds) if f is not None]
         if not ends:
             raise ValueError(BREAKS)
         nothing = min(ends, key=lambda fit: fit.misfit)
@@ -419,17 +440,31 @@ def _proved(
     return [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found], heldout
 
 
-def decide(problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: float, t: Thresholds) -> Verdict:
-    """The verdict on a ranking whose best leaves ``excess`` times what noise and numerics explain."""
+def decide(
+    problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: float, t: Thresholds, *, start: float
+) -> Verdict:
+    """The verdict on a ranking.
+
+    Args:
+        problem: That was fitted.
+        nothing: Without an effect.
+        found: Effects, best first.
+        excess: Times what noise and numerics explain that the best leaves.
+        t: What decides.
+        start: As ``excess``, without an effect.
+    """
     believed = [c for c in found if c.gain > t.alarm]
     if any(math.isfinite(c.kept) for c in found):
         least = min((c.kept for c in believed if math.isfinite(c.kept)), default=math.nan)
-        believed = [c for c in believed if c.kept <= min(t.lost, t.worse * least)]
+        # Where most of an error is noise, even the truth takes little of it away.
+        most = [t.noisy if start < t.some and c.gain > t.sure else t.lost for c in believed]
+        believed = [c for c, lost in zip(believed, most, strict=True) if c.kept <= min(lost, t.worse * least)]
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
-    if best is None or best.score < t.alarm:
-        return Verdict(kind="nothing_missing" if excess < t.quiet else "unknown_physics", **common)
-    if (excess > t.beyond and best.explained < t.share) or (excess > t.some and best.explained < t.part):
+    little = best is not None and start > t.some and best.explained < t.part
+    if best is None or best.score < t.alarm or little:
+        return Verdict(kind="nothing_missing" if start < t.quiet else "unknown_physics", **common)
+    if excess > t.beyond and best.explained < t.share:
         return Verdict(kind="unknown_physics", **common)
     close = tuple(c for c in believed if c.score > best.score - t.margin)
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
