@@ -74,6 +74,7 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
     faint = [c for c in single if c.strength < threshold]
     pairs = [c for c in cases if c.kind == "pair"]
     outside = [c for c in cases if c.kind == "outside"]
+    seen = [c for c in outside if c.strength >= 2 * threshold]
     committed = [c for c in strong if c.verdict in NAMED and len(c.names) == 1]
     spoke = [c for c in strong if c.verdict in SETS and c.set]
     right = [c for c in single if c.verdict in NAMED and c.truth[0] in c.names]
@@ -101,6 +102,8 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
         "  improved in ": str(Rate(hits=sum(r < 1 for r in sealed), of=len(sealed))),
         "outside the library: unknown (>= 60 %)": str(rate(outside, lambda c: c.unknown)),
         "  wrong confident name (<= 20 %)": str(rate(outside, lambda c: c.verdict in NAMED)),
+        "  unknown, strong": str(rate(seen, lambda c: c.unknown)),
+        "  wrong confident name, strong": str(rate(seen, lambda c: c.verdict in NAMED)),
         "pairs: one name right": str(rate(pairs, lambda c: any(n in c.names for n in c.truth))),
         "  both right": str(rate(pairs, lambda c: set(c.truth) <= set(c.names))),
         "fainter than the threshold: nothing, or the truth": str(
@@ -171,7 +174,7 @@ def check(batch: Path) -> dict[str, Any]:
 
 def score(
     batch: Path, /, *, answers: tuple[str, ...], threshold: float = 1.0, rename: Path | None = None,
-    out: Path | None = None,
+    asked: bool = False, out: Path | None = None,
 ) -> dict[str, dict[str, str]]:  # fmt: skip
     """Print the tables.
 
@@ -180,6 +183,7 @@ def score(
         answers: Folders of answers, each as NAME=FOLDER or FOLDER.
         threshold: Strength at which an effect can just be seen.
         rename: JSON {"effects": {theirs: ours}, "parameters": {"effect": {theirs: ours}}} for other vocabularies.
+        asked: Leave out what no answer was written for, as of a tool that was not asked for all.
         out: JSON file for the tables and every case.
 
     Returns:
@@ -190,12 +194,15 @@ def score(
     found: dict[str, list[Scored]] = {}
     for item in answers:
         label, _, folder = item.rpartition("=")
-        found[label or Path(folder).name] = [match(t, Path(folder), batch, words) for t in truth["cases"]]
+        cases = [match(t, Path(folder), batch, words) for t in truth["cases"]]
+        found[label or Path(folder).name] = [c for c in cases if not asked or c.verdict != "missing"]
     tables = {label: table(cases, threshold) for label, cases in found.items()}
     rows = next(iter(tables.values()))
     width = max(map(len, rows))
     columns = [max(len(label), *(len(v) for v in rows.values())) for label, rows in tables.items()]
     print(f"{len(truth['cases'])} cases, batch {truth['batch']}, strong: at least {2 * threshold:g}")
+    if asked:
+        print("answered: " + ", ".join(f"{label} {len(cases)}" for label, cases in found.items()))
     print("  ".join(["".ljust(width), *(label.ljust(w) for label, w in zip(tables, columns, strict=True))]))
     for row in rows:
         cells = [t[row].ljust(w) for t, w in zip(tables.values(), columns, strict=True)]
