@@ -383,6 +383,16 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     model.write_text(model.read_text().replace('name = "drag"', 'name = "wind"'))
     with pytest.raises(ValueError, match=r"name = 'wind', wanted one of"):
         read_model(model)
+    # Some effects share a name.
+    before = model.read_text().split("[[effect]]")[0]
+    for e in library():
+        numbers = "".join(f"{q.name} = 0.1\n" for q in e.quantities) + "at = [0.0, 0.0, 0.0]\n" * e.local
+        model.write_text(f'{before}[[effect]]\nname = "{e.name}"\n{numbers}')
+        ((told, _),) = read_model(model).effects
+        assert type(told) is type(e)
+    model.write_text(f'{before}[[effect]]\nname = "friction"\nmu = 0.3\n')
+    with pytest.raises(ValueError, match="friction has name, mu, wanted inverse_coefficient or ln_factor"):
+        read_model(model)
 
 
 def test_what_no_effect_explains_bends_no_clock(made):

@@ -112,17 +112,22 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     wanted = {"edge", "walls", "across", "ln_modulus", "ln_pressure"}
     if not isinstance(numbers, dict) or set(numbers) != wanted:
         raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
-    known = {e.name: e for e in (library() if effects is None else effects)}
+    known: dict[str, list[Hypothesis]] = {}
+    for effect in library() if effects is None else effects:
+        known.setdefault(effect.name, []).append(effect)
     found = []
     for row in rows:
-        effect = known.get(row.get("name"))
-        if effect is None:
+        alike = known.get(row.get("name"), [])
+        if not alike:
             raise ValueError(f"{path}: [[effect]] name = {row.get('name')!r}, wanted one of {', '.join(known)}")
-        names = [q.name for q in effect.quantities]
-        if set(row) - {"name", "at"} != set(names) or ("at" in row) != effect.local:
-            wants = [*names, *(["at"] if effect.local else [])]
-            raise ValueError(f"{path}: [[effect]] {effect.name} has {', '.join(row)}, wanted {', '.join(wants)}")
-        found.append((effect, np.array([*(row[name] for name in names), *row.get("at", [])], dtype=float)))
+        # Some share a name, as friction of planes that were thought to stick and of others.
+        wants = [[*(q.name for q in e.quantities), *(["at"] if e.local else [])] for e in alike]
+        fits = [e for e, names in zip(alike, wants, strict=True) if set(row) - {"name"} == set(names)]
+        if not fits:
+            wanted = " or ".join(", ".join(names) for names in wants)
+            raise ValueError(f"{path}: [[effect]] {row['name']} has {', '.join(row)}, wanted {wanted}")
+        names = [q.name for q in fits[0].quantities]
+        found.append((fits[0], np.array([*(row[name] for name in names), *row.get("at", [])], dtype=float)))
     return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **numbers)
 
 

@@ -48,7 +48,7 @@ class Thresholds:
 
     Attributes:
         alarm: Score and gain below which nothing is missing.
-        margin: Of the score, within which two effects are not told apart: 2 % of what the best takes away.
+        margin: Of the score, within which two effects are not told apart: odds of twenty to one.
         quiet: Times what noise and numerics explain, without an effect, below which nothing is missing if none is
             believed.
         some: The same, above which an effect must take away ``part`` of it.
@@ -62,7 +62,7 @@ class Thresholds:
     """
 
     alarm: float = 40.0
-    margin: float = 10.0
+    margin: float = 3.0
     quiet: float = 1.9
     some: float = 1.3
     part: float = 0.5
