@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -384,7 +385,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"name = 'wind', wanted one of"):
         read_model(model)
     # Some effects share a name.
-    before = model.read_text().split("[[effect]]")[0]
+    before = re.sub(r"(?s)\[\[effect\]\]\n.*?(?=\n\[|$)", "", model.read_text()).rstrip() + "\n"
     for e in library():
         numbers = "".join(f"{q.name} = 0.1\n" for q in e.quantities) + "at = [0.0, 0.0, 0.0]\n" * e.local
         model.write_text(f'{before}[[effect]]\nname = "{e.name}"\n{numbers}')
