@@ -191,9 +191,9 @@ def body_of(mesh: Mesh) -> GpuMesh:
     surface[mesh.surface] = True
     filled = (np.diff(begin) * nodes + np.arange(nodes)).astype(i32)
     node = (mesh.held, surface, mesh.places, mesh.front, spread.astype(i32), slots, filled)
-    on_walls = (wall_begin, _some(wall_of[wall_entry].astype(i32)), _some(mesh.wall_value[wall_entry, 0].astype(f32)))
+    on_walls = (wall_begin, wall_of[wall_entry].astype(i32), mesh.wall_value[wall_entry, 0].astype(f32))
     wall = (mesh.wall_begin, mesh.wall_node, mesh.wall_value, mesh.wall_place, mesh.wall_axis, mesh.wall_area)
-    wall = tuple(_some(a.astype(i32 if a.dtype.kind == "i" else f32)) for a in (*wall, mesh.wall_chamber))
+    wall = tuple(a.astype(i32 if a.dtype.kind == "i" else f32) for a in (*wall, mesh.wall_chamber))
     mark = (mesh.mark_begin.astype(i32), mesh.mark_node.astype(i32), mesh.mark_value)
     shape = (mesh.weights, mesh.slopes, mesh.cells.astype(i32), mesh.corners.astype(i32))
     return GpuMesh(
@@ -230,9 +230,6 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
     def single(get, kind: type) -> np.ndarray:
         return np.repeat(np.array([get(c) for c in cases], kind), used)
 
-    def moving(a: np.ndarray) -> np.ndarray:  # [n, 3, 16] of nodes that move, components first
-        return np.swapaxes(a, 0, 1)
-
     elements, chambers, tied = len(first.series) // 64, first.supply.shape[1], len(first.springs)
     assert chambers + 3 * tied <= SHARED
     longest = max(len(c.supply) for c in cases)
@@ -251,7 +248,7 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
             pushes[mine, k], starts[mine, k] = c.push[k].T[:n], c.push_start[k][:n]
         for node, number, share in zip(c.spring_node, c.spring_number, c.spring_share, strict=True):
             ties[mine, number, node] += share[:n]
-    d, v = (each(lambda c, a=a: moving(getattr(c, a))) * ~body.held for a in ("place", "velocity"))
+    d, v = (each(lambda c, a=a: np.swapaxes(getattr(c, a), 0, 1)) * ~body.held for a in ("place", "velocity"))
     case = (
         single(lambda c: c.dt, f32),
         single(lambda c: c.steps, np.int32),
@@ -265,7 +262,7 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
         each(lambda c: c.fluid),
         supply,
         each(lambda c: c.air),
-        _some(first.volume),
+        first.volume,
         pushed,
         pushes,
         starts,
@@ -276,7 +273,7 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
         each(lambda c: c.adhesion),
         each(lambda c: c.reach),
     )
-    planes = (_some(first.normals.astype(f32)), first.stick, first.area)
+    planes = (first.normals.astype(f32), first.stick, first.area)
     flags = (any(c.stiffens for c in cases), any(c.softens for c in cases))
     return _run(body, planes, case, (d, v), elements, flags, (count, samples, markers, 5, 3))
 
@@ -286,10 +283,9 @@ def _run(
 ) -> np.ndarray:
     """Launch: what is on the host goes to the GPU, samples come back."""
     points, nodes, walls, _ = body.count
-    rooms = ((elements, 6, points), (9, points), (3, nodes * body.most), (4, walls))
-    free = [*_there(start), *(cuda.device_array((shape[0], *room), f32) for room in rooms)]
-    if elements:
-        free[2].copy_to_device(np.zeros(free[2].shape, f32))
+    history = np.zeros((shape[0], elements, 6, points), f32)
+    rooms = ((9, points), (3, nodes * body.most), (4, walls))
+    free = [*_there((*start, history)), *(cuda.device_array((shape[0], *room), f32) for room in rooms)]
     out = cuda.to_device(np.zeros(shape, f32))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # that there are few blocks
@@ -314,8 +310,3 @@ def _by_node(node: np.ndarray, nodes: int) -> tuple[np.ndarray, np.ndarray]:
     """Entries of each node: where they begin [n + 1], and their numbers."""
     begin = np.concatenate([[0], np.cumsum(np.bincount(node, minlength=nodes))])
     return begin.astype(np.int32), np.argsort(node, kind="stable").astype(np.int32)
-
-
-def _some(a: np.ndarray) -> np.ndarray:
-    """An array that has something in it, as a GPU asks for."""
-    return a if a.size else np.zeros([max(n, 1) for n in a.shape], a.dtype)
