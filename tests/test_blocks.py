@@ -43,16 +43,16 @@ def varied(trial: Trial, duration: float, edge: float, gap: float = 1e-4) -> lis
     return found
 
 
-def check(bodies: list[tuple[Twin, list[Scenario]]], duration: float, far: float) -> int:
-    """Compare; returns how many variations were."""
+def check(bodies: list[tuple[Twin, list[Scenario]]], far: float) -> int:
+    """Compare velocities, and what differs less; returns how many variations were."""
     count = 0
     for twin, scenarios in bodies:
         known, found = (Ensemble(twin, 1, there)(scenarios) for there in ("cpu", "cuda"))
         for one, other in zip(known, found, strict=True):
             assert one.dt == other.dt
-            np.testing.assert_allclose(other.place, one.place, atol=far * duration, rtol=0)
+            np.testing.assert_allclose(other.place, one.place, atol=far / 100, rtol=0)
             np.testing.assert_allclose(other.velocity, one.velocity, atol=far, rtol=0)
-            np.testing.assert_allclose(other.gradient, one.gradient, atol=far, rtol=0)
+            np.testing.assert_allclose(other.gradient, one.gradient, atol=far / 10, rtol=0)
             count += len(one.place)
     return count
 
@@ -64,9 +64,9 @@ def stretched(folder: Path) -> Trial:
 
 def test_on_a_gpu(tmp_path, cuda):
     far = varied(stretched(tmp_path), 0.1, EDGE, gap=1.0)
-    assert check(far, 0.1, 1e-3) > 40
+    assert check(far, 1e-3) > 40
     near = varied(stretched(tmp_path), 2 * SAMPLE, EDGE)
-    assert check(near, 2 * SAMPLE, 1e-2) > 40  # bodies bounce and slip, where rounding grows
+    assert check(near, 1e-4) > 40
 
 
 def test_on_a_simulated_gpu():
@@ -95,7 +95,7 @@ def simulated(folder: Path) -> int:
                 scales = [q.scale for q in effect.quantities] + [0.1 * s for s in trial.setup.size] * effect.local
                 whole = effect(whole, torch.tensor(0.2 * values * scales), twin)
         bodies.append((twin, [scenarios[0], whole]))
-    return check(bodies, SAMPLE, 1e-5)
+    return check(bodies, 1e-5)
 
 
 if __name__ == "__main__":

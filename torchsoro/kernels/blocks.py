@@ -107,7 +107,7 @@ def _march(mesh, wall, mark, node, plane, case, room, stiffens, softens, out):
                     f1 -= pressure * areas[1, w]
                     f2 -= pressure * areas[2, w]
                 for k in range(pushes.shape[1]):
-                    if f32(t) * dt >= starts[b, k]:
+                    if t >= starts[b, k]:
                         share = pushed[b, k, n]
                         f0 -= share * pushes[b, k, 0]
                         f1 -= share * pushes[b, k, 1]
@@ -236,7 +236,7 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
     most = max(len(c.push_begin) - 1 for c in cases)
     supply = np.zeros((count, longest, chambers), f32)
     pushed, pushes = np.zeros((count, most, nodes), f32), np.zeros((count, most, 3), f32)
-    starts, ties = np.full((count, most), np.inf, f32), np.zeros((count, tied, nodes), f32)
+    starts, ties = np.zeros((count, most), np.int32), np.zeros((count, tied, nodes), f32)
     at = 0
     for c, n in every_case:
         mine = slice(at, at + n)
@@ -245,7 +245,7 @@ def march_all(body: GpuMesh, cases: Sequence[Case], used: Sequence[int], samples
         for k in range(len(c.push_begin) - 1):
             span = slice(c.push_begin[k], c.push_begin[k + 1])
             np.add.at(pushed[mine, k].T, c.push_node[span], c.push_share[span, None])
-            pushes[mine, k], starts[mine, k] = c.push[k].T[:n], c.push_start[k][:n]
+            pushes[mine, k], starts[mine, k] = c.push[k].T[:n], c.push_start[k]
         for node, number, share in zip(c.spring_node, c.spring_number, c.spring_share, strict=True):
             ties[mine, number, node] += share[:n]
     d, v = (each(lambda c, a=a: np.swapaxes(getattr(c, a), 0, 1)) * ~body.held for a in ("place", "velocity"))

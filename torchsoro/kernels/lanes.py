@@ -95,7 +95,7 @@ class Case(NamedTuple):
         push_node: Node of each entry.
         push_share: Its share of the force.
         push: Forces [G, 3, 16].
-        push_start: When they begin [G, 16].
+        push_start: Substep at which they begin [G].
         spring_node: Nodes of springs [R].
         spring_share: Of each, for each lane [R, 16].
         spring_number: Number of the spring [R].
@@ -191,11 +191,12 @@ def _walls(mesh, case, t, d, f, swept, normals, pressure, room):
 @fast
 def _attached(case, t, d, f, push, stretch):
     """Dead forces and springs."""
-    now = f32(t * case.dt)
     for g in range(len(case.push_begin) - 1):
+        if t < case.push_start[g]:
+            continue
         for c in range(3):
             for lane in range(16):
-                push[16 * c + lane] = case.push[g, c, lane] if now >= case.push_start[g, lane] else f32(0)
+                push[16 * c + lane] = case.push[g, c, lane]
         for k in range(case.push_begin[g], case.push_begin[g + 1]):
             at, share = 48 * case.push_node[k], case.push_share[k]
             o = f[at : at + 48]

@@ -170,7 +170,7 @@ class Ensemble:
             times = torch.arange(steps, dtype=torch.float64) * dt
             for k, ((_, b), s) in enumerate(zip(full, told, strict=True)):
                 supply[:, :, k] = _pressure(s.pressure, b).at(times).T.numpy()
-        pushes = _pushes(full, told)
+        pushes = _pushes(full, told, dt)
         springs = [lanes(lambda s, i=i: s.springs[i].share, 1) for i in range(len(first.springs))]
         where = [np.flatnonzero(share.any(-1)) for share in springs]
         empty = np.zeros(0, np.int64)
@@ -254,7 +254,7 @@ def _pressure(supply: Waveform | None, number: int) -> Waveform:
     return Waveform(time=supply.time.double(), pressure=p.double())
 
 
-def _pushes(full: Sequence[Lane], told: Sequence[Scenario]) -> dict[str, np.ndarray]:
+def _pushes(full: Sequence[Lane], told: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
     """Forces of each scenario in its own lanes."""
     begin, nodes, shares, forces, starts = [0], [], [], [], []
     for number in dict.fromkeys(i for i, _ in full):
@@ -269,14 +269,15 @@ def _pushes(full: Sequence[Lane], told: Sequence[Scenario]) -> dict[str, np.ndar
                 f = push.force
                 force[:, k] = f[full[k][1] if f.shape[0] > 1 else 0].numpy() if f.ndim > 1 else f.numpy()
             forces.append(force)
-            starts.append(np.full(LANES, push.start, np.float32))
+            # One that begins at a step does, however that is rounded.
+            starts.append(math.ceil(push.start / dt - 1e-3))
     none = np.zeros(0)
     return {
         "push_begin": np.array(begin),
         "push_node": np.concatenate([none, *nodes]).astype(np.int64),
         "push_share": np.concatenate([none, *shares]).astype(np.float32),
         "push": np.array(forces, np.float32).reshape(-1, 3, LANES),
-        "push_start": np.array(starts, np.float32).reshape(-1, LANES),
+        "push_start": np.array(starts, np.int64),
     }
 
 
