@@ -19,6 +19,9 @@ from torchsoro.sim2real.twin import Motion
 
 STEP = 0.05  # of a scale, for differences
 STIFF = 1e-3  # damping of the step without a trial: what the others hardly tell stays as it was
+WEAK = 0.2  # of a look, at which effects are looked at too, since what is weak may be lost in what is not linear
+FAR = 8.0  # times a look of an effect whose parameters add up, up to which strength
+REACH = 1.5  # times a look that is taken for linear, up to which strength
 FIRST = 0.5  # the longest step of a search, in shares of what is there plus two scales
 
 Search = Generator[Request, list[Motion], "Point | None"]
@@ -104,17 +107,22 @@ class Problem(Likelihood):
             For each, its looks, best first: the misfit that it would leave, and the point to begin a search with, in
             scales. Looks that break down are left out.
         """
-        looks = [effect.looks(self.twin) for effect in effects]
+        weak = [[] if e.joint else e.weak(self.twin, WEAK) for e in effects]
+        looks = [[*w, *e.looks(self.twin)] for w, e in zip(weak, effects, strict=True)]
         requests = [
             ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in mine]))
             for e, mine in zip(effects, looks, strict=True)
         ]
         simulated = self.simulate(requests)
-        return [self._rank(e, mine, motions, base) for e, mine, motions in zip(effects, looks, simulated, strict=True)]
+        return [
+            self._rank(e, mine, len(w), motions, base)
+            for e, mine, w, motions in zip(effects, looks, weak, simulated, strict=True)
+        ]
 
     def _rank(
-        self, effect: Hypothesis, looks: list[np.ndarray], motions: list[Motion], base: Point
+        self, effect: Hypothesis, looks: list[np.ndarray], weak: int, motions: list[Motion], base: Point
     ) -> list[tuple[float, np.ndarray]]:
+        """As :meth:`look`, of one effect; the first ``weak`` of its looks are weak ones."""
         low, high = self.bounds((effect,))
         count, kinds = len(self.common), len(effect.quantities)
         held = np.array([isinstance(e, type(effect)) for e, _ in self.common])
@@ -134,7 +142,7 @@ class Problem(Likelihood):
                 common[i] = 0.0
             left = float(((target - H @ x) ** 2).sum())
             ranked.append((left, np.clip(np.concatenate([common, strength]), low, high)))
-        for directions in looks:
+        for number, directions in enumerate(looks):
             n = len(directions)
             mine = range(at, at + n)
             at += n
@@ -142,9 +150,10 @@ class Problem(Likelihood):
                 continue
             left = [self.residual([m.alone(k) for m in motions], base.errors)[0] for k in mine]
             slopes = np.stack([base.r - r for r in left], 1)
-            if effect.joint:
+            if effect.joint or number < weak:
                 # What adds up: any strength within bounds.
-                begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:])
+                far = FAR if effect.joint else REACH / WEAK
+                begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:], far)
                 offset = np.zeros(n)
             else:
                 begin, reach, offset = left[0], (np.array([-0.5]), np.array([0.5])), np.ones(1)
@@ -377,14 +386,14 @@ def _marks(effect: Hypothesis) -> list[bool]:
     return [False] * len(effect.quantities) + [True] * (3 * effect.local)
 
 
-def _reach(directions: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far directions may be scaled within bounds, and within eight times themselves."""
+def _reach(directions: np.ndarray, low: np.ndarray, high: np.ndarray, far: float) -> tuple[np.ndarray, np.ndarray]:
+    """How far directions may be scaled within bounds, and up to ``far`` times themselves."""
     least, most = [], []
     for d in directions:
         k = int(np.flatnonzero(d)[0])
         ends = sorted((low[k] / d[k], high[k] / d[k]))
-        least.append(max(ends[0], -8.0))
-        most.append(min(ends[1], 8.0))
+        least.append(max(ends[0], -far))
+        most.append(min(ends[1], far))
     return np.array(least), np.array(most)
 
 

@@ -110,6 +110,24 @@ class Hypothesis(nn.Module):
             return alternatives
         return [np.concatenate([a, np.tile(p, (len(a), 1))], 1) for p in _places(twin) for a in alternatives]
 
+    def weak(self, twin: Twin, strength: float) -> list[np.ndarray]:
+        """Looks that are so weak that the motion changes in proportion; of those that differ in strength only, one.
+
+        Args:
+            twin: The body.
+            strength: Of the looks, in their own.
+        """
+        kinds = len(self.quantities)
+        # What has no end at zero, as the logarithm of a time, is a form and no strength.
+        form = np.array([q.least < 0 for q in self.quantities]) & (np.arange(kinds) > 0)
+        shrink = np.concatenate([np.where(form & ~self.joint, 1.0, strength), np.ones(3 * self.local)])
+        if self.joint:
+            return [d * shrink for d in self.looks(twin)]
+        found: dict[bytes, np.ndarray] = {}
+        for d in sorted(self.looks(twin), key=lambda d: abs(d[0, 0])):
+            found.setdefault(np.where(shrink == 1, d[0], 0.0).tobytes(), d * shrink)
+        return list(found.values())
+
 
 def _places(twin: Twin) -> list[np.ndarray]:
     """Along the middle of the body's longest edge, beginning well off a clamp; in tenths of its size."""

@@ -160,19 +160,13 @@ def _looks(effect: Hypothesis, problem: Problem) -> list[np.ndarray]:
     An effect that grows from nothing is known by a weak one. One that begins at some strength, as sliding on a plane
     does, is looked at there, too.
     """
-    kinds = len(effect.quantities)
-    # What has no end at zero, as the logarithm of a time, is a form and no strength.
-    form = np.array([q.least < 0 for q in effect.quantities]) & (np.arange(kinds) > 0)
-    shrink = np.concatenate([np.where(form & ~effect.joint, 1.0, SMALL), np.ones(3 * effect.local)])
-    known = effect.looks(problem.twin)
+    weak = effect.weak(problem.twin, SMALL)
     if effect.joint:  # of many places, every other
-        return [d * shrink for d in known[:: -2 if effect.local else 1]]
-    known = sorted(known, key=lambda d: abs(d[0, 0]))
-    weak: dict[bytes, np.ndarray] = {}
-    for d in known:
-        weak.setdefault(np.where(shrink == 1, d[0], 0.0).tobytes(), d * shrink)
-    smooth = effect.local or kinds > 1 or not problem.scenarios[0].grounds
-    return [*weak.values(), *([] if smooth else [known[0], known[-1]])]
+        return weak[:: -2 if effect.local else 1]
+    if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].grounds:
+        return weak
+    known = sorted(effect.looks(problem.twin), key=lambda d: abs(d[0, 0]))
+    return [*weak, known[0], known[-1]]
 
 
 def _response(effect: Hypothesis, looks: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
