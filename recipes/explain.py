@@ -52,7 +52,7 @@ class Options:
     trial: Path | None = None
     """The trial.toml to predict; with a pressure.csv beside it where the body has a chamber."""
     budget: float = 20.0
-    """Time that the explanation may take, about [minutes]; sets how fine the twin is."""
+    """Time that the explanation may take on two cores, about [minutes]; sets how fine the twin is, on any machine."""
     edge: float = 0.0
     """Edge of the twin's cells [m] instead."""
     walls: int = WALLS

@@ -77,9 +77,10 @@ def made(tmp_path_factory):
     twin = Twin(found.setup, edge=EDGE, across=2)
     ensemble = Ensemble(twin)
 
-    def record(name: str | None, values=()) -> Experiment:
+    def record(name: str | None, values=(), **change) -> Experiment:
         rng, trials = np.random.default_rng(1), []
         for k, trial in enumerate((found.trials[0], loud)):
+            trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
             scenario = twin.scenario(trial)
             if name is not None:
                 scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), twin)
@@ -205,6 +206,18 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
     (one,) = predict(problem, fit, recorded.trials[1:])
     (other,) = predict(problem, fit, recorded.trials[1:], believed=True)
     assert one.total < 0.3 * other.total
+
+
+def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
+    twin, ensemble, record = made
+    recorded = record("attached_mass", (0.002, 0.05, 0.01, 0.02), gravity=(9.81, 0.0, 0.0))
+    problem = Problem(recorded, twin, trials=recorded.trials, ensemble=ensemble)
+    (ranked,) = problem.look([effect("attached_mass")], problem.base())
+    _, start = ranked[0]
+    assert start[-3:] / 10 * twin.setup.size == pytest.approx((0.05, 0.01, 0.02), abs=0.006)
+    (fit,) = problem.fit([((effect("attached_mass"),), start)])
+    assert fit is not None and fit.misfit / fit.samples == pytest.approx(1.0, abs=0.35)
+    assert fit.values[0] == pytest.approx((0.002, 0.05, 0.01, 0.02), rel=0.3, abs=0.003)
 
 
 def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
@@ -339,6 +352,12 @@ def test_a_finer_twin_corrects_where_one_is(made):
     for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
         assert np.abs(motion.place - right.place).max() < 1e-7
     assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_refused(made):
+    with pytest.raises(ValueError, match="device = 'cuda'"):
+        Ensemble(made[0], device="cuda")
 
 
 # The whole --------------------------------------------------------------------------------------------------------

@@ -36,12 +36,17 @@ class Ensemble:
 
     Attributes:
         room: Variations that take no longer than one.
+
+    Raises:
+        ValueError: for "cuda" without a GPU that Numba can use.
     """
 
     def __init__(self, twin: Twin, threads: int = THREADS, device: str = "auto") -> None:
+        there = device != "cpu" and blocks.available()
+        if device == "cuda" and not there:
+            raise ValueError("device = 'cuda': no GPU with CUDA that numba-cuda can use; wanted 'cpu', 'auto', or one")
         self.twin, self.threads, self.device = twin, threads, device
         self.mesh = mesh_of(twin)
-        there = device == "cuda" or (device == "auto" and blocks.available())
         self.body = blocks.body_of(self.mesh) if there else None
         self.room = blocks.ROOM if there else LANES * threads
         grid = twin.grid

@@ -107,22 +107,23 @@ class Problem(Likelihood):
             For each, its looks, best first: the misfit that it would leave, and the point to begin a search with, in
             scales. Looks that break down are left out.
         """
-        weak = [[] if e.joint else e.weak(self.twin, WEAK) for e in effects]
-        looks = [[*w, *e.looks(self.twin)] for w, e in zip(weak, effects, strict=True)]
+        linear = [e.looks(self.twin) if e.joint else e.weak(self.twin, WEAK) for e in effects]
+        linear = [[e.around(d, self.twin) for d in mine] for e, mine in zip(effects, linear, strict=True)]
+        looks = [mine if e.joint else mine + e.looks(self.twin) for e, mine in zip(effects, linear, strict=True)]
         requests = [
             ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in mine]))
             for e, mine in zip(effects, looks, strict=True)
         ]
         simulated = self.simulate(requests)
         return [
-            self._rank(e, mine, len(w), motions, base)
-            for e, mine, w, motions in zip(effects, looks, weak, simulated, strict=True)
+            self._rank(e, mine, len(adding), motions, base)
+            for e, mine, adding, motions in zip(effects, looks, linear, simulated, strict=True)
         ]
 
     def _rank(
-        self, effect: Hypothesis, looks: list[np.ndarray], weak: int, motions: list[Motion], base: Point
+        self, effect: Hypothesis, looks: list[np.ndarray], linear: int, motions: list[Motion], base: Point
     ) -> list[tuple[float, np.ndarray]]:
-        """As :meth:`look`, of one effect; the first ``weak`` of its looks are weak ones."""
+        """As :meth:`look`, of one effect; the first ``linear`` of its looks add up."""
         low, high = self.bounds((effect,))
         count, kinds = len(self.common), len(effect.quantities)
         held = np.array([isinstance(e, type(effect)) for e, _ in self.common])
@@ -150,8 +151,8 @@ class Problem(Likelihood):
                 continue
             left = [self.residual([m.alone(k) for m in motions], base.errors)[0] for k in mine]
             slopes = np.stack([base.r - r for r in left], 1)
-            if effect.joint or number < weak:
-                # What adds up: any strength within bounds.
+            if number < linear:
+                # Any strength within bounds.
                 far = FAR if effect.joint else REACH / WEAK
                 begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:], far)
                 offset = np.zeros(n)
@@ -182,7 +183,8 @@ class Problem(Likelihood):
             for i in np.flatnonzero(held):  # the effect takes over what the belief held
                 strength[0] += common[i] * self.common[i][1] / effect.quantities[0].scale
                 common[i] = 0.0
-            start = np.concatenate([common, strength, directions[0, kinds:]])
+            share = np.abs(x[:n]) + 1e-9
+            start = np.concatenate([common, strength, share @ directions[:, kinds:] / share.sum()])
             ranked.append((cost, np.clip(start, low, high)))
         return sorted(ranked, key=lambda look: look[0])
 

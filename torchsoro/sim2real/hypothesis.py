@@ -54,6 +54,7 @@ class Hypothesis(nn.Module):
         local: Whether it acts at a place, which is then inferred along with them.
         starts: Strengths to look at first, in scales: alternatives, or, if ``joint``, one of each parameter.
         joint: Whether the parameters add up, as components of a vector do.
+        weight: Number of the parameter, if any, whose weight bends a body that it hangs on off the middle.
         form: Share of a parameter that stays unknown, as nature's form of the effect is not the hypothesis': small for
             a number that a body has, larger for one that stands for a law.
     """
@@ -64,6 +65,7 @@ class Hypothesis(nn.Module):
     local: ClassVar[bool] = False
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
+    weight: ClassVar[int | None] = None
     form: ClassVar[float] = 0.1
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
@@ -127,6 +129,21 @@ class Hypothesis(nn.Module):
         for d in sorted(self.looks(twin), key=lambda d: abs(d[0, 0])):
             found.setdefault(np.where(shrink == 1, d[0], 0.0).tobytes(), d * shrink)
         return list(found.values())
+
+    def around(self, look: np.ndarray, twin: Twin) -> np.ndarray:
+        """A look of a local effect [D, K], with its weight on the sides of the body as well [D + 4, K]."""
+        if self.weight is None:
+            return look
+        s, kinds = twin.setup, len(self.quantities)
+        longest = int(np.argmax(s.size))
+        row = look[np.flatnonzero(look[:, self.weight])[0]]
+        rows = [look]
+        for axis in (a for a in range(3) if a != longest):
+            for side in (s.origin[axis], s.origin[axis] + s.size[axis]):
+                aside = row.copy()
+                aside[kinds + axis] = 10 * side / s.size[axis]
+                rows.append(aside[None])
+        return np.concatenate(rows)
 
 
 def _places(twin: Twin) -> list[np.ndarray]:

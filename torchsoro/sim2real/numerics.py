@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchsoro.sim2real.ensemble import SAFETY, THREADS, Ensemble
+from torchsoro.sim2real.ensemble import SAFETY, Ensemble
 from torchsoro.sim2real.experiment import Experiment, Setup, Trial
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.likelihood import BREAKS, added
@@ -18,6 +18,7 @@ from torchsoro.sim2real.residual import Priors
 from torchsoro.sim2real.twin import Motion, Twin
 
 SPEED = 6e7  # points times variations times steps in a second of a thread
+CORES = 2  # that a budget is meant for, wherever it is spent: the twin, and the answer, are the same everywhere
 WALLS = 1  # cells through each wall, at least; each bends by itself
 SIMULATIONS = 400  # that an explanation takes for each trial
 SURE = 1.5  # times the differences that were seen
@@ -47,13 +48,13 @@ class Numerics:
 
 
 def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
-    """Seconds that an explanation takes, about."""
+    """Seconds that an explanation takes on two cores, about."""
     s = twin.setup
     speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
     factor = math.sqrt(1 + sum(g for g, _ in s.prony) / 2)
     steep = math.sqrt(max(a.steep for a in twin.grid.axes))
     steps = s.duration * steep * speed * factor / (2 * SAFETY)
-    return twin.count * steps * trials * simulations / SPEED / THREADS
+    return twin.count * steps * trials * simulations / SPEED / CORES
 
 
 def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS) -> Twin:
@@ -62,7 +63,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     Args:
         setup: Of the experiment.
         trials: To simulate.
-        budget: [s].
+        budget: On two cores [s].
         walls: Cells through each wall, at least.
 
     Raises:
@@ -97,7 +98,7 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
         walls, across = math.ceil(share * twin.walls), math.ceil(share * least)
         fine = Twin(twin.setup, edge=twin.edge / share, walls=walls, across=across)
         # A group of lanes takes as long with one trial as with sixteen.
-        if cost(fine, trials, 16 / trials * THREADS) <= seconds:
+        if cost(fine, trials, 16 / trials * CORES) <= seconds:
             break
     return fine
 

@@ -153,7 +153,7 @@ class Friction(Hypothesis):
 
     name, seam = "friction", "friction of the planes"
     quantities = (Quantity("ln_factor", "1", 0.1, -40.0, 40.0),)
-    starts = ((2.0,), (-2.0,), (6.0,), (-6.0,), (-15.0,))
+    starts = ((2.0,), (-2.0,), (6.0,), (-6.0,), (11.0,), (-15.0,))
 
     def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The coefficient."""

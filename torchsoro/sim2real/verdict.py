@@ -66,7 +66,7 @@ class Thresholds:
     quiet: float = 1.9
     some: float = 1.3
     part: float = 0.5
-    beyond: float = 4.0
+    beyond: float = 2.0
     share: float = 0.8
     lost: float = 0.85
     noisy: float = 0.95
