@@ -1,23 +1,34 @@
 """What the threads of a block do for a variation of a body on a GPU: stress at points, forces of cells, walls, planes.
 
-As :mod:`lane_cells`, whose laws these are, and :mod:`lanes`, for one variation.
+As :mod:`lane_cells`, whose laws of stress these are, and :mod:`lanes`, for one variation.
 """
 
 from __future__ import annotations
 
 import math
+from types import FunctionType
 from typing import Any
 
 import numba.cuda
 
 from torchsoro.kernels import lane_cells
-from torchsoro.kernels.lane_cells import CRUSHED, f32
+from torchsoro.kernels.lane_cells import f32
 
 cuda: Any = numba.cuda  # its types are those of the host
 _device = cuda.jit(device=True, fastmath=True)
-_at_least, _logarithm, _shrinkage = (
-    _device(f.py_func) for f in (lane_cells.at_least, lane_cells.logarithm, lane_cells.shrinkage)
-)
+
+
+def _laws() -> dict[str, Any]:
+    """Stress at a point as in :mod:`lane_cells`, for a GPU: the same functions, which call each other there."""
+    found: dict[str, Any] = {}
+    for law in ("at_least", "logarithm", "shrinkage", "pull_back", "piola"):
+        body = getattr(lane_cells, law).py_func
+        found[law] = _device(FunctionType(body.__code__, {**body.__globals__, **found}, law))
+    return found
+
+
+_law = _laws()
+pull_back, piola = _law["pull_back"], _law["piola"]
 
 
 @_device
@@ -54,79 +65,16 @@ def gradient(mesh, d, cell, k):
 
 
 @_device
-def pulled(F, law, stiffens):
-    """Pull-back of the deviatoric stress over mu: xx, yy, zz, xy, yz, xz; see :func:`lane_cells.remember`."""
-    F00, F01, F02, F10, F11, F12, F20, F21, F22 = F
-    C00, C11, C22 = (
-        F00 * F00 + F10 * F10 + F20 * F20,
-        F01 * F01 + F11 * F11 + F21 * F21,
-        F02 * F02 + F12 * F12 + F22 * F22,
-    )
-    C01, C12, C02 = (
-        F00 * F01 + F10 * F11 + F20 * F21,
-        F01 * F02 + F11 * F12 + F21 * F22,
-        F00 * F02 + F10 * F12 + F20 * F22,
-    )
-    J = F00 * (F11 * F22 - F12 * F21) + F01 * (F12 * F20 - F10 * F22) + F02 * (F10 * F21 - F11 * F20)
-    J = _at_least(J, f32(CRUSHED))
-    trace, factor = C00 + C11 + C22, f32(1)
-    if stiffens:
-        x = _at_least(_shrinkage(_logarithm(J)) * trace - f32(3), f32(0))
-        factor += x * (law[0] + law[1] * x)
-    scale, iso = -factor * trace / (f32(3) * J * J * J), factor / J
-    return (
-        scale * (C11 * C22 - C12 * C12) + iso,
-        scale * (C00 * C22 - C02 * C02) + iso,
-        scale * (C00 * C11 - C01 * C01) + iso,
-        scale * (C02 * C12 - C01 * C22),
-        scale * (C01 * C02 - C00 * C12),
-        scale * (C01 * C12 - C02 * C11),
-    )
-
-
-@_device
 def stress(F, Q, own, p, law, stiffens, softens, P):
-    """First Piola stress times volume into P [9, P], derivative by derivative; see :func:`lane_cells.solid`."""
-    F00, F01, F02, F10, F11, F12, F20, F21, F22 = F
-    Q00, Q11, Q22, Q01, Q12, Q02 = Q
-    one = f32(1)
-    c00, c01, c02 = F11 * F22 - F12 * F21, F12 * F20 - F10 * F22, F10 * F21 - F11 * F20
-    c10, c11, c12 = F02 * F21 - F01 * F22, F00 * F22 - F02 * F20, F01 * F20 - F00 * F21
-    c20, c21, c22 = F01 * F12 - F02 * F11, F02 * F10 - F00 * F12, F00 * F11 - F01 * F10
-    J = _at_least(F00 * c00 + F01 * c01 + F02 * c02, f32(CRUSHED))
-    log = _logarithm(J)
-    shrink = _shrinkage(log)
-    square = F00 * F00 + F01 * F01 + F02 * F02 + F10 * F10 + F11 * F11 + F12 * F12 + F20 * F20 + F21 * F21 + F22 * F22
-    factor, whole = one, one
-    x = _at_least(shrink * square - f32(3), f32(0))
-    if stiffens:
-        factor += x * (law[0] + law[1] * x)
+    """First Piola stress times volume into P [9, P], derivative by derivative."""
+    P00, P10, P20, P01, P11, P21, P02, P12, P22, largest = piola(
+        F, Q, (own[0, p], own[1, p], own[2, p]), law, stiffens, softens
+    )
+    P[0, p], P[1, p], P[2, p] = P00, P10, P20
+    P[3, p], P[4, p], P[5, p] = P01, P11, P21
+    P[6, p], P[7, p], P[8, p] = P02, P12, P22
     if softens:
-        below = _at_least(own[2, p] - x, f32(0))
-        own[2, p] = x + below
-        whole -= law[2] * below / (below + law[3])
-    q00, q11, q22, q01, q12, q02 = J * Q00 + factor, J * Q11 + factor, J * Q22 + factor, J * Q01, J * Q12, J * Q02
-    A00, A01, A02 = (
-        F00 * q00 + F01 * q01 + F02 * q02,
-        F00 * q01 + F01 * q11 + F02 * q12,
-        F00 * q02 + F01 * q12 + F02 * q22,
-    )
-    A10, A11, A12 = (
-        F10 * q00 + F11 * q01 + F12 * q02,
-        F10 * q01 + F11 * q11 + F12 * q12,
-        F10 * q02 + F11 * q12 + F12 * q22,
-    )
-    A20, A21, A22 = (
-        F20 * q00 + F21 * q01 + F22 * q02,
-        F20 * q01 + F21 * q11 + F22 * q12,
-        F20 * q02 + F21 * q12 + F22 * q22,
-    )
-    along = F00 * A00 + F01 * A01 + F02 * A02 + F10 * A10 + F11 * A11 + F12 * A12 + F20 * A20 + F21 * A21 + F22 * A22
-    m = own[0, p] * shrink * whole
-    beta = (own[1, p] * f32(0.5) * (J * (J - one) + log) - m * along * f32(1 / 3)) / J
-    P[0, p], P[1, p], P[2, p] = m * A00 + beta * c00, m * A10 + beta * c10, m * A20 + beta * c20
-    P[3, p], P[4, p], P[5, p] = m * A01 + beta * c01, m * A11 + beta * c11, m * A21 + beta * c21
-    P[6, p], P[7, p], P[8, p] = m * A02 + beta * c02, m * A12 + beta * c12, m * A22 + beta * c22
+        own[2, p] = largest
 
 
 @_device

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import config, float32
 
-from torchsoro.kernels.block_cells import cuda, gradient, hand_out, look, met, pulled, stress, wall_area
+from torchsoro.kernels.block_cells import cuda, gradient, hand_out, look, met, pull_back, stress, wall_area
 from torchsoro.kernels.lane_cells import f32
 from torchsoro.kernels.lanes import SURFACE, TOUCH, Case, Mesh
 
@@ -48,7 +48,7 @@ def _march(mesh, wall, mark, node, plane, case, room, stiffens, softens, out):
             F = gradient(mesh, d, p >> 3, p & 7)
             q0, q1, q2, q3, q4, q5 = f32(0), f32(0), f32(0), f32(0), f32(0), f32(0)
             if elements > 0:
-                T = pulled(F, law, stiffens)
+                T = pull_back(F, law, stiffens)
                 for e in range(elements):
                     now, later, fades, grows = series[b, e, 0], series[b, e, 1], series[b, e, 2], series[b, e, 3]
                     q0 += now * Z[e, 0, p] + later * T[0]

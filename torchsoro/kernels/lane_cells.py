@@ -8,6 +8,9 @@ are those of ``stress``, with ln J and J^(-2/3) as series.
 
 from __future__ import annotations
 
+import contextlib
+from pathlib import Path
+
 import numpy as np
 from numba import njit
 
@@ -16,7 +19,21 @@ CRUSHED = 0.05  # least volume ratio that the stress laws feel
 # Without counts of references to arrays: every slice would be counted, which takes longer than what is done with some.
 OPTIONS = {"fastmath": True, "boundscheck": False, "error_model": "numpy", "nogil": True, "cache": True, "_nrt": False}
 fast = njit(**OPTIONS)
+inlined = njit(**OPTIONS, forceinline=True)  # what a lane's loop calls, which then is still done for all lanes at once
 f32 = np.float32
+
+
+def _forget() -> None:
+    """Remove compiled code that is older than a source: Numba looks at the file of the outermost function only."""
+    here = Path(__file__).parent
+    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
+    for index in here.glob("__pycache__/*.nbi"):
+        with contextlib.suppress(OSError):
+            if index.stat().st_mtime < newest:
+                index.unlink()
+
+
+_forget()
 
 
 @fast
@@ -26,13 +43,13 @@ def clear(a):
         a[n] = f32(0)
 
 
-@fast
+@inlined
 def at_least(x, least):
     """The larger of two numbers, without a branch."""
     return f32(0.5) * (x + least + abs(x - least))
 
 
-@fast
+@inlined
 def logarithm(J):
     """Of J: 2 artanh z, z = (J - 1) / (J + 1), by its series."""
     z = (J - f32(1)) / (J + f32(1))
@@ -41,7 +58,7 @@ def logarithm(J):
     return f32(2) * z * (f32(1) + q * (f32(1 / 3) + q * (f32(1 / 5) + q * tail)))
 
 
-@fast
+@inlined
 def shrinkage(log):
     """J^(-2/3) from ln J, by its series."""
     y = f32(-2 / 3) * log
@@ -121,70 +138,129 @@ def scatter(f, corner, sx, sy, Wx, Wy, Wz, Sx, Sy, Sz, X, P):
                 o[96 + q] += u02 * a0 + u12 * a1 + t02 * b0 + t12 * b1
 
 
+@inlined
+def pull_back(F, law, stiffens):
+    """Pull-back of the deviatoric stress over mu at a point: xx, yy, zz, xy, yz, xz; ``law`` as of :func:`piola`."""
+    F00, F01, F02, F10, F11, F12, F20, F21, F22 = F
+    C00, C11, C22 = (
+        F00 * F00 + F10 * F10 + F20 * F20,
+        F01 * F01 + F11 * F11 + F21 * F21,
+        F02 * F02 + F12 * F12 + F22 * F22,
+    )
+    C01, C12, C02 = (
+        F00 * F01 + F10 * F11 + F20 * F21,
+        F01 * F02 + F11 * F12 + F21 * F22,
+        F00 * F02 + F10 * F12 + F20 * F22,
+    )
+    J = F00 * (F11 * F22 - F12 * F21) + F01 * (F12 * F20 - F10 * F22) + F02 * (F10 * F21 - F11 * F20)
+    J = at_least(J, f32(CRUSHED))
+    trace, factor = C00 + C11 + C22, f32(1)
+    if stiffens:
+        x = at_least(shrinkage(logarithm(J)) * trace - f32(3), f32(0))
+        factor += x * (law[0] + law[1] * x)
+    scale, iso = -factor * trace / (f32(3) * J * J * J), factor / J
+    return (
+        scale * (C11 * C22 - C12 * C12) + iso,
+        scale * (C00 * C22 - C02 * C02) + iso,
+        scale * (C00 * C11 - C01 * C01) + iso,
+        scale * (C02 * C12 - C01 * C22),
+        scale * (C01 * C02 - C00 * C12),
+        scale * (C01 * C12 - C02 * C11),
+    )
+
+
+@inlined
+def piola(F, Q, own, law, stiffens, softens):
+    """First Piola stress at a point, column by column, and the largest x so far.
+
+    Args:
+        F: Deformation gradient, row by row.
+        Q: What the Maxwell elements add, as of :func:`pull_back`.
+        own: Shear and bulk modulus times volume, and the largest x = I1b - 3 so far.
+        law: Two coefficients of stiffening, then depth d and range r of softening: below the largest x the deviatoric
+            stress is 1 - d u / (1 + u) of what it was, u = (largest - x) / r.
+        stiffens: Whether the former count.
+        softens: Whether the latter do.
+    """
+    F00, F01, F02, F10, F11, F12, F20, F21, F22 = F
+    Q00, Q11, Q22, Q01, Q12, Q02 = Q
+    shear, bulk, largest = own
+    one = f32(1)
+    c00, c01, c02 = F11 * F22 - F12 * F21, F12 * F20 - F10 * F22, F10 * F21 - F11 * F20
+    c10, c11, c12 = F02 * F21 - F01 * F22, F00 * F22 - F02 * F20, F01 * F20 - F00 * F21
+    c20, c21, c22 = F01 * F12 - F02 * F11, F02 * F10 - F00 * F12, F00 * F11 - F01 * F10
+    J = at_least(F00 * c00 + F01 * c01 + F02 * c02, f32(CRUSHED))
+    log = logarithm(J)
+    shrink = shrinkage(log)
+    square = F00 * F00 + F01 * F01 + F02 * F02 + F10 * F10 + F11 * F11 + F12 * F12 + F20 * F20 + F21 * F21 + F22 * F22
+    factor, whole = one, one
+    x = at_least(shrink * square - f32(3), f32(0))
+    if stiffens:
+        factor += x * (law[0] + law[1] * x)
+    if softens:
+        below = at_least(largest - x, f32(0))
+        largest = x + below
+        whole -= law[2] * below / (below + law[3])
+    q00, q11, q22, q01, q12, q02 = J * Q00 + factor, J * Q11 + factor, J * Q22 + factor, J * Q01, J * Q12, J * Q02
+    A00, A01, A02 = (
+        F00 * q00 + F01 * q01 + F02 * q02,
+        F00 * q01 + F01 * q11 + F02 * q12,
+        F00 * q02 + F01 * q12 + F02 * q22,
+    )
+    A10, A11, A12 = (
+        F10 * q00 + F11 * q01 + F12 * q02,
+        F10 * q01 + F11 * q11 + F12 * q12,
+        F10 * q02 + F11 * q12 + F12 * q22,
+    )
+    A20, A21, A22 = (
+        F20 * q00 + F21 * q01 + F22 * q02,
+        F20 * q01 + F21 * q11 + F22 * q12,
+        F20 * q02 + F21 * q12 + F22 * q22,
+    )
+    along = F00 * A00 + F01 * A01 + F02 * A02 + F10 * A10 + F11 * A11 + F12 * A12 + F20 * A20 + F21 * A21 + F22 * A22
+    m = shear * shrink * whole
+    beta = (bulk * f32(0.5) * (J * (J - one) + log) - m * along * f32(1 / 3)) / J
+    return (
+        m * A00 + beta * c00,
+        m * A10 + beta * c10,
+        m * A20 + beta * c20,
+        m * A01 + beta * c01,
+        m * A11 + beta * c11,
+        m * A21 + beta * c21,
+        m * A02 + beta * c02,
+        m * A12 + beta * c12,
+        m * A22 + beta * c22,
+        largest,
+    )
+
+
+@inlined
+def _deformed(g, lane):
+    """Deformation gradient of a lane, row by row, from displacement gradients [3, 48]."""
+    one = f32(1)
+    return (
+        *(one + g[lane], g[48 + lane], g[96 + lane]),
+        *(g[16 + lane], one + g[64 + lane], g[112 + lane]),
+        *(g[32 + lane], g[80 + lane], one + g[128 + lane]),
+    )
+
+
 @fast
 def solid(at, G, P, Q, own, law, stiffens, softens):
-    """From displacement gradients G [3, 48] to the first Piola stress P; Q [6, 16] is what the Maxwell elements add.
-
-    ``own`` are the point's shear and bulk modulus, and the largest x = I1b - 3 so far; ``law`` two coefficients of
-    stiffening, then depth d and range r of softening: below the largest x the deviatoric stress is 1 - d u / (1 + u)
-    of what it was, u = (largest - x) / r.
-    """
+    """First Piola stress P from displacement gradients G [3, 48]; Q is [6, 16], ``law`` [4, 16] of :func:`piola`."""
     g, p = G[at : at + 144], P[at : at + 144]
-    one = f32(1)
-    third = f32(1 / 3)
     for lane in range(16):
-        F00, F10, F20 = one + g[lane], g[16 + lane], g[32 + lane]
-        F01, F11, F21 = g[48 + lane], one + g[64 + lane], g[80 + lane]
-        F02, F12, F22 = g[96 + lane], g[112 + lane], one + g[128 + lane]
-        c00, c01, c02 = F11 * F22 - F12 * F21, F12 * F20 - F10 * F22, F10 * F21 - F11 * F20
-        c10, c11, c12 = F02 * F21 - F01 * F22, F00 * F22 - F02 * F20, F01 * F20 - F00 * F21
-        c20, c21, c22 = F01 * F12 - F02 * F11, F02 * F10 - F00 * F12, F00 * F11 - F01 * F10
-        J = F00 * c00 + F01 * c01 + F02 * c02
-        J = at_least(J, f32(CRUSHED))
-        log = logarithm(J)
-        shrink = shrinkage(log)
-        square = (
-            F00 * F00 + F01 * F01 + F02 * F02 + F10 * F10 + F11 * F11 + F12 * F12 + F20 * F20 + F21 * F21 + F22 * F22
+        added = Q[lane], Q[16 + lane], Q[32 + lane], Q[48 + lane], Q[64 + lane], Q[80 + lane]
+        mine = own[lane], own[16 + lane], own[32 + lane]
+        laws = law[lane], law[16 + lane], law[32 + lane], law[48 + lane]
+        P00, P10, P20, P01, P11, P21, P02, P12, P22, largest = piola(
+            _deformed(g, lane), added, mine, laws, stiffens, softens
         )
-        factor, whole = one, one
-        x = at_least(shrink * square - f32(3), f32(0))
-        if stiffens:
-            factor = one + x * (law[lane] + law[16 + lane] * x)
+        p[lane], p[16 + lane], p[32 + lane] = P00, P10, P20
+        p[48 + lane], p[64 + lane], p[80 + lane] = P01, P11, P21
+        p[96 + lane], p[112 + lane], p[128 + lane] = P02, P12, P22
         if softens:
-            below = at_least(own[32 + lane] - x, f32(0))
-            own[32 + lane] = x + below
-            whole = one - law[32 + lane] * below / (below + law[48 + lane])
-        q00, q11, q22, q01, q12, q02 = (
-            J * Q[lane] + factor,
-            J * Q[16 + lane] + factor,
-            J * Q[32 + lane] + factor,
-            J * Q[48 + lane],
-            J * Q[64 + lane],
-            J * Q[80 + lane],
-        )
-        A00, A01, A02 = (
-            F00 * q00 + F01 * q01 + F02 * q02,
-            F00 * q01 + F01 * q11 + F02 * q12,
-            F00 * q02 + F01 * q12 + F02 * q22,
-        )
-        A10, A11, A12 = (
-            F10 * q00 + F11 * q01 + F12 * q02,
-            F10 * q01 + F11 * q11 + F12 * q12,
-            F10 * q02 + F11 * q12 + F12 * q22,
-        )
-        A20, A21, A22 = (
-            F20 * q00 + F21 * q01 + F22 * q02,
-            F20 * q01 + F21 * q11 + F22 * q12,
-            F20 * q02 + F21 * q12 + F22 * q22,
-        )
-        along = (
-            F00 * A00 + F01 * A01 + F02 * A02 + F10 * A10 + F11 * A11 + F12 * A12 + F20 * A20 + F21 * A21 + F22 * A22
-        )
-        m = own[lane] * shrink * whole
-        beta = (own[16 + lane] * f32(0.5) * (J * (J - one) + log) - m * along * third) / J
-        p[lane], p[16 + lane], p[32 + lane] = m * A00 + beta * c00, m * A10 + beta * c10, m * A20 + beta * c20
-        p[48 + lane], p[64 + lane], p[80 + lane] = m * A01 + beta * c01, m * A11 + beta * c11, m * A21 + beta * c21
-        p[96 + lane], p[112 + lane], p[128 + lane] = m * A02 + beta * c02, m * A12 + beta * c12, m * A22 + beta * c22
+            own[32 + lane] = largest
 
 
 @fast
@@ -195,34 +271,10 @@ def remember(at, G, T, Q, Z, series, law, stiffens, elements):
     has g, g b, a and b (1 - a) of each element [E * 64].
     """
     g = G[at : at + 144]
-    one = f32(1)
     for lane in range(16):
-        F00, F10, F20 = one + g[lane], g[16 + lane], g[32 + lane]
-        F01, F11, F21 = g[48 + lane], one + g[64 + lane], g[80 + lane]
-        F02, F12, F22 = g[96 + lane], g[112 + lane], one + g[128 + lane]
-        C00, C11, C22 = (
-            F00 * F00 + F10 * F10 + F20 * F20,
-            F01 * F01 + F11 * F11 + F21 * F21,
-            F02 * F02 + F12 * F12 + F22 * F22,
-        )
-        C01, C12, C02 = (
-            F00 * F01 + F10 * F11 + F20 * F21,
-            F01 * F02 + F11 * F12 + F21 * F22,
-            F00 * F02 + F10 * F12 + F20 * F22,
-        )
-        k00, k11, k22 = C11 * C22 - C12 * C12, C00 * C22 - C02 * C02, C00 * C11 - C01 * C01
-        k01, k12, k02 = C02 * C12 - C01 * C22, C01 * C02 - C00 * C12, C01 * C12 - C02 * C11
-        J = F00 * (F11 * F22 - F12 * F21) + F01 * (F12 * F20 - F10 * F22) + F02 * (F10 * F21 - F11 * F20)
-        J = at_least(J, f32(CRUSHED))
-        trace = C00 + C11 + C22
-        factor = one
-        if stiffens:
-            x = at_least(shrinkage(logarithm(J)) * trace - f32(3), f32(0))
-            factor = one + x * (law[lane] + law[16 + lane] * x)
-        scale = -factor * trace / (f32(3) * J * J * J)
-        iso = factor / J
-        T[lane], T[16 + lane], T[32 + lane] = scale * k00 + iso, scale * k11 + iso, scale * k22 + iso
-        T[48 + lane], T[64 + lane], T[80 + lane] = scale * k01, scale * k12, scale * k02
+        T00, T11, T22, T01, T12, T02 = pull_back(_deformed(g, lane), (law[lane], law[16 + lane]), stiffens)
+        T[lane], T[16 + lane], T[32 + lane] = T00, T11, T22
+        T[48 + lane], T[64 + lane], T[80 + lane] = T01, T12, T02
     clear(Q)
     for e in range(elements):
         z, maxwell = Z[96 * e : 96 * e + 96], series[64 * e : 64 * e + 64]
