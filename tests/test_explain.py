@@ -21,6 +21,7 @@ from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
 from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.recording import Recording, read_table
+from torchsoro.sim2real.report import effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
 from torchsoro.sim2real.twin import Motion, Twin
 from torchsoro.sim2real.verdict import Candidate, Thresholds, _freed, decide, judge, rank
@@ -218,6 +219,9 @@ def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
     (fit,) = problem.fit([((effect("attached_mass"),), start)])
     assert fit is not None and fit.misfit / fit.samples == pytest.approx(1.0, abs=0.35)
     assert fit.values[0] == pytest.approx((0.002, 0.05, 0.01, 0.02), rel=0.3, abs=0.003)
+    (row,) = effect_rows(fit, 1.0, problem)
+    off = np.abs(np.array(row["location_m"]) - (0.05, 0.01, 0.02))
+    assert (off < 2 * np.array(row["location_within_m"])).all() and max(row["location_within_m"]) < 0.02
 
 
 def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):

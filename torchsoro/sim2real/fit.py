@@ -20,8 +20,8 @@ from torchsoro.sim2real.twin import Motion
 STEP = 0.05  # of a scale, for differences
 STIFF = 1e-3  # damping of the step without a trial: what the others hardly tell stays as it was
 WEAK = 0.2  # of a look, at which effects are looked at too, since what is weak may be lost in what is not linear
-FAR = 8.0  # times a look of an effect whose parameters add up, up to which strength
-REACH = 1.5  # times a look that is taken for linear, up to which strength
+FAR = 8.0  # times a look whose parts add up, up to which strength
+NEAR = 0.6  # of a look, up to which a weak one is trusted; from there on it is looked at by itself
 FIRST = 0.5  # the longest step of a search, in shares of what is there plus two scales
 
 Search = Generator[Request, list[Motion], "Point | None"]
@@ -153,7 +153,7 @@ class Problem(Likelihood):
             slopes = np.stack([base.r - r for r in left], 1)
             if number < linear:
                 # Any strength within bounds.
-                far = FAR if effect.joint else REACH / WEAK
+                far = FAR if effect.joint or effect.local else NEAR / WEAK
                 begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:], far)
                 offset = np.zeros(n)
             else:

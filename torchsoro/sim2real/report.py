@@ -88,12 +88,14 @@ def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any
                 if quantity.name == name:
                     parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
         place = effect.place(values, problem.twin)
+        within = wide * np.sqrt(spread * np.diag(covariance)[count:])
         rows.append(
             {
                 "name": effect.name,
                 "parameters": parameters,
                 "confidence": weight,
                 "location_m": None if place is None else [float(v) for v in place],
+                "location_within_m": [float(v) for v in within] or None,
                 "time_window_s": None,
             }
         )
@@ -264,8 +266,11 @@ def _said(candidate: Candidate, problem: Problem) -> str:
             f"{name} {p['value']:.3g} {p['unit']} (90 %: {p['low']:.3g} to {p['high']:.3g})"
             for name, p in row["parameters"].items()
         )
-        where = row["location_m"]
-        place = "" if where is None else " at (" + ", ".join(f"{1e3 * x:.0f}" for x in where) + ") mm"
+        place = ""
+        if row["location_m"] is not None:
+            within = [f" ± {1e3 * w:.0f}" for w in row["location_within_m"] or []] or [""] * 3
+            at = [f"{1e3 * x:.0f}{w}" for x, w in zip(row["location_m"], within, strict=True)]
+            place = f" at ({', '.join(at)}) mm"
         parts.append(f"{row['name']}{place}: {numbers}")
     return " and ".join(parts)
 
