@@ -158,7 +158,7 @@ class PrintOffset(Hypothesis):
 class AttachedMass(Hypothesis):
     """A point mass, with its weight, somewhere on the body."""
 
-    name, seam, local, weight = "attached_mass", "mass at a place", True, 0
+    name, seam, local, mass = "attached_mass", "mass at a place", True, 0
     quantities = (Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),)
     starts = ((2.0,), (6.0,))
 
@@ -193,7 +193,7 @@ class LoadInertia(Hypothesis):
 class Tether(Hypothesis):
     """A spring, a dashpot and a mass at a place of the body, as a tube is."""
 
-    name, seam, local, weight, form = "tether", "spring, drag and mass at a place", True, 2, LAW
+    name, seam, local, mass, form = "tether", "spring, drag and mass at a place", True, 2, LAW
     quantities = (
         Quantity("stiffness_n_m", "N/m", 2.0, 0.0, 1000.0),
         Quantity("damping_n_s_m", "N s/m", 0.05, 0.0, 1000.0),

@@ -54,7 +54,7 @@ class Hypothesis(nn.Module):
         local: Whether it acts at a place, which is then inferred along with them.
         starts: Strengths to look at first, in scales: alternatives, or, if ``joint``, one of each parameter.
         joint: Whether the parameters add up, as components of a vector do.
-        weight: Number of the parameter, if any, whose weight bends a body that it hangs on off the middle.
+        mass: Number of the parameter, if any, that is a mass: off the middle of a body, its weight bends that.
         form: Share of a parameter that stays unknown, as nature's form of the effect is not the hypothesis': small for
             a number that a body has, larger for one that stands for a law.
     """
@@ -65,7 +65,7 @@ class Hypothesis(nn.Module):
     local: ClassVar[bool] = False
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
-    weight: ClassVar[int | None] = None
+    mass: ClassVar[int | None] = None
     form: ClassVar[float] = 0.1
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
@@ -131,12 +131,12 @@ class Hypothesis(nn.Module):
         return list(found.values())
 
     def around(self, look: np.ndarray, twin: Twin) -> np.ndarray:
-        """A look of a local effect [D, K], with its weight on the sides of the body as well [D + 4, K]."""
-        if self.weight is None:
+        """A look of a local effect [D, K], with its mass on the sides of the body as well [D + 4, K]."""
+        if self.mass is None:
             return look
         s, kinds = twin.setup, len(self.quantities)
         longest = int(np.argmax(s.size))
-        row = look[np.flatnonzero(look[:, self.weight])[0]]
+        row = look[np.flatnonzero(look[:, self.mass])[0]]
         rows = [look]
         for axis in (a for a in range(3) if a != longest):
             for side in (s.origin[axis], s.origin[axis] + s.size[axis]):

@@ -67,7 +67,7 @@ class Thresholds:
     some: float = 1.3
     part: float = 0.5
     beyond: float = 2.0
-    share: float = 0.8
+    share: float = 0.9
     lost: float = 0.85
     noisy: float = 0.95
     sure: float = 150.0
