@@ -63,7 +63,7 @@ class Thresholds:
 
     alarm: float = 40.0
     margin: float = 3.0
-    quiet: float = 1.9
+    quiet: float = 1.7
     some: float = 1.3
     part: float = 0.5
     beyond: float = 2.0
