@@ -48,6 +48,7 @@ HELPS = 0.85  # error on trials left out, over that without it, at which a netwo
 SMOOTH = 9  # samples of the parabola that is differentiated twice for sparse regression
 SPARSE = 0.1  # of the largest normalised coefficient, below which a term is dropped
 PREDICTS = 0.1  # share of the residual accelerations of trials left out, at which terms are believed
+BROKEN = 1.0  # m, the error where a prediction breaks down
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -138,7 +139,8 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
             sure.append(effect.name)
 
     def after(i: int, where: Problem, trial: Trial) -> float:
-        return predict(where, problem.without(fit, i), [trial])[0].total
+        told = predict(where, problem.without(fit, i), [trial])
+        return told[0].total if told else BROKEN
 
     kind = {0: "nothing_missing", 1: "explained"}.get(len(sure), "cannot_distinguish")
     held = left_out(problem, fitted(problem), after)

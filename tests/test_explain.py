@@ -21,7 +21,7 @@ from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
 from torchsoro.sim2real.numerics import choose_twin
 from torchsoro.sim2real.recording import Recording, read_table
-from torchsoro.sim2real.report import effect_rows
+from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
 from torchsoro.sim2real.twin import Motion, Twin
 from torchsoro.sim2real.verdict import Candidate, Thresholds, _freed, decide, judge, rank
@@ -382,7 +382,11 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     recorded = record("drag", (800.0,))
     monkeypatch.setattr(explain, "read_experiment", lambda folder: recorded)
     monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (effect("drag"),))
-    explain.main(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
+    told = explain.main(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
+    assert told is not None
+    broken = dataclasses.replace(told.verdict.ranking[0], kept=np.inf)  # JSON knows no infinity
+    verdict = dataclasses.replace(told.verdict, ranking=(broken,))
+    json.dumps(as_json(dataclasses.replace(told, verdict=verdict), {}), allow_nan=False)
     answer = json.loads((tmp_path / "out" / "explanation.json").read_text())
     assert answer["verdict"] == "explained" and answer["set"] == ["drag"]
     found = answer["effects"][0]["parameters"]["density_drag_kg_m3"]

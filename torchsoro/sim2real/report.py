@@ -29,6 +29,7 @@ from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
 BELIEVED = 3.0  # standard deviations of a measurement error that are believed
+BROKEN = 1e3  # error on trials left out over that without an effect, where that breaks down: JSON knows no infinity
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,7 +127,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "unknowns": c.fit.unknowns,
                 "gain": c.gain,
                 "alike": correlation(c.fit),
-                "heldout_over_nothing": None if math.isnan(c.kept) else c.kept,
+                "heldout_over_nothing": None if math.isnan(c.kept) else min(c.kept, BROKEN),
                 "effects": effect_rows(c.fit, 0.0, problem),
             }
             for c in v.ranking
