@@ -110,6 +110,7 @@ def draw_body(
     for k, title in enumerate(("before", said)):
         panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
         panels.append(panel)
+        panel.patch.set_visible(False)  # which would cover the other's label
         for edge in _outline(setup):
             panel.plot(*(1e3 * edge.T), color=BODY, lw=1.3)
         for box in setup.clamps:

@@ -29,6 +29,7 @@ from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
 BELIEVED = 3.0  # standard deviations of a measurement error that are believed
+PLACE = 0.07  # of the body's size, that a place may be off, as ``Hypothesis.form`` of a parameter
 BROKEN = 1e3  # error on trials left out over that without an effect, where that breaks down: JSON knows no infinity
 
 
@@ -71,7 +72,7 @@ class Explanation:
 def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any]]:
     """The effects of a fit, as in explanation.json; intervals by the law of errors, within bounds."""
     wide, rows, scenario = float(norm.ppf((1 + LEVEL) / 2)), [], problem.scenarios[0]
-    spread = max(1.0, fit.misfit / fit.samples) * correlation(fit)
+    spread, size = max(1.0, fit.misfit / fit.samples) * correlation(fit), np.array(problem.twin.setup.size)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
@@ -89,7 +90,7 @@ def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any
                 if quantity.name == name:
                     parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
         place = effect.place(values, problem.twin)
-        within = wide * np.sqrt(spread * np.diag(covariance)[count:])
+        within = wide * np.sqrt(spread * np.diag(covariance)[count:] + (PLACE * size[: 3 * effect.local]) ** 2)
         rows.append(
             {
                 "name": effect.name,
