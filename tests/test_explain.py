@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,11 +21,13 @@ from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
 from torchsoro.sim2real.numerics import choose_twin
+from torchsoro.sim2real.ranking import Candidate, rank
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
+from torchsoro.sim2real.search import _freed
 from torchsoro.sim2real.twin import Motion, Twin
-from torchsoro.sim2real.verdict import Candidate, Thresholds, _freed, decide, judge, rank
+from torchsoro.sim2real.verdict import Thresholds, decide, judge
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 EDGE = 0.01
@@ -315,7 +318,7 @@ def test_what_is_said_of_the_best_effect(made, start, excess, explained, gain, k
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)
     nothing = problem.fit([((), None)], rounds=3)[0]
-    fit = dataclasses.replace(nothing, effects=(effect("drag"),))
+    fit = dataclasses.replace(nothing, effects=(effect("drag"),), values=(np.ones(1),))
     found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, kept=kept)]
     assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
 
@@ -334,7 +337,9 @@ def test_what_predicts_far_worse_than_another_is_not_believed(made):
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)
     nothing = problem.fit([((), None)], rounds=3)[0]
-    tether, drag = (dataclasses.replace(nothing, effects=(effect(name),)) for name in ("tether", "drag"))
+    tether, drag = (
+        dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
+    )
     common = {"gain": 400.0, "explained": 0.9}
     for kept, chosen in ((0.3, "tether"), (0.38, "tether"), (0.6, "drag"), (0.9, "drag")):
         found = [
@@ -343,6 +348,45 @@ def test_what_predicts_far_worse_than_another_is_not_believed(made):
         ]
         told = decide(problem, nothing, found, 1.5, Thresholds(), start=9.0)
         assert [c.fit.name for c in told.chosen] == [chosen]
+    # Of two that predict nearly all, neither does far worse.
+    found = [dataclasses.replace(c, kept=kept) for c, kept in zip(found, (0.05, 0.035), strict=True)]
+    assert decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
+
+
+@pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
+def test_where_bodies_slide_effects_are_told_apart_by_more(made, planes, kind):
+    twin, ensemble, record = made
+    problem = Problem(record(None), twin, ensemble=ensemble)
+    nothing = problem.fit([((), None)], rounds=3)[0]
+    found = [
+        Candidate(
+            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
+            score=score,
+            gain=400.0,
+            explained=0.9,
+        )
+        for name, score in (("density", 180.0), ("modulus", 150.0), ("drag", 140.0))
+    ]
+    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
+    told = decide(there, nothing, found, 1.5, Thresholds(), start=9.0)
+    assert told.kind == kind
+    assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
+
+
+@pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])
+def test_the_believed_modulus_may_be_that_of_the_stiff_side(made, slope, ranked):
+    twin, ensemble, record = made
+    problem = Problem(record(None), twin, ensemble=ensemble)
+    nothing = problem.fit([((), None)], rounds=3)[0]
+    freed = dataclasses.replace(nothing, effects=(effect("modulus"),), values=(np.array([-0.25]),), misfit=6600.0)
+    off = np.array([-2.5, slope / 0.2, 0.0, 0.0])
+    soft = dataclasses.replace(
+        nothing, effects=(effect("soft_side"),), values=(np.array([slope, 0.0, 0.0]),), belief=np.array([-0.25]),
+        point=off, misfit=4400.0, unknowns=3,
+    )  # fmt: skip
+    without = dataclasses.replace(nothing, misfit=7000.0)
+    found = rank([freed, soft], without, 115000.0, problem.camera.deviations)
+    assert [c.fit.name for c in found] == ranked
 
 
 def test_a_finer_twin_corrects_where_one_is(made):

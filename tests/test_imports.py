@@ -55,6 +55,8 @@ sim2real.fit
 sim2real.histories
 sim2real.heldout sim2real.isolability sim2real.model sim2real.numerics sim2real.forcemap
 sim2real.next_experiment
+sim2real.ranking
+sim2real.search
 sim2real.verdict sim2real.phases
 sim2real.drawings
 sim2real.report

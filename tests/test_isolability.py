@@ -20,9 +20,10 @@ from torchsoro.sim2real.likelihood import Beliefs
 from torchsoro.sim2real.likeness import Response, cleared, compare, first_seen, imitation, settle
 from torchsoro.sim2real.next_experiment import REPEAT, Proposal, advice, next_experiment
 from torchsoro.sim2real.numerics import Numerics
+from torchsoro.sim2real.ranking import Candidate
 from torchsoro.sim2real.report import Explanation, as_json, draw_alike, lead
 from torchsoro.sim2real.scenario import Scenario
-from torchsoro.sim2real.verdict import Candidate, Verdict
+from torchsoro.sim2real.verdict import Verdict
 
 # A chain: four masses between springs, from a wall on; two of them are seen. ----------------------------------------
 

@@ -122,6 +122,10 @@ class SoftSide(Hypothesis):
         middle[steepest] -= np.sign(values[steepest]) * 0.27 * twin.setup.size[steepest]
         return middle
 
+    def varies(self, values: np.ndarray) -> float:
+        """At the stiffest corner."""
+        return 0.5 * float(np.abs(values[:3]).sum())
+
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """E exp(a . xi), xi from -1/2 to 1/2 over the body's box."""
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))

@@ -100,6 +100,10 @@ class Hypothesis(nn.Module):
         """
         return values[len(self.quantities) :] if self.local else None
 
+    def varies(self, values: np.ndarray) -> float:
+        """By how much ln of the modulus is higher on the stiff side than on average: it may be what is believed."""
+        return 0.0
+
     def looks(self, twin: Twin) -> list[np.ndarray]:
         """What to look at first: alternatives, each with directions [D, K] in scales, which add up.
 

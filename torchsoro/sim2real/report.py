@@ -24,7 +24,8 @@ from torchsoro.sim2real.likeness import SCORE
 from torchsoro.sim2real.next_experiment import Proposal, advice
 from torchsoro.sim2real.numerics import Numerics
 from torchsoro.sim2real.phases import Mismatch
-from torchsoro.sim2real.verdict import Candidate, Verdict, correlation
+from torchsoro.sim2real.ranking import Candidate, correlation
+from torchsoro.sim2real.verdict import Verdict
 from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
