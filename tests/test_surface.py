@@ -110,6 +110,15 @@ def test_an_l_has_its_mass_centre_and_front(tmp_path):
     np.testing.assert_allclose(at[0], [0.06, 0.01, 0.008])
 
 
+def test_a_face_beside_that_of_a_chamber_makes_no_sliver(tmp_path):
+    chamber = '[[chamber]]\nname = "c"\nbox = [[0.01, 0.005, 0.002], [0.0299, 0.015, 0.006]]\n'
+    found = folder(tmp_path, prism(CORNERS, 0, 20), more=chamber)
+    twin = Twin(found.setup, edge=0.01, walls=1)
+    assert min(np.diff(axis.planes).min() for axis in twin.grid.axes) > 1e-3
+    # One that is farther off is kept.
+    assert 0.008 in twin.grid.axes[2].planes.round(9)
+
+
 def test_a_round_bar_has_the_frequency_of_its_radius(tmp_path):
     """Cells that are cut by the surface count as far as they are filled."""
     radius, length, young, density = 10.0, 80.0, 1e5, 1000.0

@@ -17,6 +17,9 @@ from torchsoro.sim2real.grid import Axis, Grid, divide
 from torchsoro.sim2real.scenario import Ground, Push, Scenario
 
 
+NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
     """How markers moved; float64.
@@ -88,7 +91,7 @@ class Twin:
                     f"{end:g} m, within the body"
                 )
             faces = [] if surface is None else surface.faces[axis]
-            near = 1e-3 * setup.size[axis]
+            near = NEAR * setup.size[axis]
             inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
             breaks = [begin, *inner, end]
             least = [walls if setup.cavities else 1] * (len(breaks) - 1)
