@@ -3,8 +3,8 @@
     python recipes/recordings.py FOLDER/silicone-cantilever-beam --out runs/beam
     python recipes/explain.py runs/beam --out runs/beam-explained
 
-By the folder's name: the bar, the arm or the tail of Dubied, Michelis, Spielberg, Katzschmann (2022), all of Dragon
-Skin 10 and filmed by motion capture. What is believed is what their repository says: the modulus, fitted to a static
+By the folder's name: the bar or the arm of Dubied, Michelis, Spielberg, Katzschmann (2022), of Dragon Skin 10
+and recorded by motion capture. What is believed is what their repository says: the modulus, fitted to a static
 sag, and no damping.
 
 silicone-cantilever-beam: 100 x 30 x 30 mm, clamped at one end, held straight and let go, under its weight and with
@@ -13,8 +13,6 @@ other is kept to be predicted; ``--fit weight`` keeps both recordings with the l
 
 pneumatic-arm-segment: hangs, one of four chambers is inflated to 75, 100 and 150 mbar; 125 and 175 mbar are kept.
 The pressure is believed to be there at once. The section is not published: round walls of 2 mm are straight ones here.
-
-pneumatic-fish-tail: one inflation, at a pressure that is not published; 400 mbar are believed.
 """
 
 from __future__ import annotations
@@ -86,8 +84,6 @@ box = [[-0.02, -0.02, 0.0999], [0.02, 0.02, 0.101]]
 # Of a chamber: from the inner tube to the outer wall, as wide as the tube.
 ARM_CHAMBER = ((0.00714, -0.00714, 0.00693), (0.0174, 0.00714, 0.0970))
 
-TAIL_MARKERS = {"tail1": (0.015, 0.01081, 0.05221)}
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
@@ -131,61 +127,83 @@ def setup(text: str, markers: dict[str, tuple[float, ...]]) -> str:
     return f'{text}\n{marker}\n[recording]\nkind = "mocap"\nnoise = 5e-5\n'
 
 
-def bar(options: Options) -> None:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Files:
+    """Of a trial, or of one that is kept.
+
+    Attributes:
+        kept: Whether it is to be predicted only.
+        markers: Columns of markers.csv.
+        pressure: Those of pressure.csv, if there is one.
+        trial: Text of trial.toml, if there is one.
+    """
+
+    kept: bool
+    markers: dict[str, np.ndarray]
+    pressure: dict[str, np.ndarray] | None = None
+    trial: str = ""
+
+
+def bar(options: Options) -> tuple[str, dict[str, Files]]:
     """Let go."""
     kept = ("weight_b", "load_b") if options.fit == "both" else ("load_a", "load_b")
-    (options.out / "setup.toml").write_text(setup(BAR, BAR_MARKERS), encoding="utf-8")
+    trials = {}
     for name, (file, first) in BAR_TRIALS.items():
         table = table_of(options.recordings / f"{file}_beamframe.csv")
-        frame = np.arange(len(table["time_s"]))
-        time = (frame - (first - 1)) / RATE
+        time = (np.arange(len(table["time_s"])) - (first - 1)) / RATE
         used = (time >= 0) & (time <= 2.0)
         columns = {"time_s": time[used], **moved(table, BAR_MARKERS, slice(first - 30, first - 2), used)}
-        folder = options.out / ("heldout" if name in kept else "trials") / name
-        write_table(folder / "markers.csv", columns)
-        if name.startswith("load"):
-            (folder / "trial.toml").write_text(BAR_LOAD, encoding="utf-8")
+        trials[name] = Files(kept=name in kept, markers=columns, trial=BAR_LOAD if name.startswith("load") else "")
+    return setup(BAR, BAR_MARKERS), trials
 
 
-def arm(options: Options) -> None:
+def arm(options: Options) -> tuple[str, dict[str, Files]]:
     """One chamber inflated, and the others open."""
-    chambers = ""
+    chambers, trials = "", {}
     for side, (c, d) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         corners = np.array([[c * x - d * y, d * x + c * y, z] for x, y, z in ARM_CHAMBER])
         box = [corners.min(0).tolist(), corners.max(0).tolist()]
         chambers += f'\n[[chamber]]\nname = "side{side}"\nbox = {box}\n'
-    (options.out / "setup.toml").write_text(setup(ARM + chambers, ARM_MARKERS), encoding="utf-8")
     for mbar in (*ARM_TRIALS, *ARM_KEPT):
         table = table_of(options.recordings / "blackframe_25mbar" / f"{mbar:03d}mbar_armframe.csv")
         time = (np.arange(len(table["time_s"])) - ARM_BEGINS) / RATE
         used = (time >= 0) & (time <= ARM_LASTS)
-        columns = {"time_s": time[used], **moved(table, ARM_MARKERS, slice(0, 5), used)}
+        places = moved(table, ARM_MARKERS, slice(0, ARM_BEGINS - 1), used)
         # A frame that was lost repeats the one before.
-        same = np.all([np.diff(c, prepend=np.nan) == 0 for k, c in columns.items() if k != "time_s"], axis=0)
-        for key in columns:
-            if key != "time_s":
-                columns[key] = np.where(same, np.nan, columns[key])
-        folder = options.out / ("heldout" if mbar in ARM_KEPT else "trials") / f"{mbar}mbar"
-        write_table(folder / "markers.csv", columns)
+        lost = np.all([np.diff(x, prepend=np.nan) == 0 for x in places.values()], axis=0)
+        columns = {"time_s": time[used]} | {key: np.where(lost, np.nan, x) for key, x in places.items()}
         full = 100.0 * mbar
-        pressure = {f"side{side}_pa": np.array([0.0, full, full]) * (side == 0) for side in range(4)}
-        write_table(folder / "pressure.csv", {"time_s": np.array([0.0, 0.002, 2 * ARM_LASTS]), **pressure})
+        supply = {f"side{side}_pa": np.array([0.0, full, full]) * (side == 0) for side in range(4)}
+        pressure = {"time_s": np.array([0.0, 0.002, 2 * ARM_LASTS]), **supply}
+        trials[f"{mbar}mbar"] = Files(kept=mbar in ARM_KEPT, markers=columns, pressure=pressure)
+    return setup(ARM + chambers, ARM_MARKERS), trials
 
 
-WRITERS: dict[str, Callable[[Options], None]] = {"silicone-cantilever-beam": bar, "pneumatic-arm-segment": arm}
+MAKERS: dict[str, Callable[[Options], tuple[str, dict[str, Files]]]] = {
+    "silicone-cantilever-beam": bar,
+    "pneumatic-arm-segment": arm,
+}
 
 
 def main(options: Options) -> None:
     """Write the experiment.
 
     Raises:
-        ValueError: if the folder is none of those, or a recording is not there.
+        ValueError: if the folder is none of those, or a recording is not there; before anything is written.
     """
     name = options.recordings.resolve().name
-    if name not in WRITERS:
-        raise ValueError(f"recordings = {options.recordings}, wanted a folder named {', '.join(WRITERS)}")
+    if name not in MAKERS:
+        raise ValueError(f"recordings = {options.recordings}, wanted a folder named {' or '.join(MAKERS)}")
+    text, trials = MAKERS[name](options)
     options.out.mkdir(parents=True, exist_ok=True)
-    WRITERS[name](options)
+    (options.out / "setup.toml").write_text(text, encoding="utf-8")
+    for trial, files in trials.items():
+        folder = options.out / ("heldout" if files.kept else "trials") / trial
+        write_table(folder / "markers.csv", files.markers)
+        if files.pressure is not None:
+            write_table(folder / "pressure.csv", files.pressure)
+        if files.trial:
+            (folder / "trial.toml").write_text(files.trial, encoding="utf-8")
     print(options.out)
 
 

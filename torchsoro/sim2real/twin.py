@@ -16,7 +16,6 @@ from torchsoro.sim2real.experiment import Boundary, Box, Setup, Trial
 from torchsoro.sim2real.grid import Axis, Grid, divide
 from torchsoro.sim2real.scenario import Ground, Push, Scenario
 
-
 NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
 
 
