@@ -365,7 +365,7 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(made, planes, kind):
             gain=400.0,
             explained=0.9,
         )
-        for name, score in (("density", 180.0), ("modulus", 150.0), ("drag", 140.0))
+        for name, score in (("density", 180.0), ("modulus", 140.0), ("drag", 120.0))
     ]
     there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
     told = decide(there, nothing, found, 1.5, Thresholds(), start=9.0)

@@ -46,7 +46,7 @@ class Thresholds:
 
     alarm: float = 40.0
     margin: float = 3.0
-    rough: float = 0.2
+    rough: float = 0.3
     halves: float = 10.0
     quiet: float = 1.7
     some: float = 1.3
