@@ -15,17 +15,17 @@ import torch
 from test_experiment import experiment
 
 from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
+from torchsoro.sim2real.experiment import Boundary, Experiment, Trial, read_experiment
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
-from torchsoro.sim2real.numerics import choose_twin
+from torchsoro.sim2real.numerics import choose_twin, cost
 from torchsoro.sim2real.ranking import Candidate, rank
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
-from torchsoro.sim2real.search import _freed
+from torchsoro.sim2real.search import _freed, _simpler
 from torchsoro.sim2real.twin import Motion, Twin
 from torchsoro.sim2real.verdict import Thresholds, decide, judge
 
@@ -212,6 +212,21 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
     assert one.total < 0.3 * other.total
 
 
+def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
+    twin, ensemble, record = made
+    recorded = record("attached_mass", (0.004, 0.055, 0.01, 0.015))
+    problem = Problem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
+    mass, tether = effect("attached_mass"), effect("tether")
+    start = np.array([0.0, 0.0, 0.0, 2.0, 9.0, 5.0, 7.0])
+    (hung,) = problem.fit([((tether,), start)], rounds=2)
+    bare = np.where(np.arange(6) < 2, 0.0, hung.values[0])
+    (found,) = _simpler(problem, [mass, tether], [dataclasses.replace(hung, values=(bare,))])
+    assert found.name == "attached_mass" and found.values[0][0] == pytest.approx(0.004, rel=0.35)
+    sprung = dataclasses.replace(hung, values=(np.where(np.arange(6) == 0, 1.0, bare),))
+    assert _simpler(problem, [mass, tether], [sprung]) == [sprung]
+    assert _simpler(problem, [tether], [dataclasses.replace(hung, values=(bare,))])[0].name == "tether"
+
+
 def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.002, 0.05, 0.01, 0.02), gravity=(9.81, 0.0, 0.0))
@@ -295,10 +310,10 @@ def test_candidates_are_scored_by_the_best_of_them(made):
     simple, other = rank([near, better], start, 1e3 * start.misfit, trust)
     assert simple.fit is near and simple.gain < other.gain
     # A clock that would have to be off by five standard deviations tells against an effect, thirty do not forbid it.
-    for off, cost in ((2.0, 0.0), (5.0, 2.0), (30.0, 12.0)):
+    for off, lost in ((2.0, 0.0), (5.0, 2.0), (30.0, 12.0)):
         bent = dataclasses.replace(near, errors=off * trust * (np.arange(len(trust)) == 0))
         told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.misfit, trust)}
-        assert told["drag"] == pytest.approx(simple.score - cost)
+        assert told["drag"] == pytest.approx(simple.score - lost)
 
 
 @pytest.mark.parametrize(
@@ -415,6 +430,12 @@ def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
     _, _, record = made
     setup = record(None).setup
     assert choose_twin(setup, 2, 600.0).count <= choose_twin(setup, 2, 6000.0).count
+    # Where a body slides, a finer one is worth more of the time.
+    fine, coarse = (Twin(setup, edge=0.02 / n, across=n) for n in (3, 2))
+    enough = 30 * cost(fine, 2)
+    ground = Boundary(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction="stick")
+    chosen = [choose_twin(s, 2, enough).count for s in (setup, dataclasses.replace(setup, planes=(ground,)))]
+    assert chosen == [coarse.count, fine.count]
     with pytest.raises(ValueError, match=r"budget: .* minutes, wanted"):
         choose_twin(setup, 2, 0.01)
 

@@ -205,6 +205,11 @@ class Tether(Hypothesis):
     )
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
+    def simpler(self, values: np.ndarray) -> tuple[str, list[int]] | None:
+        """Without spring and dashpot, a mass."""
+        slack = all(v < 0.01 * q.scale for v, q in zip(values[:2], self.quantities, strict=False))
+        return ("attached_mass", [2, 3, 4, 5]) if slack else None
+
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The spring is at rest in the undeformed body."""
         share = twin.at(values[:, 3:])

@@ -104,6 +104,10 @@ class Hypothesis(nn.Module):
         """By how much ln of the modulus is higher on the stiff side than on average: it may be what is believed."""
         return 0.0
 
+    def simpler(self, values: np.ndarray) -> tuple[str, list[int]] | None:
+        """The effect that it comes to at values [K], by name, and which of them are its; scales are the same."""
+        return None
+
     def looks(self, twin: Twin) -> list[np.ndarray]:
         """What to look at first: alternatives, each with directions [D, K] in scales, which add up.
 

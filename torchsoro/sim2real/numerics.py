@@ -21,6 +21,8 @@ SPEED = 6e7  # points times variations times steps in a second of a thread
 CORES = 2  # that a budget is meant for, wherever it is spent: the twin, and the answer, are the same everywhere
 WALLS = 1  # cells through each wall, at least; each bends by itself
 SIMULATIONS = 400  # that an explanation takes for each trial
+SLOW = 64.0  # times as long an explanation may take that finds something, on a slow machine
+DENTS = 24.0  # the same of a body that meets planes: where it slides, a fine twin is worth the time
 SURE = 1.5  # times the differences that were seen
 FINER = (2.0, 1.5)  # times as many cells along each axis, of the twin that corrects the one in use
 GAP = 2e-5  # m
@@ -74,7 +76,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
     twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
     for twin in twins:
-        if cost(twin, trials) <= budget / 64:
+        if cost(twin, trials) <= budget / (DENTS if setup.planes else SLOW):
             return twin
     needed = cost(twins[-1], trials)
     if needed > 3 * budget:

@@ -75,7 +75,22 @@ def search(
         left = best[0].misfit - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]
         best = _best([*best, *pairs])
-    return problem, nothing, best
+    return problem, nothing, _simpler(problem, effects, best)
+
+
+def _simpler(problem: Problem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
+    """Fits without those that come to a simpler effect, which are fitted as that."""
+    for fit in [f for f in best if len(f.effects) == 1]:
+        told = fit.effects[0].simpler(fit.values[0])
+        plain = [e for e in effects if told is not None and e.name == told[0]]
+        if told is None or not plain:
+            continue
+        known = len(fit.belief)
+        start = np.concatenate([fit.point[:known], fit.point[known:][told[1]]])
+        (again,) = problem.fit([((plain[0],), start)], errors=fit.errors, rounds=ROUNDS)
+        if again is not None and again.misfit < fit.misfit + 2 * FAINT * correlation(fit):
+            best = _best([*(f for f in best if f is not fit), again])
+    return best
 
 
 def _freed(problem: Problem, effects: Sequence[Hypothesis], nothing: Fit) -> list[Task]:
