@@ -13,6 +13,7 @@ import hypothesis
 import matplotlib
 import pytest
 import torch
+from ringing import bar
 from tiny import tiny
 
 os.environ["MPLBACKEND"] = "Agg"  # also for the processes that tests start
@@ -71,3 +72,9 @@ def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
     """The folder of an uninterrupted run of a tiny walker, to be left as it is, and what it returned."""
     path = tmp_path_factory.mktemp("runs") / "straight"
     return path, recipes["walker"].main(tiny(path))
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory):
+    """A bar's twin, its ensemble, and a function that makes recordings of it."""
+    return bar(tmp_path_factory.mktemp("bar"))

@@ -7,97 +7,27 @@ import json
 import re
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from test_experiment import experiment
+from ringing import EDGE, effect
 
 from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Boundary, Experiment, Trial, read_experiment
+from torchsoro.sim2real.experiment import Boundary
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
 from torchsoro.sim2real.numerics import choose_twin, cost
-from torchsoro.sim2real.ranking import Candidate, rank
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
-from torchsoro.sim2real.search import _freed, _simpler
+from torchsoro.sim2real.search import _simpler
 from torchsoro.sim2real.twin import Motion, Twin
-from torchsoro.sim2real.verdict import Thresholds, decide, judge
+from torchsoro.sim2real.verdict import judge
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
-EDGE = 0.01
-SETUP = """
-title = "bar"
-duration = 0.2
-
-[body]
-size = [0.06, 0.02, 0.02]
-
-[material]
-density = 1000.0
-youngs_modulus = 1e5
-poisson_ratio = 0.3
-prony = [[0.3, 0.01]]
-
-[[clamp]]
-box = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]
-
-[[marker]]
-name = "tip"
-at = [0.06, 0.01, 0.02]
-
-[[marker]]
-name = "side"
-at = [0.04, 0.0, 0.01]
-
-[recording]
-noise = 5e-5
-"""
-
-
-def effect(name):
-    return next(e for e in library() if e.name == name)
-
-
-def two_trials(folder: Path) -> tuple[Experiment, Trial]:
-    """A bar with a trial in which nothing was seen yet, and another in which it is thrown."""
-    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
-    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
-    experiment(folder, SETUP, f"{header}\n{blank}\n")
-    found = read_experiment(folder)
-    thrown = dataclasses.replace(found.setup, velocity=(0.0, 0.1, 0.3))
-    return found, dataclasses.replace(found.trials[0], name="b", setup=thrown)
-
-
-@pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """A bar, and what its twin would record with an effect, two trials."""
-    found, loud = two_trials(tmp_path_factory.mktemp("bar"))
-    twin = Twin(found.setup, edge=EDGE, across=2)
-    ensemble = Ensemble(twin)
-
-    def record(name: str | None, values=(), **change) -> Experiment:
-        rng, trials = np.random.default_rng(1), []
-        for k, trial in enumerate((found.trials[0], loud)):
-            trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
-            scenario = twin.scenario(trial)
-            if name is not None:
-                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), twin)
-            camera = Camera(found.setup, [trial])
-            errors = np.zeros(len(camera.deviations))
-            errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
-            seen = camera.see(ensemble([scenario])[0].alone(), 0, errors)[0]
-            place = seen + 5e-5 * rng.normal(size=seen.shape)
-            place[7, 0] = np.nan
-            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
-        return dataclasses.replace(found, trials=tuple(trials))
-
-    return twin, ensemble, record
 
 
 # Measurement ------------------------------------------------------------------------------------------------------
@@ -293,115 +223,6 @@ def test_a_wrong_frequency_is_found_over_many_swings(made):
     )
     assert told.chosen and told.chosen[0].fit.name == "modulus"
     assert told.chosen[0].fit.values[0][0] == pytest.approx(0.9, abs=0.01)
-
-
-def test_candidates_are_scored_by_the_best_of_them(made):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
-    worse = dataclasses.replace(nothing, misfit=3 * nothing.samples, effects=(effect("drag"),), unknowns=1)
-    better = dataclasses.replace(worse, misfit=1.5 * nothing.samples, effects=(effect("tether"),), unknowns=6)
-    start = dataclasses.replace(nothing, misfit=10.0 * nothing.samples)
-    trust = problem.camera.deviations
-    first, second = rank([worse, better], start, start.misfit, trust)
-    assert first.fit is better and second.fit is worse
-    # What no form of an effect is known well enough for does not count, and then the simpler is the better.
-    near = dataclasses.replace(worse, misfit=better.misfit + 0.5 * nothing.samples)
-    simple, other = rank([near, better], start, 1e3 * start.misfit, trust)
-    assert simple.fit is near and simple.gain < other.gain
-    # A clock that would have to be off by five standard deviations tells against an effect, thirty do not forbid it.
-    for off, lost in ((2.0, 0.0), (5.0, 2.0), (30.0, 12.0)):
-        bent = dataclasses.replace(near, errors=off * trust * (np.arange(len(trust)) == 0))
-        told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.misfit, trust)}
-        assert told["drag"] == pytest.approx(simple.score - lost)
-
-
-@pytest.mark.parametrize(
-    ("start", "excess", "explained", "gain", "kept", "kind"),
-    [
-        (1.2, 1.1, 0.3, 400.0, 0.8, "explained"),  # of so little no share is known
-        (1.6, 1.3, 0.6, 400.0, 0.8, "explained"),
-        (1.6, 1.4, 0.4, 400.0, 0.8, "nothing_missing"),
-        (2.5, 1.9, 0.4, 400.0, 0.8, "unknown_physics"),
-        (9.0, 5.0, 0.7, 400.0, 0.8, "unknown_physics"),
-        (1.1, 1.0, 1.0, 300.0, 0.9, "explained"),  # noise hides how much better it predicts
-        (1.1, 1.0, 1.0, 100.0, 0.9, "nothing_missing"),
-        (5.0, 1.1, 1.0, 300.0, 0.9, "unknown_physics"),  # it fits, but does not predict
-    ],
-)
-def test_what_is_said_of_the_best_effect(made, start, excess, explained, gain, kept, kind):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
-    fit = dataclasses.replace(nothing, effects=(effect("drag"),), values=(np.ones(1),))
-    found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, kept=kept)]
-    assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
-
-
-def test_a_strained_belief_is_set_free_too(made):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=1)[0]
-    assert not _freed(problem, library(), nothing)
-    ((chosen, begin),) = _freed(problem, library(), dataclasses.replace(nothing, point=np.array([3.5])))
-    assert [e.name for e in chosen] == ["modulus"]
-    assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
-
-
-def test_what_predicts_far_worse_than_another_is_not_believed(made):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
-    tether, drag = (
-        dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
-    )
-    common = {"gain": 400.0, "explained": 0.9}
-    for kept, chosen in ((0.3, "tether"), (0.38, "tether"), (0.6, "drag"), (0.9, "drag")):
-        found = [
-            Candidate(fit=tether, score=480.0, kept=kept, **common),
-            Candidate(fit=drag, score=460.0, kept=0.3, **common),
-        ]
-        told = decide(problem, nothing, found, 1.5, Thresholds(), start=9.0)
-        assert [c.fit.name for c in told.chosen] == [chosen]
-    # Of two that predict nearly all, neither does far worse.
-    found = [dataclasses.replace(c, kept=kept) for c, kept in zip(found, (0.05, 0.035), strict=True)]
-    assert decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
-
-
-@pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
-def test_where_bodies_slide_effects_are_told_apart_by_more(made, planes, kind):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
-    found = [
-        Candidate(
-            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
-            score=score,
-            gain=400.0,
-            explained=0.9,
-        )
-        for name, score in (("density", 180.0), ("modulus", 140.0), ("drag", 120.0))
-    ]
-    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
-    told = decide(there, nothing, found, 1.5, Thresholds(), start=9.0)
-    assert told.kind == kind
-    assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
-
-
-@pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])
-def test_the_believed_modulus_may_be_that_of_the_stiff_side(made, slope, ranked):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
-    freed = dataclasses.replace(nothing, effects=(effect("modulus"),), values=(np.array([-0.25]),), misfit=6600.0)
-    off = np.array([-2.5, slope / 0.2, 0.0, 0.0])
-    soft = dataclasses.replace(
-        nothing, effects=(effect("soft_side"),), values=(np.array([slope, 0.0, 0.0]),), belief=np.array([-0.25]),
-        point=off, misfit=4400.0, unknowns=3,
-    )  # fmt: skip
-    without = dataclasses.replace(nothing, misfit=7000.0)
-    found = rank([freed, soft], without, 115000.0, problem.camera.deviations)
-    assert [c.fit.name for c in found] == ranked
 
 
 def test_a_finer_twin_corrects_where_one_is(made):

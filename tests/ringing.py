@@ -1,0 +1,85 @@
+"""A small bar that is let go, and recordings that its own twin makes of it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import torch
+from test_experiment import experiment
+
+from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
+from torchsoro.sim2real.library import library
+from torchsoro.sim2real.recording import Recording
+from torchsoro.sim2real.residual import Camera
+from torchsoro.sim2real.twin import Twin
+
+EDGE = 0.01
+SETUP = """
+title = "bar"
+duration = 0.2
+
+[body]
+size = [0.06, 0.02, 0.02]
+
+[material]
+density = 1000.0
+youngs_modulus = 1e5
+poisson_ratio = 0.3
+prony = [[0.3, 0.01]]
+
+[[clamp]]
+box = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]
+
+[[marker]]
+name = "tip"
+at = [0.06, 0.01, 0.02]
+
+[[marker]]
+name = "side"
+at = [0.04, 0.0, 0.01]
+
+[recording]
+noise = 5e-5
+"""
+
+
+def effect(name):
+    return next(e for e in library() if e.name == name)
+
+
+def two_trials(folder: Path) -> tuple[Experiment, Trial]:
+    """A bar with a trial in which nothing was seen yet, and another in which it is thrown."""
+    header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
+    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
+    experiment(folder, SETUP, f"{header}\n{blank}\n")
+    found = read_experiment(folder)
+    thrown = dataclasses.replace(found.setup, velocity=(0.0, 0.1, 0.3))
+    return found, dataclasses.replace(found.trials[0], name="b", setup=thrown)
+
+
+def bar(folder: Path):
+    """The twin of a bar, its ensemble, and a function that makes what it would record with an effect in two trials."""
+    found, loud = two_trials(folder)
+    twin = Twin(found.setup, edge=EDGE, across=2)
+    ensemble = Ensemble(twin)
+
+    def record(name: str | None, values=(), **change) -> Experiment:
+        rng, trials = np.random.default_rng(1), []
+        for k, trial in enumerate((found.trials[0], loud)):
+            trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
+            scenario = twin.scenario(trial)
+            if name is not None:
+                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), twin)
+            camera = Camera(found.setup, [trial])
+            errors = np.zeros(len(camera.deviations))
+            errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
+            seen = camera.see(ensemble([scenario])[0].alone(), 0, errors)[0]
+            place = seen + 5e-5 * rng.normal(size=seen.shape)
+            place[7, 0] = np.nan
+            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
+        return dataclasses.replace(found, trials=tuple(trials))
+
+    return twin, ensemble, record
