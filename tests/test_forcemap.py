@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ringing import SETUP, two_trials
 from test_experiment import experiment
-from test_explain import SETUP, two_trials
 
 from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import read_experiment

@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from ringing import effect
 from scipy.integrate import solve_ivp
-from test_explain import effect, made  # noqa: F401
 
 from torchsoro.sim2real.body_effects import Density, Modulus
 from torchsoro.sim2real.fit import Problem
@@ -177,7 +177,7 @@ class Broken(Idle):
 
 
 @pytest.fixture(scope="module")
-def problem(made):  # noqa: F811
+def problem(made):
     """From rest, under its own weight, believed to be springy: no time but that of density and modulus."""
     twin, ensemble, record = made
     recorded = record(None)
