@@ -121,8 +121,11 @@ class Grid:
         self.points = np.stack([x, y, z], -1).reshape(-1, 3)
         """Of the body [P, 3] m, cell by cell."""
         size = np.prod([np.diff(a.planes)[self.cells[:, i]] for i, a in enumerate(axes)], axis=0)
-        self.volumes = (size[:, None] / 8 * share[tuple(self.cells.T)]).reshape(-1)
+        mine = share[tuple(self.cells.T)]
+        self.volumes = (size[:, None] / 8 * mine).reshape(-1)
         """Of the points [P] m3."""
+        self.cut = bool((mine < 1).any())
+        """Whether a cell is body in part only."""
 
     @property
     def nodes(self) -> int:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from torchsoro.sim2real.ensemble import SAFETY, Ensemble
+from torchsoro.sim2real.ensemble import Ensemble, safety
 from torchsoro.sim2real.experiment import Experiment, Setup, Trial
 from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.likelihood import BREAKS, added
@@ -55,7 +55,7 @@ def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
     factor = math.sqrt(1 + sum(g for g, _ in s.prony) / 2)
     steep = math.sqrt(max(a.steep for a in twin.grid.axes))
-    steps = s.duration * steep * speed * factor / (2 * SAFETY)
+    steps = s.duration * steep * speed * factor / (2 * safety(twin.grid))
     return twin.count * steps * trials * simulations / SPEED / CORES
 
 
