@@ -97,6 +97,27 @@ def test_a_box_of_triangles_moves_as_a_box(tmp_path):
     np.testing.assert_allclose(moved.place, same.place, atol=1e-7)
 
 
+def test_a_box_of_triangles_lands_as_a_box(tmp_path):
+    """On a plane just below it, held at one end."""
+    plane = "[[plane]]\npoint = [0, 0, -0.0005]\nnormal = [0, 0, 1]\nfriction = 0.3\n"
+    box = folder(tmp_path / "box", None, BOX, more=plane)
+    mesh = folder(tmp_path / "mesh", prism([(0, 0), (80, 0), (80, 20), (0, 20)], 0, 20), more=plane)
+    moved, same = (
+        Ensemble(t)([t.scenario(dataclasses.replace(e.trials[0], setup=s))])[0]
+        for e in (box, mesh)
+        for s in (dataclasses.replace(e.setup, gravity=(0.0, 0.0, -9.81)),)
+        for t in (Twin(s, edge=0.01, across=2),)
+    )
+    assert moved.place[0, -1, 0, 2] < 0.0099
+    np.testing.assert_allclose(moved.place, same.place, atol=2e-6)
+
+
+def test_a_plane_faces_what_there_is_of_a_body(tmp_path):
+    twin = Twin(folder(tmp_path, prism(CORNERS, 0, 20)).setup, edge=0.01, across=2)
+    below, above = (float(twin.grid.facing(np.array([0.0, 0.0, side])).sum()) for side in (1.0, -1.0))
+    assert (below, above) == (pytest.approx(0.08 * 0.02), pytest.approx(0.03 * 0.02))
+
+
 def test_an_l_has_its_mass_centre_and_front(tmp_path):
     body = prism(CORNERS, 0, 20)
     found = folder(tmp_path, body)
@@ -172,7 +193,6 @@ def test_a_model_takes_its_mesh_along(tmp_path):
         ("open", "", "the surface is open"),
         ("text", "", "wanted"),
         ("large", "", "is the unit right"),
-        ("", '[[plane]]\npoint = [0, 0, -0.1]\nnormal = [0, 0, 1]\n', "wanted a box where there are planes"),
         ("", '[[chamber]]\nname = "c"\nbox = [[0.04, 0.005, 0.004], [0.06, 0.015, 0.016]]\n', "opens to the outside"),
     ],
 )  # fmt: skip

@@ -296,6 +296,14 @@ def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
     grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).place for k in (0.0, 2e4)]
     moved = [np.abs(p[-1] - p[0]).max() for p in grown]
     assert moved[0] > 1.2 * moved[1] > 1e-5
+    # Air that was believed to be there and is not.
+    twin = Twin(t.setup, edge=EDGE)
+    twice = next(e for e in library() if e.name == "air_stiffness" and e.quantities[0].name == "share")
+    believed = twin.scenario(t).replace(air_stiffness=torch.tensor([2e4], dtype=torch.float64))
+    assert twice.applies(believed, twin) and not twice.applies(twin.scenario(t), twin)
+    without = twice(believed, torch.tensor([[-1.0]], dtype=torch.float64), twin)
+    assert not without.air_stiffness.any()
+    assert twice.told(np.array([-1.0]), believed)["air_stiffness_pa"][0] == -2e4
     # Pressure acts from inside: the forces on the whole body add up to nothing.
     free = run(changed(t, t.pressure, clamps=(), duration=0.05))
     assert abs((free.place[-1] - free.place[0]).mean(0)[0]) < 2e-4
@@ -340,6 +348,8 @@ def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
     )
     twin = Twin(t.setup, edge=EDGE, walls=2)
     scenario = twin.scenario(t)
+    if type(effect).__name__ == "AirTwice":
+        scenario = scenario.replace(air_stiffness=torch.tensor([2e4], dtype=torch.float64))
     assert effect.applies(scenario, twin) and len(effect.quantities) <= 3
     count = len(effect.quantities)
     zero = torch.zeros(1, count, dtype=torch.float64)

@@ -92,8 +92,8 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
-        everywhere = self._fill(torch.ones(self.domain.count))
-        self._simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
+        everywhere = self.filled(torch.ones(self.domain.count))
+        self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
 
     def forward(
         self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False, void: bool = True
@@ -114,7 +114,7 @@ class Robot(nn.Module):
             SimulationDiverged: if the simulation breaks down.
         """
         s = self.settings
-        body = self._fill(gamma)
+        body = self.filled(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
         trajectory = self._simulate(body, weight, gravity_scale, everything, void)
@@ -133,7 +133,8 @@ class Robot(nn.Module):
             dt=trajectory.dt,
         )
 
-    def _fill(self, gamma: Tensor) -> Body:
+    def filled(self, gamma: Tensor) -> Body:
+        """The domain filled with a density [N]."""
         s = self.settings
         return fill(
             self.domain, gamma, solid=self.solid, gas=self.gas, epsilon=s.epsilon, power=s.power, filler=s.filler
@@ -148,7 +149,7 @@ class Robot(nn.Module):
             weight = weight[keep]
         for halving in range(s.halvings + 1):
             try:
-                trajectory = self._simulator(2**halving)(
+                trajectory = self.simulator(2**halving)(
                     body,
                     duration=s.settle + s.duration,
                     prony=self.prony,
@@ -173,8 +174,8 @@ class Robot(nn.Module):
         probes = torch.arange(len(rest), device=rest.device)
         return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
-    def _simulator(self, parts: int) -> Simulator:
-        """A simulator that takes a part of the usual step."""
+    def simulator(self, parts: int = 1) -> Simulator:
+        """A simulator, in whose box it moves, that takes a part of the usual step."""
         s = self.settings
         half = (s.size[0] / 2, s.size[1] / 2)
         return Simulator(

@@ -282,21 +282,13 @@ class Grid:
     def facing(self, normal: np.ndarray) -> np.ndarray:
         """Area [n] m2 of the nodes on the face of the box that faces a plane with this normal."""
         axis = int(np.abs(normal).argmax())
-        one, two = sorted({0, 1, 2} - {axis})
-        layer = 0 if normal[axis] > 0 else self.counts[axis] - 1
-        parts = []
-        for a in (one, two):
-            own = self.axes[a]
-            share = np.zeros(own.nodes)
-            for cell in range(own.cells):
-                first = own.first[cell]
-                share[first : first + 3] += own.table[0][cell].sum(0) * np.diff(own.planes)[cell] / 2
-            parts.append(share)
-        area = np.zeros(self.counts)
-        at: list = [slice(None)] * 3
-        at[axis] = layer
-        area[tuple(at)] = np.outer(*parts)
-        return area.reshape(-1)
+        facing = -1 if normal[axis] > 0 else 1
+        sides = [s for s in self._sides() if s[1] is None and s[3] == axis and s[4] == facing]
+        if not sides:
+            return np.zeros(self.nodes)
+        cells, places, areas = (np.array([s[i] for s in sides]) for i in (0, 2, 5))
+        nodes, weights, _ = self.stencil(places, cells)
+        return np.bincount(nodes.ravel(), (weights * areas[:, None]).ravel(), self.nodes)
 
 
 def _shares(axes: Sequence[Axis], filled: Callable[..., np.ndarray]) -> np.ndarray:

@@ -18,6 +18,7 @@ from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.outer_effects import (
     Adhesion,
     AirStiffness,
+    AirTwice,
     FluidDrag,
     Friction,
     GravityTilt,
@@ -36,7 +37,7 @@ def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
-        *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness),
+        *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness, AirTwice),
         *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
     )
     return tuple(kind() for kind in kinds)

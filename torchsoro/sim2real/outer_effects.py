@@ -93,6 +93,26 @@ class AirStiffness(Hypothesis):
         return scenario.pressure is not None
 
 
+class AirTwice(Hypothesis):
+    """There is less air to compress than believed, as where the pressure was measured in the chamber itself."""
+
+    name, seam = "air_stiffness", "chamber pressure by its volume"
+    quantities = (Quantity("share", "1", 0.1, -10.0, 0.0),)
+    starts = ((-3.0,), (-10.0,))
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """What is to be added."""
+        return {"air_stiffness_pa": (float(values[0]) * float(scenario.air_stiffness.max()), "Pa")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """A share of what is believed less."""
+        return scenario.replace(air_stiffness=scenario.air_stiffness * (1 + values[:, :1]))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a chamber whose air is believed to be compressed."""
+        return scenario.pressure is not None and bool((scenario.air_stiffness > 0).any())
+
+
 class Leak(Hypothesis):
     """A part of the supply is lost behind a line that fills slowly: tau p' = (1 - a) p_supply - p."""
 

@@ -71,14 +71,11 @@ class Twin:
         across: Cells across a body without a chamber, at least.
 
     Raises:
-        ValueError: for a clamp that holds no part of a face, a chamber that does not lie inside the body, or a body
-            of a mesh beside planes.
+        ValueError: for a clamp that holds no part of a face, or a chamber that does not lie inside the body.
     """
 
     def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
         surface = setup.surface
-        if surface is not None and setup.planes:
-            raise ValueError("plane: with a body of a mesh, wanted a box where there are planes")
         self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
         axes = []
         for axis in range(3):
