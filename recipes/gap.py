@@ -1,0 +1,194 @@
+"""Put into an archived robot what its paper's simulation lacked, hide it, and make an experiment of what is seen.
+
+    python recipes/gap.py walker --hide tube --out runs/gap
+    python recipes/explain.py runs/gap --out runs/gap-explained
+
+The robot is simulated as it was designed, by particles, in four trials with different pressures; eight points of one
+side are filmed, with noise. ``setup.toml`` holds what is believed, without what ``--hide`` names:
+
+- tube: the supply's tube at the rear, a mass on a spring with a dashpot;
+- relaxation: the Maxwell elements, which the paper left out of simulations that took too long;
+- air: the air spring is believed although the pressure was measured in the chamber, and so counted twice;
+- asymmetry: one side softer than the other;
+- nothing: the twin's own error, to be seen before anything is believed of the others.
+
+What was hidden is in ``<out>-truth.json``, beside the experiment. A demonstration, not a proof: body and contact are
+simulated by another formulation than the twin's, but the effects have the forms that it knows.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+from replay import find
+
+from torchsoro.archive import load_design, read_settings
+from torchsoro.fabricate import surface
+from torchsoro.loads import Drag, Load, PointMass, Spring
+from torchsoro.material import Body, without_void
+from torchsoro.robot import Robot, build
+from torchsoro.settings import plain_errors
+from torchsoro.sim2real.recording import write_table
+
+TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # of the pressure
+RATE = 200.0  # Hz, of the camera
+MARKERS = 8
+TUBE = {"mass_kg": 2e-3, "stiffness_n_m": 10.0, "damping_n_s_m": 0.02}
+REACH = 4e-3  # m around the rearmost point, on which the tube hangs
+SOFT = 0.3  # of its modulus, that one side lacks
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to hide in what."""
+
+    robot: tyro.conf.Positional[str]
+    """Name of an archived robot, or a run's folder."""
+    out: Path
+    """Folder of the experiment."""
+    hide: Literal["nothing", "tube", "relaxation", "air", "asymmetry"] = "nothing"
+    """What the experiment lacks."""
+    strength: float = 1.0
+    """Of a tube or an asymmetry, times the usual."""
+    duration: float = 0.2
+    """Of a trial [s]."""
+    settle: float = 0.05
+    """Time before the actuation starts, to come to rest [s]."""
+    noise: float = 1e-4
+    """Standard deviation [m]."""
+    seed: int = 0
+    """Of the noise."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+
+
+def hidden(options: Options, robot: Robot, body: Body) -> tuple[Body, list[Load], dict[str, Any]]:
+    """The body, and what is attached to it, with what is hidden; and the truth."""
+    solid = body.chamber < 0
+    x = body.position
+    if options.hide == "tube":
+        rear = -(x @ x.new_tensor(robot.direction))
+        last = x[torch.where(solid, rear, -torch.inf).argmax()]
+        group = torch.nonzero(solid & ((x - last).norm(dim=-1) < REACH)).squeeze(-1)
+        told = {name: options.strength * value for name, value in TUBE.items()}
+        loads = [
+            PointMass(particles=group, mass=told["mass_kg"]),
+            Spring(particles=group, stiffness=told["stiffness_n_m"]),
+            Drag(particles=group, coefficient=told["damping_n_s_m"]),
+        ]
+        return body, loads, {"name": "tether", "parameters": told, "location_m": x[group].mean(0).tolist()}
+    if options.hide == "asymmetry":
+        softer = 1 - options.strength * SOFT * ((x[:, 1] > 0) & solid)
+        body = dataclasses.replace(body, bulk=body.bulk * softer, shear=body.shear * softer)
+        return body, [], {"name": "soft_side", "parameters": {"fraction": options.strength * SOFT}, "axis": "y"}
+    if options.hide == "relaxation":
+        elements = torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
+        return body, [], {"name": "viscoelastic", "parameters": {}, "prony": elements}
+    if options.hide == "air":
+        stiffness = robot.settings.air_stiffness
+        return body, [], {"name": "air_stiffness", "parameters": {"air_stiffness_pa": -stiffness}}
+    return body, [], {}
+
+
+def setup(options: Options, robot: Robot, markers: np.ndarray, stiffness: float) -> str:
+    """What is believed, as setup.toml."""
+    s = robot.settings
+    known = [] if options.hide == "relaxation" else torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
+    tables = [
+        f'title = "{s.robot}"\ngravity = {list(robot.gravity)}\nduration = {options.settle + options.duration}\n',
+        '[body]\nshape = "mesh"\nfile = "body.stl"\n',
+        f"[material]\ndensity = {robot.solid.density}\nyoungs_modulus = {robot.solid.youngs_modulus}\n"
+        f"poisson_ratio = {robot.solid.poisson_ratio}\nprony = {known}\n",
+    ]
+    for chamber in robot.domain.chambers:
+        half = np.array(chamber.size) / 2 - chamber.wall
+        box = [(np.array(chamber.center) + side * half).tolist() for side in (-1, 1)]
+        tables.append(f'[[chamber]]\nname = "{chamber.name}"\nbox = {box}\nair_stiffness = {stiffness}\n')
+    for plane in robot.planes:
+        normal = [float(plane.side) * (a == plane.axis) for a in range(3)]
+        point = [float(plane.offset) * (a == plane.axis) for a in range(3)]
+        friction = '"stick"' if plane.sticks else plane.friction
+        tables.append(f"[[plane]]\npoint = {point}\nnormal = {normal}\nfriction = {friction}\n")
+    tables += [f'[[marker]]\nname = "m{i}"\nat = {place.tolist()}\n' for i, place in enumerate(markers)]
+    tables.append(f'[recording]\nkind = "mocap"\nnoise = {options.noise}\n')
+    return "\n".join(tables)
+
+
+def spread(places: np.ndarray, count: int) -> list[int]:
+    """Numbers of places [N, 3] that lie far from each other."""
+    chosen = [0]
+    while len(chosen) < min(count, len(places)):
+        near = np.linalg.norm(places[:, None] - places[chosen], axis=-1).min(1)
+        chosen.append(int(near.argmax()))
+    return chosen
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Simulate the robot and write the experiment.
+
+    Returns:
+        What was hidden.
+
+    Raises:
+        ValueError: for a robot that does not exist.
+        SimulationDiverged: if the simulation breaks down.
+    """
+    folder = find(options.robot)
+    base = read_settings(folder / "settings.json", device=options.device)
+    rng, seen, truth = np.random.default_rng(options.seed), {}, {}
+    for name, share in (TRIALS | KEPT).items():
+        timed = {"settle": options.settle, "duration": options.duration, "sample_every": 1 / RATE}
+        settings = dataclasses.replace(base, pressure=share * base.pressure, **timed)
+        if options.hide == "air":
+            settings = dataclasses.replace(settings, air_stiffness=0.0)
+        robot = build(settings)
+        gamma = load_design(folder / "design.npz", robot.domain).to(settings.target)
+        body, _ = without_void(robot.filled(gamma))
+        body, loads, truth = hidden(options, robot, body)
+        side = torch.nonzero((body.chamber < 0) & (body.position[:, 1] < robot.domain.origin[1] + robot.domain.spacing))
+        side = side.squeeze(-1)
+        probes = side[spread(body.position[side].cpu().numpy(), MARKERS)]
+        told = robot.simulator()(
+            body,
+            duration=options.settle + options.duration,
+            prony=robot.prony,
+            pressure=robot.pressure,
+            gravity=robot.gravity,
+            planes=robot.planes,
+            loads=loads,
+            sample_every=1 / RATE,
+            probes=probes,
+        )
+        track = told.position.cpu().double().numpy()
+        track += options.noise * rng.standard_normal(track.shape)
+        columns = {"time_s": told.time.cpu().double().numpy()}
+        columns |= {f"m{i}_{a}_m": track[:, i, k] for i in range(len(probes)) for k, a in enumerate("xyz")}
+        time = torch.arange(0.0, float(told.time[-1]) + 2e-3, 1e-3, dtype=torch.float64)
+        supply = robot.pressure.at(time).reshape(-1).double().numpy()
+        chamber = robot.domain.chambers[0].name
+        seen[name] = columns, {"time_s": time.numpy(), f"{chamber}_pa": supply}
+        print(f"{name}: moved by {1e3 * np.abs(track - track[0]).max():.1f} mm")
+    options.out.mkdir(parents=True, exist_ok=True)
+    # Where the air is believed twice, it is there once more than it was.
+    text = setup(options, robot, body.position[probes].cpu().numpy(), base.air_stiffness)
+    (options.out / "setup.toml").write_text(text, encoding="utf-8")
+    trimesh.Trimesh(*surface(robot.domain, gamma.cpu().numpy())).export(options.out / "body.stl")
+    for name, (markers, pressure) in seen.items():
+        there = options.out / ("heldout" if name in KEPT else "trials") / name
+        write_table(there / "markers.csv", markers)
+        write_table(there / "pressure.csv", pressure)
+    (options.out.parent / f"{options.out.name}-truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+    print(options.out)
+    return truth
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__))

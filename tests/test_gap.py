@@ -1,0 +1,61 @@
+"""The recipe that hides physics in an archived robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.experiment import read_experiment
+from torchsoro.sim2real.library import library
+from torchsoro.sim2real.twin import Twin
+
+
+@pytest.fixture(scope="module")
+def hide(recipes, straight, tmp_path_factory):
+    """Make an experiment of a tiny walker that lacks something, and say what."""
+    gap = importlib.import_module("gap")
+
+    def make(what: str, **options):
+        out = tmp_path_factory.mktemp(what) / "gap"
+        settings = {"duration": 0.02, "settle": 0.01, "noise": 1e-9, **options}
+        truth = gap.main(gap.Options(robot=str(straight[0]), out=out, hide=what, **settings))
+        assert json.loads((out.parent / "gap-truth.json").read_text()) == truth
+        return read_experiment(out), truth
+
+    return make
+
+
+def track(found):
+    return np.stack([t.recording.place for t in found.trials])
+
+
+def test_every_hidden_effect_has_a_name_and_moves_the_robot_otherwise(hide):
+    plain, truth = hide("nothing")
+    assert truth == {} and [t.name for t in plain.heldout] == ["kept"]
+    assert np.ptp(track(plain), axis=1).max() > 1e-5
+    names = {e.name for e in library()}
+    for what in ("tube", "air", "asymmetry"):
+        found, truth = hide(what)
+        assert truth["name"] in names
+        assert np.abs(track(found) - track(plain)).max() > 1e-7
+        # All is believed that is true without it.
+        assert found.setup == dataclasses.replace(plain.setup, surface=found.setup.surface)
+    relaxed, truth = hide("relaxation")
+    assert truth["name"] in names and len(truth["prony"]) == 2
+    assert not relaxed.setup.prony and len(plain.setup.prony) == 2
+    np.testing.assert_allclose(track(relaxed), track(plain), atol=1e-7)
+
+
+def test_the_twin_of_a_robot_stands_on_its_ground(hide):
+    found, _ = hide("nothing")
+    twin = Twin(found.setup, edge=0.01, walls=1)
+    assert twin.grid.cut
+    moved = Ensemble(twin)([twin.scenario(found.trials[0])])[0]
+    assert moved.sound.all()
+    # Neither falls through the ground, nor jumps off it.
+    assert np.abs(moved.place[..., 2] - moved.place[..., :1, :, 2]).max() < 5e-3
