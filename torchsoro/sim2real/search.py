@@ -79,8 +79,8 @@ def search(
 
 
 def _simpler(problem: Problem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
-    """Fits without those that come to a simpler effect, which are fitted as that."""
-    for fit in [f for f in best if len(f.effects) == 1]:
+    """Fits without those of the best that come to a simpler effect, which are fitted as that."""
+    for fit in [f for f in best[:3] if len(f.effects) == 1]:
         told = fit.effects[0].simpler(fit.values[0])
         plain = [e for e in effects if told is not None and e.name == told[0]]
         if told is None or not plain:
