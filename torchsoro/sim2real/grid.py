@@ -279,16 +279,18 @@ class Grid:
         index = np.stack(np.unravel_index(np.arange(self.nodes), self.counts), -1)
         return np.flatnonzero(((index == 0) | (index == np.array(self.counts) - 1)).any(-1))
 
+    @cached_property
+    def ends(self) -> np.ndarray:
+        """Area of the body on the lower and upper sides of its box, as shares of nodes [3, 2, n] m2."""
+        sides = [s for s in self._sides() if s[1] is None]
+        places, axes, upper, areas = (np.array([s[i] for s in sides]) for i in (2, 3, 4, 5))
+        kinds = 2 * axes + (upper > 0)
+        return self.spread(places, areas * (kinds == np.arange(6)[:, None])).reshape(3, 2, self.nodes)
+
     def facing(self, normal: np.ndarray) -> np.ndarray:
         """Area [n] m2 of the nodes on the face of the box that faces a plane with this normal."""
         axis = int(np.abs(normal).argmax())
-        facing = -1 if normal[axis] > 0 else 1
-        sides = [s for s in self._sides() if s[1] is None and s[3] == axis and s[4] == facing]
-        if not sides:
-            return np.zeros(self.nodes)
-        cells, places, areas = (np.array([s[i] for s in sides]) for i in (0, 2, 5))
-        nodes, weights, _ = self.stencil(places, cells)
-        return np.bincount(nodes.ravel(), (weights * areas[:, None]).ravel(), self.nodes)
+        return self.ends[axis, int(normal[axis] < 0)]
 
 
 def _shares(axes: Sequence[Axis], filled: Callable[..., np.ndarray]) -> np.ndarray:
