@@ -27,6 +27,7 @@ import numpy as np
 import torch
 import trimesh
 import tyro
+from recordings import Files, setup, write
 from replay import find
 
 from torchsoro.archive import load_design, read_settings
@@ -35,7 +36,6 @@ from torchsoro.loads import Drag, Load, PointMass, Spring
 from torchsoro.material import Body, without_void
 from torchsoro.robot import Robot, build
 from torchsoro.settings import plain_errors
-from torchsoro.sim2real.recording import write_table
 
 TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # of the pressure
 RATE = 200.0  # Hz, of the camera
@@ -69,8 +69,13 @@ class Options:
     """Where to compute."""
 
 
-def hidden(options: Options, robot: Robot, body: Body) -> tuple[Body, list[Load], dict[str, Any]]:
-    """The body, and what is attached to it, with what is hidden; and the truth."""
+def elements(robot: Robot) -> list[list[float]]:
+    """Pairs of modulus and time."""
+    return torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
+
+
+def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tuple[Body, list[Load], dict[str, Any]]:
+    """The body and what is attached to it, with what is hidden; the truth. Air is believed of this stiffness [Pa]."""
     solid = body.chamber < 0
     x = body.position
     if options.hide == "tube":
@@ -89,18 +94,16 @@ def hidden(options: Options, robot: Robot, body: Body) -> tuple[Body, list[Load]
         body = dataclasses.replace(body, bulk=body.bulk * softer, shear=body.shear * softer)
         return body, [], {"name": "soft_side", "parameters": {"fraction": options.strength * SOFT}, "axis": "y"}
     if options.hide == "relaxation":
-        elements = torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
-        return body, [], {"name": "viscoelastic", "parameters": {}, "prony": elements}
+        return body, [], {"name": "viscoelastic", "parameters": {}, "prony": elements(robot)}
     if options.hide == "air":
-        stiffness = robot.settings.air_stiffness
         return body, [], {"name": "air_stiffness", "parameters": {"air_stiffness_pa": -stiffness}}
     return body, [], {}
 
 
-def setup(options: Options, robot: Robot, markers: np.ndarray, stiffness: float) -> str:
-    """What is believed, as setup.toml."""
+def believed(options: Options, robot: Robot, stiffness: float) -> str:
+    """Tables of setup.toml but for markers and recording; air of this stiffness is believed [Pa]."""
     s = robot.settings
-    known = [] if options.hide == "relaxation" else torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
+    known = [] if options.hide == "relaxation" else elements(robot)
     tables = [
         f'title = "{s.robot}"\ngravity = {list(robot.gravity)}\nduration = {options.settle + options.duration}\n',
         '[body]\nshape = "mesh"\nfile = "body.stl"\n',
@@ -116,8 +119,6 @@ def setup(options: Options, robot: Robot, markers: np.ndarray, stiffness: float)
         point = [float(plane.offset) * (a == plane.axis) for a in range(3)]
         friction = '"stick"' if plane.sticks else plane.friction
         tables.append(f"[[plane]]\npoint = {point}\nnormal = {normal}\nfriction = {friction}\n")
-    tables += [f'[[marker]]\nname = "m{i}"\nat = {place.tolist()}\n' for i, place in enumerate(markers)]
-    tables.append(f'[recording]\nkind = "mocap"\nnoise = {options.noise}\n')
     return "\n".join(tables)
 
 
@@ -142,7 +143,7 @@ def main(options: Options) -> dict[str, Any]:
     """
     folder = find(options.robot)
     base = read_settings(folder / "settings.json", device=options.device)
-    rng, seen, truth = np.random.default_rng(options.seed), {}, {}
+    rng, trials, truth = np.random.default_rng(options.seed), {}, {}
     for name, share in (TRIALS | KEPT).items():
         timed = {"settle": options.settle, "duration": options.duration, "sample_every": 1 / RATE}
         settings = dataclasses.replace(base, pressure=share * base.pressure, **timed)
@@ -151,7 +152,7 @@ def main(options: Options) -> dict[str, Any]:
         robot = build(settings)
         gamma = load_design(folder / "design.npz", robot.domain).to(settings.target)
         body, _ = without_void(robot.filled(gamma))
-        body, loads, truth = hidden(options, robot, body)
+        body, loads, truth = hidden(options, robot, body, base.air_stiffness)
         side = torch.nonzero((body.chamber < 0) & (body.position[:, 1] < robot.domain.origin[1] + robot.domain.spacing))
         side = side.squeeze(-1)
         probes = side[spread(body.position[side].cpu().numpy(), MARKERS)]
@@ -173,17 +174,13 @@ def main(options: Options) -> dict[str, Any]:
         time = torch.arange(0.0, float(told.time[-1]) + 2e-3, 1e-3, dtype=torch.float64)
         supply = robot.pressure.at(time).reshape(-1).double().numpy()
         chamber = robot.domain.chambers[0].name
-        seen[name] = columns, {"time_s": time.numpy(), f"{chamber}_pa": supply}
+        pressure = {"time_s": time.numpy(), f"{chamber}_pa": supply}
+        trials[name] = Files(kept=name in KEPT, markers=columns, pressure=pressure)
         print(f"{name}: moved by {1e3 * np.abs(track - track[0]).max():.1f} mm")
-    options.out.mkdir(parents=True, exist_ok=True)
-    # Where the air is believed twice, it is there once more than it was.
-    text = setup(options, robot, body.position[probes].cpu().numpy(), base.air_stiffness)
-    (options.out / "setup.toml").write_text(text, encoding="utf-8")
+    places = body.position[probes].cpu().numpy().tolist()
+    text = believed(options, robot, base.air_stiffness)
+    write(options.out, setup(text, {f"m{i}": at for i, at in enumerate(places)}, options.noise), trials)
     trimesh.Trimesh(*surface(robot.domain, gamma.cpu().numpy())).export(options.out / "body.stl")
-    for name, (markers, pressure) in seen.items():
-        there = options.out / ("heldout" if name in KEPT else "trials") / name
-        write_table(there / "markers.csv", markers)
-        write_table(there / "pressure.csv", pressure)
     (options.out.parent / f"{options.out.name}-truth.json").write_text(json.dumps(truth, indent=2) + "\n")
     print(options.out)
     return truth

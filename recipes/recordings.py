@@ -18,7 +18,7 @@ The pressure is believed to be there at once. The section is not published: roun
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -45,9 +45,10 @@ BAR_TRIALS = {
     "load_a": ("beam_load101_V2_a", 52),
     "load_b": ("beam_load101_V2_b", 57),
 }
+BAR_LASTS = 2.0  # s
 BAR = f"""title = "silicone bar, let go"
 gravity = [0.0, 0.0, -9.807]
-duration = 2.0
+duration = {BAR_LASTS}
 start = "rest"
 
 [body]
@@ -121,10 +122,10 @@ def moved(table: dict[str, np.ndarray], markers: dict[str, tuple[float, ...]], s
     return columns
 
 
-def setup(text: str, markers: dict[str, tuple[float, ...]]) -> str:
-    """Of the experiment, with its markers."""
+def setup(text: str, markers: Mapping[str, Sequence[float]], noise: float = 5e-5) -> str:
+    """Of the experiment, with its markers, and the noise of motion capture [m]."""
     marker = "\n".join(f'[[marker]]\nname = "{name}"\nat = {list(at)}\n' for name, at in markers.items())
-    return f'{text}\n{marker}\n[recording]\nkind = "mocap"\nnoise = 5e-5\n'
+    return f'{text}\n{marker}\n[recording]\nkind = "mocap"\nnoise = {noise}\n'
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -144,6 +145,19 @@ class Files:
     trial: str = ""
 
 
+def write(out: Path, text: str, trials: Mapping[str, Files]) -> None:
+    """Write an experiment."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "setup.toml").write_text(text, encoding="utf-8")
+    for trial, files in trials.items():
+        folder = out / ("heldout" if files.kept else "trials") / trial
+        write_table(folder / "markers.csv", files.markers)
+        if files.pressure is not None:
+            write_table(folder / "pressure.csv", files.pressure)
+        if files.trial:
+            (folder / "trial.toml").write_text(files.trial, encoding="utf-8")
+
+
 def bar(options: Options) -> tuple[str, dict[str, Files]]:
     """Let go."""
     kept = ("weight_b", "load_b") if options.fit == "both" else ("load_a", "load_b")
@@ -151,7 +165,7 @@ def bar(options: Options) -> tuple[str, dict[str, Files]]:
     for name, (file, first) in BAR_TRIALS.items():
         table = table_of(options.recordings / f"{file}_beamframe.csv")
         time = (np.arange(len(table["time_s"])) - (first - 1)) / RATE
-        used = (time >= 0) & (time <= 2.0)
+        used = (time >= 0) & (time <= BAR_LASTS)
         columns = {"time_s": time[used], **moved(table, BAR_MARKERS, slice(first - 30, first - 2), used)}
         trials[name] = Files(kept=name in kept, markers=columns, trial=BAR_LOAD if name.startswith("load") else "")
     return setup(BAR, BAR_MARKERS), trials
@@ -195,15 +209,7 @@ def main(options: Options) -> None:
     if name not in MAKERS:
         raise ValueError(f"recordings = {options.recordings}, wanted a folder named {' or '.join(MAKERS)}")
     text, trials = MAKERS[name](options)
-    options.out.mkdir(parents=True, exist_ok=True)
-    (options.out / "setup.toml").write_text(text, encoding="utf-8")
-    for trial, files in trials.items():
-        folder = options.out / ("heldout" if files.kept else "trials") / trial
-        write_table(folder / "markers.csv", files.markers)
-        if files.pressure is not None:
-            write_table(folder / "pressure.csv", files.pressure)
-        if files.trial:
-            (folder / "trial.toml").write_text(files.trial, encoding="utf-8")
+    write(options.out, text, trials)
     print(options.out)
 
 

@@ -43,6 +43,8 @@ def test_every_hidden_effect_has_a_name_and_moves_the_robot_otherwise(hide):
         found, truth = hide(what)
         assert truth["name"] in names
         assert np.abs(track(found) - track(plain)).max() > 1e-7
+        if what == "air":
+            assert truth["parameters"]["air_stiffness_pa"] == -found.setup.cavities[0].air_stiffness < 0
         # All is believed that is true without it.
         assert found.setup == dataclasses.replace(plain.setup, surface=found.setup.surface)
     relaxed, truth = hide("relaxation")
