@@ -1,17 +1,14 @@
 """The recipe of finite-strain fits, on the recordings of others and without them."""
 
 import importlib
-import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from published import RECORDINGS, recordings
 
 from torchsoro.rheology.finite import Experiment
-
-RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
-recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
 
 
 @pytest.fixture(scope="module")

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+from published import RECORDINGS, recordings
 
 from torchsoro.rheology.measured import Sweep
 from torchsoro.rheology.spectrum import Interval, Spectrum, fit
 from torchsoro.rheology.superposition import Shift, master
 
-RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
-recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
 SOLID = Spectrum(
     equilibrium=1e6, moduli=np.full(8, 3e6), times=np.geomspace(1e-5, 1e2, 8), deformation="tension", temperature=20.0
 )

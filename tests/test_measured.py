@@ -1,7 +1,6 @@
 """Measured curves: their checks, and tables as instruments and people write them."""
 
 import math
-import os
 import sys
 from pathlib import Path
 
@@ -9,11 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from published import RECORDINGS, recordings
 
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep, read
 
-RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
-recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
 SWEEP = {"omega": [1.0, 2.0], "storage": [3.0, 4.0], "loss": [0.0, 1.0], "temperature": 20.0, "deformation": "shear"}
 
 

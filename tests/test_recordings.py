@@ -1,18 +1,15 @@
 """The recipe that makes experiments of published recordings."""
 
 import importlib
-import os
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from published import RECORDINGS, recordings
 
 from torchsoro.sim2real.experiment import read_experiment
 from torchsoro.sim2real.twin import Twin
-
-RECORDINGS = os.environ.get("TORCHSORO_RECORDINGS")
-recordings = pytest.mark.skipif(RECORDINGS is None, reason="TORCHSORO_RECORDINGS does not name the recordings' folder")
 
 
 @pytest.fixture(scope="module")

@@ -16,10 +16,16 @@ from torchsoro.sim2real.search import _freed
 from torchsoro.sim2real.verdict import Thresholds, decide
 
 
-def test_candidates_are_scored_by_the_best_of_them(made):
+@pytest.fixture(scope="module")
+def still(made):
+    """Recordings that lack nothing, and their fit without an effect."""
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
+    return problem, problem.fit([((), None)], rounds=3)[0]
+
+
+def test_candidates_are_scored_by_the_best_of_them(still):
+    problem, nothing = still
     worse = dataclasses.replace(nothing, misfit=3 * nothing.samples, effects=(effect("drag"),), unknowns=1)
     better = dataclasses.replace(worse, misfit=1.5 * nothing.samples, effects=(effect("tether"),), unknowns=6)
     start = dataclasses.replace(nothing, misfit=10.0 * nothing.samples)
@@ -50,29 +56,23 @@ def test_candidates_are_scored_by_the_best_of_them(made):
         (5.0, 1.1, 1.0, 300.0, 0.9, "unknown_physics"),  # it fits, but does not predict
     ],
 )
-def test_what_is_said_of_the_best_effect(made, start, excess, explained, gain, kept, kind):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
+def test_what_is_said_of_the_best_effect(still, start, excess, explained, gain, kept, kind):
+    problem, nothing = still
     fit = dataclasses.replace(nothing, effects=(effect("drag"),), values=(np.ones(1),))
     found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, kept=kept)]
     assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
 
 
-def test_a_strained_belief_is_set_free_too(made):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=1)[0]
+def test_a_strained_belief_is_set_free_too(still):
+    problem, nothing = still
     assert not _freed(problem, library(), nothing)
     ((chosen, begin),) = _freed(problem, library(), dataclasses.replace(nothing, point=np.array([3.5])))
     assert [e.name for e in chosen] == ["modulus"]
     assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
 
 
-def test_what_predicts_far_worse_than_another_is_not_believed(made):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
+def test_what_predicts_far_worse_than_another_is_not_believed(still):
+    problem, nothing = still
     tether, drag = (
         dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
     )
@@ -90,10 +90,8 @@ def test_what_predicts_far_worse_than_another_is_not_believed(made):
 
 
 @pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
-def test_where_bodies_slide_effects_are_told_apart_by_more(made, planes, kind):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
+def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
+    _, nothing = still
     found = [
         Candidate(
             fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
@@ -110,10 +108,8 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(made, planes, kind):
 
 
 @pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])
-def test_the_believed_modulus_may_be_that_of_the_stiff_side(made, slope, ranked):
-    twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
-    nothing = problem.fit([((), None)], rounds=3)[0]
+def test_the_believed_modulus_may_be_that_of_the_stiff_side(still, slope, ranked):
+    problem, nothing = still
     freed = dataclasses.replace(nothing, effects=(effect("modulus"),), values=(np.array([-0.25]),), misfit=6600.0)
     off = np.array([-2.5, slope / 0.2, 0.0, 0.0])
     soft = dataclasses.replace(
