@@ -76,7 +76,7 @@ def test_what_predicts_far_worse_than_another_is_not_believed(still):
     tether, drag = (
         dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
     )
-    common = {"gain": 400.0, "explained": 0.9}
+    common = {"gain": 400.0, "explained": 0.96}
     for kept, chosen in ((0.3, "tether"), (0.38, "tether"), (0.6, "drag"), (0.9, "drag")):
         found = [
             Candidate(fit=tether, score=480.0, kept=kept, **common),
@@ -97,7 +97,7 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
             fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
             score=score,
             gain=400.0,
-            explained=0.9,
+            explained=0.96,
         )
         for name, score in (("density", 180.0), ("modulus", 140.0), ("drag", 120.0))
     ]
@@ -105,6 +105,21 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
     told = decide(there, nothing, found, 1.5, Thresholds(), start=9.0)
     assert told.kind == kind
     assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
+
+
+@pytest.mark.parametrize("best, other, told", [(0.8, 0.77, 2), (0.8, 0.74, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
+def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
+    problem, nothing = still
+    found = [
+        Candidate(
+            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
+            score=score,
+            gain=400.0,
+            explained=share,
+        )
+        for name, score, share in (("density", 480.0, best), ("drag", 440.0, other))
+    ]
+    assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen) == told
 
 
 @pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])

@@ -42,6 +42,8 @@ class Thresholds:
         sure: Such a gain; without anything missing it has never been found.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
         near: By how much it may be larger in any case, over the error without an effect.
+        left: Of the misfit, above which what the best effect leaves is due to its form, which is never just nature's.
+        form: Times what the best then leaves, up to which another is not told apart from it.
     """
 
     alarm: float = 40.0
@@ -58,6 +60,8 @@ class Thresholds:
     sure: float = 150.0
     worse: float = 1.3
     near: float = 0.02
+    left: float = 0.05
+    form: float = 1.25
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -205,8 +209,12 @@ def decide(
     if excess > t.beyond and best.explained < t.share:
         return Verdict(kind="unknown_physics", **common)
     margin = max(t.margin, t.rough * best.score) if problem.experiment.setup.planes else t.margin
+    formed = t.form * (1 - best.explained) if 1 - best.explained > t.left else 0.0
     close = tuple(
-        c for c in believed if c.score > best.score - (max(margin, t.halves) if _alike(best.fit, c.fit) else margin)
+        c
+        for c in believed
+        if c.score > best.score - (max(margin, t.halves) if _alike(best.fit, c.fit) else margin)
+        or 1 - c.explained < formed
     )
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
     return Verdict(kind=kind, chosen=close, **common)
