@@ -107,6 +107,23 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
     assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
 
 
+@pytest.mark.parametrize("kept, told", [(0.95, ["friction"]), (1.3, ["friction", "adhesion"])])
+def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
+    _, nothing = still
+    found = [
+        Candidate(
+            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(2),)),
+            score=score,
+            gain=400.0,
+            explained=0.96,
+            kept=ratio,
+        )
+        for name, score, ratio in (("adhesion", 420.0, kept), ("friction", 400.0, 0.4), ("drag", 200.0, kept))
+    ]
+    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=("a plane",))))
+    assert [c.fit.name for c in decide(there, nothing, found, 1.5, Thresholds(), start=9.0).chosen] == told
+
+
 @pytest.mark.parametrize("best, other, told", [(0.8, 0.77, 2), (0.8, 0.74, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
 def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
     problem, nothing = still

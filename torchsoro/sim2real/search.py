@@ -10,7 +10,7 @@ import numpy as np
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.likelihood import BREAKS
-from torchsoro.sim2real.ranking import BELIEVED, FAINT, correlation
+from torchsoro.sim2real.ranking import BELIEVED, FAINT, correlation, varied
 from torchsoro.sim2real.residual import find_slips
 
 KEPT = 6  # searches that are led to their end, of those that do best at first
@@ -64,13 +64,17 @@ def search(
             report(f"{effect.name}: would leave {min(mine):.0f}" if mine else f"{effect.name}: breaks down")
         tasks = _likely(looks, nothing, most)
     tried = []
+    freed = _freed(problem, effects, nothing)
     if len(tasks) > KEPT:
         tried = [f for f in problem.fit(tasks, errors=nothing.errors, rounds=TRIED, settle=False) if f is not None]
         tried.sort(key=lambda fit: fit.misfit)
         behind = tried[0].misfit + BEHIND * max(nothing.misfit - tried[0].misfit, 0.0)
-        tasks = [(f.effects, f.point) for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
-    tasks += _freed(problem, effects, nothing)
-    best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried[KEPT:]])
+        led = [f for i, f in enumerate(tried[:KEPT]) if i < 3 or f.misfit < behind]
+        # A modulus that is not believed may be that of a stiff side.
+        led += [f for f in tried if freed and varied(f) > 0 and f not in led]
+        tasks = [(f.effects, f.point) for f in led]
+    tasks += freed
+    best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried])
     if best and best[0].misfit > FAR * best[0].samples and each < PAIRS * budget:
         left = best[0].misfit - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]

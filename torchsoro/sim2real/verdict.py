@@ -171,7 +171,7 @@ def _proved(
     return [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found], heldout
 
 
-def _alike(one: Fit, other: Fit) -> bool:
+def _halves(one: Fit, other: Fit) -> bool:
     """Whether one is the modulus, and the other how that varies over the body."""
     plain = [any(isinstance(e, Modulus) for e in f.effects) for f in (one, other)]
     uneven = [varied(f) > 0 for f in (one, other)]
@@ -208,13 +208,17 @@ def decide(
         return Verdict(kind="nothing_missing" if start < t.quiet else "unknown_physics", **common)
     if excess > t.beyond and best.explained < t.share:
         return Verdict(kind="unknown_physics", **common)
-    margin = max(t.margin, t.rough * best.score) if problem.experiment.setup.planes else t.margin
+    margin, others = t.margin, [c for c in believed if c is not best]
+    if problem.experiment.setup.planes:
+        margin = max(margin, t.rough * best.score)
+        # A fit without a trial may end in another dent: that it predicts worse than nothing does tells little there.
+        others += [c for c in found if c.gain > t.alarm and c.kept > 1]
     formed = t.form * (1 - best.explained) if 1 - best.explained > t.left else 0.0
-    close = tuple(
-        c
-        for c in believed
-        if c.score > best.score - (max(margin, t.halves) if _alike(best.fit, c.fit) else margin)
-        or 1 - c.explained < formed
-    )
+
+    def alike(c: Candidate) -> bool:
+        less = max(margin, t.halves) if _halves(best.fit, c.fit) else margin
+        return c.score > best.score - less or 1 - c.explained < formed
+
+    close = (best, *filter(alike, others))
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
     return Verdict(kind=kind, chosen=close, **common)
