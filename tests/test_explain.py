@@ -157,6 +157,16 @@ def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
     assert _simpler(problem, [tether], [dataclasses.replace(hung, values=(bare,))])[0].name == "tether"
 
 
+def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
+    leak = effect("leak")
+    assert leak.simpler(np.array([0.1, 0.02])) is None
+    name, values = leak.simpler(np.array([0.0, 0.02]))
+    assert name == "pressure_lag" and values == pytest.approx([0.02])
+    name, values = leak.simpler(np.array([0.1, 0.0]))
+    told = effect("pressure_loss").told(values, None)
+    assert name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
+
+
 def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.002, 0.05, 0.01, 0.02), gravity=(9.81, 0.0, 0.0))

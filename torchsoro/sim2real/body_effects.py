@@ -205,10 +205,10 @@ class Tether(Hypothesis):
     )
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def simpler(self, values: np.ndarray) -> tuple[str, list[int]] | None:
+    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
         """Without spring and dashpot, a mass."""
         slack = all(v < 0.01 * q.scale for v, q in zip(values[:2], self.quantities, strict=False))
-        return ("attached_mass", [2, 3, 4, 5]) if slack else None
+        return ("attached_mass", values[2:]) if slack else None
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The spring is at rest in the undeformed body."""

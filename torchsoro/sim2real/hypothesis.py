@@ -104,8 +104,8 @@ class Hypothesis(nn.Module):
         """By how much ln of the modulus is higher on the stiff side than on average: it may be what is believed."""
         return 0.0
 
-    def simpler(self, values: np.ndarray) -> tuple[str, list[int]] | None:
-        """The effect that it comes to at values [K], by name, and which of them are its; scales are the same."""
+    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
+        """The effect that it comes to at values [K], by name, and that one's values."""
         return None
 
     def looks(self, twin: Twin) -> list[np.ndarray]:

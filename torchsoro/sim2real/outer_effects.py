@@ -120,6 +120,13 @@ class Leak(Hypothesis):
     quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
     starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
 
+    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
+        """With all of the pressure in the end, a lag; at once, a loss."""
+        full, prompt = (v < 0.01 * q.scale for v, q in zip(values, self.quantities, strict=True))
+        if full:
+            return "pressure_lag", values[1:]
+        return ("pressure_loss", np.log1p(-values[:1])) if prompt else None
+
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Less pressure, later."""
         assert scenario.pressure is not None

@@ -90,7 +90,7 @@ def _simpler(problem: Problem, effects: Sequence[Hypothesis], best: list[Fit]) -
         if told is None or not plain:
             continue
         known = len(fit.belief)
-        start = np.concatenate([fit.point[:known], fit.point[known:][told[1]]])
+        start = np.concatenate([fit.point[:known], told[1] / problem.scales((plain[0],))[known:]])
         (again,) = problem.fit([((plain[0],), start)], errors=fit.errors, rounds=ROUNDS)
         if again is not None and again.misfit < fit.misfit + 2 * FAINT * correlation(fit):
             best = _best([*(f for f in best if f is not fit), again])
