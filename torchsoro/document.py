@@ -14,6 +14,8 @@ from matplotlib.figure import Figure
 
 from torchsoro.storage import atomic_write
 
+LONG = 40  # characters of a cell, from which on it is broken into lines
+
 _STYLE = """
 :root { color-scheme: light; }
 body { font: 16px/1.55 system-ui, sans-serif; color: #1f2933; }
@@ -23,8 +25,9 @@ h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #dde3ea
 p.lead { font-size: 1.08rem; background: #f2f6fa; border-left: 4px solid #396ba3; padding: .8rem 1rem; }
 table { border-collapse: collapse; margin: .8rem 0 1.2rem; font-size: .9rem; display: block; overflow-x: auto; }
 th, td { padding: .3rem .75rem; text-align: right; border-bottom: 1px solid #e4e9ef; white-space: nowrap; }
-th { background: #f7f9fb; font-weight: 600; }
+th { background: #f7f9fb; font-weight: 600; white-space: normal; }
 th:first-child, td:first-child { text-align: left; }
+td.long { text-align: left; white-space: normal; min-width: 14rem; }
 figure { margin: 1rem 0 1.4rem; }
 img { max-width: 100%; height: auto; }
 figcaption, caption { color: #5b6875; font-size: .9rem; text-align: left; caption-side: top; padding: .2rem 0; }
@@ -67,9 +70,7 @@ class Document:
             raise ValueError("rows: wanted at least one")
         keys = list(dict.fromkeys(key for row in rows for key in row))
         head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(shown(row.get(key)))}</td>" for key in keys) + "</tr>" for row in rows
-        )
+        body = "".join("<tr>" + "".join(_cell(shown(row.get(key))) for key in keys) + "</tr>" for row in rows)
         title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
         self._parts.append(f"<table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
 
@@ -101,6 +102,11 @@ class Document:
         with atomic_write(path) as file:
             file.write("\n".join(lines).encode())
         return path
+
+
+def _cell(text: str) -> str:
+    kind = ' class="long"' if len(text) > LONG else ""
+    return f"<td{kind}>{html.escape(text)}</td>"
 
 
 def shown(value: Any) -> str:

@@ -125,7 +125,7 @@ def draw_body(
                 panel.text(*(place + 0.03 * size.max()), marker.name, fontsize=7)
         panel.set_title(title, fontsize=9)
         # A thin body would be a line at its true proportions.
-        panel.set_box_aspect(np.maximum(size, 0.25 * size.max()))
+        panel.set_box_aspect(np.maximum(size, 0.25 * size.max()), zoom=0.85)  # its labels lie outside
         panel.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
         panel.tick_params(labelsize=6)
         panel.locator_params(nbins=4)

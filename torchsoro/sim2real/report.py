@@ -25,7 +25,7 @@ from torchsoro.sim2real.next_experiment import Proposal, advice
 from torchsoro.sim2real.numerics import Numerics
 from torchsoro.sim2real.phases import Mismatch
 from torchsoro.sim2real.ranking import Candidate, correlation
-from torchsoro.sim2real.verdict import Verdict
+from torchsoro.sim2real.verdict import Verdict, number
 from torchsoro.storage import atomic_write
 
 LEVEL = 0.9
@@ -266,7 +266,7 @@ def _said(candidate: Candidate, problem: Problem) -> str:
     parts = []
     for row in effect_rows(candidate.fit, 0.0, problem):
         numbers = ", ".join(
-            f"{name} {p['value']:.3g} {p['unit']} (90 %: {p['low']:.3g} to {p['high']:.3g})"
+            f"{name} {number(p['value'], p['unit'])} (90 %: {p['low']:.3g} to {p['high']:.3g})"
             for name, p in row["parameters"].items()
         )
         place = ""
@@ -328,12 +328,18 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
             "score": c.score,
             "of the difference [%]": 100 * c.explained,
             "misfit / samples": c.fit.misfit / c.fit.samples,
+            "left out, after / before": "breaks down" if math.isinf(c.kept) else c.kept,
             "parameters": _said(c, e.problem),
         }
         for c in e.verdict.ranking
     ]
     if considered:
-        page.table(considered, "Score: gain in ln of the likelihood, studentised, less what the parameters are worth.")
+        page.table(
+            considered,
+            "Score: gain in ln of the likelihood, studentised, less what the parameters are worth. The highest is not "
+            "believed if it predicts trials that were left out hardly better than no effect does, or much worse than "
+            "another.",
+        )
     if e.isolability is not None:
         page.section("What this experiment can tell")
         write_isolability(page, e.isolability)

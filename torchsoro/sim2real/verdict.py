@@ -129,11 +129,16 @@ def judge(
     return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
 
 
+def number(value: float, unit: str) -> str:
+    """A value with its unit."""
+    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"
+
+
 def tell(fit: Fit) -> str:
     """Parameters in one line."""
     parts = []
     for effect, values in zip(fit.effects, fit.values, strict=True):
-        parts += [f"{q.name} = {v:.3g} {q.unit}" for q, v in zip(effect.quantities, values, strict=False)]
+        parts += [f"{q.name} = {number(v, q.unit)}" for q, v in zip(effect.quantities, values, strict=False)]
         if effect.local:
             parts.append("at " + ", ".join(f"{1e3 * v:.1f}" for v in values[len(effect.quantities) :]) + " mm")
     return ", ".join(parts)
