@@ -3,8 +3,8 @@
     python recipes/recordings.py FOLDER/silicone-cantilever-beam --out runs/beam
     python recipes/explain.py runs/beam --out runs/beam-explained
 
-By the folder's name: the bar or the arm of Dubied, Michelis, Spielberg, Katzschmann (2022), of Dragon Skin 10
-and recorded by motion capture. What is believed is what their repository says: the modulus, fitted to a static
+By the folder's name. The bar and the arm are those of Dubied, Michelis, Spielberg, Katzschmann (2022), of Dragon Skin
+10 and recorded by motion capture. What is believed is what their repository says: the modulus, fitted to a static
 sag, and no damping.
 
 silicone-cantilever-beam: 100 x 30 x 30 mm, clamped at one end, held straight and let go, under its weight and with
@@ -13,11 +13,17 @@ other is kept to be predicted; ``--fit weight`` keeps both recordings with the l
 
 pneumatic-arm-segment: hangs, one of four chambers is inflated to 75, 100 and 150 mbar; 125 and 175 mbar are kept.
 The pressure is believed to be there at once. The section is not published: round walls of 2 mm are straight ones here.
+
+bellows-actuator: the actuator of Caasenbrood, Pogromsky, Nijmeijer (2022), bent by 17 degrees and let go. Its section
+is not published: a solid bar of its length and mass, with the linear stiffness of its authors, is believed, which a
+force at its end holds. Recorded is an angle: the place of the end is that of an arc. Gravity, whose direction is not
+told, is left out.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
@@ -84,6 +90,11 @@ box = [[-0.02, -0.02, 0.0999], [0.02, 0.02, 0.101]]
 """
 # Of a chamber: from the inner tube to the outer wall, as wide as the tube.
 ARM_CHAMBER = ((0.00714, -0.00714, 0.00693), (0.0174, 0.00714, 0.0970))
+
+BELLOWS_LENGTH, BELLOWS_WIDTH = 0.064, 0.013 * math.pi**0.5  # m; a square of the same area
+BELLOWS_STIFFNESS, BELLOWS_MASS, BELLOWS_POISSON = 8.25e-4, 0.017, 0.45  # N m2, kg
+BELLOWS_GROWS, BELLOWS_ENDS, BELLOWS_LASTS = 0.26, 0.30, 0.85  # s; two periods, so that what holds leaves no swing
+BELLOWS_RATE = 200.0  # Hz; the file has 10 kHz, interpolated
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -193,9 +204,59 @@ def arm(options: Options) -> tuple[str, dict[str, Files]]:
     return setup(ARM + chambers, ARM_MARKERS), trials
 
 
+def bellows(options: Options) -> tuple[str, dict[str, Files]]:
+    """Held in a bend, and let go."""
+    table = table_of(options.recordings / "oscill_data_b17.csv")
+    time = np.arange(0.0, BELLOWS_LASTS - BELLOWS_ENDS, 1 / BELLOWS_RATE)
+    bend = np.radians(np.interp(time, table["time_s"], table["bending_angle_deg"]))
+    length, width = BELLOWS_LENGTH, BELLOWS_WIDTH
+    along, aside = length * np.sinc(bend / np.pi), -length * bend / 2 * np.sinc(bend / (2 * np.pi)) ** 2
+    modulus = BELLOWS_STIFFNESS / (width**4 / 12)
+    # Of a cantilever with a force at its end, shear included.
+    give = length**3 / (3 * BELLOWS_STIFFNESS) + 1.2 * length * 2 * (1 + BELLOWS_POISSON) / (modulus * width**2)
+    middle, end = width / 2, [[length - 0.004, 0.0, 0.0], [length, width, width]]
+    text = f"""title = "bellows actuator, let go from a bend"
+gravity = [0.0, 0.0, 0.0]
+duration = {BELLOWS_LASTS}
+start = "rest"
+
+[body]
+shape = "box"
+size = [{length}, {width:.6f}, {width:.6f}]
+origin = [0.0, 0.0, 0.0]
+
+[material]
+density = {BELLOWS_MASS / (length * width**2):.1f}
+youngs_modulus = {modulus:.0f}
+poisson_ratio = {BELLOWS_POISSON}
+prony = []
+
+[[clamp]]
+box = [[-0.001, -0.001, -0.001], [0.0001, {width + 0.001:.6f}, {width + 0.001:.6f}]]
+
+[[load]]
+box = {end}
+force = [0.0, 0.0, {aside[0] / give:.5f}]
+ramp = {BELLOWS_GROWS}
+end = {BELLOWS_ENDS}
+
+[[marker]]
+name = "end"
+at = [{length}, {middle:.6f}, {middle:.6f}]
+
+[recording]
+kind = "video"
+axes = ["x", "z"]
+noise = 1e-4
+"""
+    columns = {"time_s": BELLOWS_ENDS + time, "end_x_m": along, "end_z_m": middle + aside}
+    return text, {"released": Files(kept=False, markers=columns)}
+
+
 MAKERS: dict[str, Callable[[Options], tuple[str, dict[str, Files]]]] = {
     "silicone-cantilever-beam": bar,
     "pneumatic-arm-segment": arm,
+    "bellows-actuator": bellows,
 }
 
 

@@ -88,6 +88,11 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path):
         ("density = 1000.0", "density = 1.0", r"density = 1, wanted 10 to 30000 kg/m3"),
         ("at = [0.04, 0.01, 0.02]", "at = [0.14, 0.01, 0.02]", r"tip at .* is 100 mm outside of the body"),
         ("duration = 0.1", "duration = 0.1\ngravity = [0, 0, -9810]", r"wanted at most 1000 m/s2"),
+        (
+            "[recording]",
+            "[[load]]\nbox = [[0,0,0],[1,1,1]]\nforce = [0, 0, 1]\nramp = 0.2\nend = 0.1\n[recording]",
+            r"end = 0\.1, wanted one after it has grown, at 0\.2 s",
+        ),
     ],
 )
 def test_what_does_not_fit_is_named(tmp_path, old, new, message):

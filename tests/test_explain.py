@@ -157,6 +157,22 @@ def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
     assert _simpler(problem, [tether], [dataclasses.replace(hung, values=(bare,))])[0].name == "tether"
 
 
+def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
+    twin, ensemble, record = made
+    recorded = record(None)
+    late = []
+    for trial in recorded.trials:
+        held = trial.recording.time > 0.5 * trial.setup.duration
+        recording = dataclasses.replace(
+            trial.recording, time=trial.recording.time[held], place=trial.recording.place[held]
+        )
+        late.append(dataclasses.replace(trial, recording=recording))
+    early = Problem(recorded, twin, trials=late, ensemble=ensemble).early(0.4)
+    for whole, part in zip(late, early.trials, strict=True):
+        share = len(part.recording.time) / len(whole.recording.time)
+        assert share == pytest.approx(0.4, abs=0.05)
+
+
 def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
     leak = effect("leak")
     assert leak.simpler(np.array([0.1, 0.02])) is None

@@ -144,6 +144,8 @@ def test_a_load_and_swings_are_phases(tmp_path):
     found = phases(trial_of(tmp_path / "loaded", load), motion_of(STILL))
     assert [x.name for x in found] == ["time before the load", "time under the load"]
     assert found[0].end == pytest.approx(0.3, abs=0.002)
+    found = phases(trial_of(tmp_path / "held", load.replace("start", "end")), motion_of(STILL))
+    assert [x.name for x in found] == ["time under the load", "time after the load"]
     swing = 0.01 * np.cos(6 * np.pi * np.linspace(0, 1, 401))
     found = phases(trial_of(tmp_path / "swinging"), motion_of(swing))
     assert [x.name for x in found][:2] == ["first swing", "second swing"]

@@ -76,3 +76,20 @@ def test_what_is_not_there_is_refused(recipe, tmp_path, name, message):
     with pytest.raises(ValueError, match=message):
         recipe.main(recipe.Options(recordings=tmp_path / name, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+@recordings
+def test_the_bellows_are_held_by_a_force_that_ends(recipe, tmp_path):
+    found = made(recipe, "bellows-actuator", tmp_path)
+    (trial,) = found.trials
+    (load,) = trial.setup.loads
+    assert trial.recording is not None and trial.recording.time[0] == load.end
+    place = places(trial)[:, 0]
+    # An arc of 16.9 degrees whose length is the body's.
+    angle = np.radians(16.9)
+    chord = 2 * 0.064 / angle * np.sin(angle / 2)
+    start = place[0] - [0.0, found.setup.size[2] / 2]
+    assert np.hypot(*start) == pytest.approx(chord, rel=1e-3) and start[1] / start[0] == pytest.approx(
+        -np.tan(angle / 2), rel=1e-2
+    )
+    assert np.abs(place[-1] - [0.064, found.setup.size[2] / 2]).max() < 1e-3

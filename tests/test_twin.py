@@ -172,6 +172,38 @@ def test_a_clamped_bar_has_the_frequency_of_its_length(trial, across):
     assert abs(fitted[2]) / (2 * math.pi) == pytest.approx(exact, rel=0.006)
 
 
+def test_a_bar_that_was_pulled_aside_rings_when_it_is_let_go(trial):
+    from structures import timoshenko
+
+    length, width, force = 0.1, 0.025, 0.02
+    solid = Solid(youngs_modulus=1e5, poisson_ratio=0.0, density=1000.0)
+    exact = timoshenko(length, width, solid)
+    pulled, let_go = 2 / exact, 2.25 / exact  # a force that grows for whole periods leaves no swing
+    box = ((length - 0.005, 0.0, 0.0), (length, width, width))
+    t = changed(
+        trial,
+        size=(length, width, width),
+        clamps=(((-0.001, -0.001, -0.001), (0.0001, 0.026, 0.026)),),
+        markers=(dataclasses.replace(trial.setup.markers[0], at=(length, width / 2, width / 2)),),
+        poisson_ratio=0.0,
+        prony=(),
+        gravity=(0.0, 0.0, 0.0),
+        loads=(Load(box=box, force=(0.0, 0.0, -force), ramp=pulled, end=let_go),),
+        duration=let_go + 1.5 / exact,
+    )
+    motion = run(t, edge=width / 3)
+    z = motion.place[:, 0, 2] - motion.place[0, 0, 2]
+    inertia = width**4 / 12
+    # A cantilever with a force at its end, shear included.
+    sag = force * ((length - 0.0025) ** 3 / (3 * 1e5 * inertia) + 1.2 * length / (0.5e5 * width**2))
+    held = (motion.time > pulled) & (motion.time < let_go)
+    assert z[held] == pytest.approx(-sag, rel=0.06)
+    free = motion.time > let_go
+    assert z[free].max() == pytest.approx(sag, rel=0.08) and z[free].min() == pytest.approx(-sag, rel=0.08)
+    crossings = motion.time[free][1:][np.diff(np.sign(z[free])) != 0]
+    assert np.diff(crossings).mean() == pytest.approx(0.5 / exact, rel=0.03)
+
+
 @pytest.mark.parametrize("stiffening", [0.0, 4.0])
 def test_moves_as_the_particles_of_the_simulator_do(trial, stiffening):
     """Same laws, other shape functions: a viscoelastic bar that swings far."""

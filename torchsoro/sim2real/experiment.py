@@ -41,11 +41,13 @@ class Boundary:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Load:
-    """Dead force [N] on the body points in a box, from ``start`` [s] on."""
+    """Dead force [N] on the body points in a box, from ``start`` to ``end`` [s]; at first it grows for ``ramp`` [s]."""
 
     box: Box
     force: Vector
     start: float = 0.0
+    ramp: float = 0.0
+    end: float = math.inf
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -350,10 +352,7 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
             Boundary(point=t.vector("point"), normal=t.vector("normal"), friction=_friction(t))
             for t in top.tables("plane")
         ),
-        loads=tuple(
-            Load(box=t.box(), force=t.vector("force"), start=t.number("start", 0.0, least=0.0))
-            for t in top.tables("load")
-        ),
+        loads=tuple(_load(t) for t in top.tables("load")),
         markers=tuple(Marker(name=t.text("name"), at=t.vector("at")) for t in top.tables("marker")),
         kind=kind,
         axes=tuple("xyz".index(axis) for axis in axes),
@@ -363,6 +362,14 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
         table.done()
     _check(setup, file)
     return setup
+
+
+def _load(table: _Table) -> Load:
+    start, ramp = table.number("start", 0.0, least=0.0), table.number("ramp", 0.0, least=0.0)
+    end = table.number("end") if "end" in table.values else math.inf
+    if not end > start + ramp:
+        raise ValueError(f"{table.where}: end = {end:g}, wanted one after it has grown, at {start + ramp:g} s")
+    return Load(box=table.box(), force=table.vector("force"), start=start, ramp=ramp, end=end)
 
 
 def _prony(material: _Table) -> tuple[tuple[float, float], ...]:

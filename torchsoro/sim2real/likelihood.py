@@ -154,7 +154,8 @@ class Likelihood:
         cut = []
         for t in self.trials:
             assert t.recording is not None
-            end = share * t.setup.duration
+            begin = float(t.recording.time[0])
+            end = begin + share * (t.setup.duration - begin)
             held = t.recording.time <= end
             recording = dataclasses.replace(t.recording, time=t.recording.time[held], place=t.recording.place[held])
             cut.append(dataclasses.replace(t, setup=dataclasses.replace(t.setup, duration=end), recording=recording))

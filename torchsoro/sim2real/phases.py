@@ -267,13 +267,17 @@ def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[str]:
 
 
 def _loads(trial: Trial, time: np.ndarray) -> list[str]:
-    """Which of the loads that begin later has begun."""
-    starts = sorted({load.start for load in trial.setup.loads if 0 < load.start < time[-1]})
-    if not starts:
+    """Which of the loads that begin later has begun, and whether all have ended that do."""
+    loads = trial.setup.loads
+    starts = sorted({load.start for load in loads if 0 < load.start < time[-1]})
+    ends = [load.end for load in loads if load.end < time[-1]]
+    if not starts and not ends:
         return []
     count = np.searchsorted(starts, time, side="right")
-    of = [f" {k + 1}" if len(starts) > 1 else "" for k in range(len(starts))]
-    return [f"time before the load{of[0]}" if k == 0 else f"time under the load{of[k - 1]}" for k in count]
+    of = [f" {k + 1}" if len(starts) > 1 else "" for k in range(len(starts))] or [""]
+    first = f"time before the load{of[0]}" if starts else "time under the load"
+    names = [first if k == 0 else f"time under the load{of[k - 1]}" for k in count]
+    return ["time after the load" if ends and t >= max(ends) else name for t, name in zip(time, names, strict=True)]
 
 
 def _swings(motion: Motion, time: np.ndarray) -> list[str]:

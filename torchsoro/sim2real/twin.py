@@ -12,10 +12,11 @@ import torch
 from torch import Tensor
 
 from torchsoro.material import Prony
-from torchsoro.sim2real.experiment import Boundary, Box, Setup, Trial
+from torchsoro.sim2real.experiment import Boundary, Box, Load, Setup, Trial
 from torchsoro.sim2real.grid import Axis, Grid, divide
 from torchsoro.sim2real.scenario import Ground, Push, Scenario
 
+STEPS = 16  # in which a force grows
 NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
 
 
@@ -178,16 +179,19 @@ class Twin:
             fluid=torch.zeros((), dtype=torch.float64),
             grounds=tuple(_ground(p) for p in s.planes),
             pushes=tuple(
-                Push(
-                    share=torch.from_numpy(self.grid.within(load.box)),
-                    force=torch.tensor(load.force, dtype=torch.float64),
-                    start=load.start,
-                )
-                for load in s.loads
+                push for load in s.loads for push in _pushes(load, torch.from_numpy(self.grid.within(load.box)))
             ),
             springs=(),
             duration=s.duration,
         )
+
+
+def _pushes(load: Load, share: Tensor) -> list[Push]:
+    """A force that grows does so in steps, and one that ends meets its opposite."""
+    force, steps = torch.tensor(load.force, dtype=torch.float64), STEPS if load.ramp > 0 else 1
+    starts = [load.start + load.ramp * (k + 0.5) / steps if load.ramp > 0 else load.start for k in range(steps)]
+    pushes = [Push(share=share, force=force / steps, start=start) for start in starts]
+    return [*pushes, Push(share=share, force=-force, start=load.end)] if load.end < math.inf else pushes
 
 
 def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
