@@ -124,6 +124,14 @@ def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
     assert [c.fit.name for c in decide(there, nothing, found, 1.5, Thresholds(), start=9.0).chosen] == told
 
 
+def test_what_noise_hides_is_one_effect_where_bodies_slide_too(still):
+    _, nothing = still
+    fit = dataclasses.replace(nothing, effects=(effect("friction"),), values=(np.ones(2),))
+    found = [Candidate(fit=fit, score=400.0, gain=400.0, explained=0.96, kept=0.9)]
+    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=("a plane",))))
+    assert decide(there, nothing, found, 1.0, Thresholds(), start=1.1).kind == "explained"
+
+
 @pytest.mark.parametrize("best, other, told", [(0.8, 0.77, 2), (0.8, 0.74, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
 def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
     problem, nothing = still

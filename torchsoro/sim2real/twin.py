@@ -189,7 +189,7 @@ class Twin:
 def _pushes(load: Load, share: Tensor) -> list[Push]:
     """A force that grows does so in steps, and one that ends meets its opposite."""
     force, steps = torch.tensor(load.force, dtype=torch.float64), STEPS if load.ramp > 0 else 1
-    starts = [load.start + load.ramp * (k + 0.5) / steps if load.ramp > 0 else load.start for k in range(steps)]
+    starts = [load.start + load.ramp * (k + 0.5) / steps for k in range(steps)]
     pushes = [Push(share=share, force=force / steps, start=start) for start in starts]
     return [*pushes, Push(share=share, force=-force, start=load.end)] if load.end < math.inf else pushes
 

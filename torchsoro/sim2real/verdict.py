@@ -217,7 +217,7 @@ def decide(
     if problem.experiment.setup.planes:
         margin = max(margin, t.rough * best.score)
         # A fit without a trial may end in another dent: that it predicts hardly better than nothing tells little.
-        others += [c for c in found if c.gain > t.alarm and c.kept > t.lost]
+        others += [c for c in found if c not in believed and c.gain > t.alarm and c.kept > t.lost]
     formed = t.form * (1 - best.explained) if 1 - best.explained > t.left else 0.0
 
     def alike(c: Candidate) -> bool:
