@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,6 +23,17 @@ def still(made):
     twin, ensemble, record = made
     problem = Problem(record(None), twin, ensemble=ensemble)
     return problem, problem.fit([((), None)], rounds=3)[0]
+
+
+def fitted(nothing, name, score, explained, kept=math.nan):
+    """An effect of which only these numbers count."""
+    fit = dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),))
+    return Candidate(fit=fit, score=score, gain=400.0, explained=explained, kept=kept)
+
+
+def on(planes):
+    """What a verdict asks of a problem."""
+    return SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
 
 
 def test_candidates_are_scored_by_the_best_of_them(still):
@@ -93,16 +105,9 @@ def test_what_predicts_far_worse_than_another_is_not_believed(still):
 def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
     _, nothing = still
     found = [
-        Candidate(
-            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
-            score=score,
-            gain=400.0,
-            explained=0.96,
-        )
-        for name, score in (("density", 180.0), ("modulus", 140.0), ("drag", 120.0))
+        fitted(nothing, name, score, 0.96) for name, score in (("density", 180.0), ("modulus", 140.0), ("drag", 120.0))
     ]
-    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
-    told = decide(there, nothing, found, 1.5, Thresholds(), start=9.0)
+    told = decide(on(planes), nothing, found, 1.5, Thresholds(), start=9.0)
     assert told.kind == kind
     assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
 
@@ -111,38 +116,23 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
 def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
     _, nothing = still
     found = [
-        Candidate(
-            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(2),)),
-            score=score,
-            gain=400.0,
-            explained=0.96,
-            kept=ratio,
-        )
+        fitted(nothing, name, score, 0.96, kept=ratio)
         for name, score, ratio in (("adhesion", 420.0, kept), ("friction", 400.0, 0.4), ("drag", 200.0, kept))
     ]
-    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=("a plane",))))
-    assert [c.fit.name for c in decide(there, nothing, found, 1.5, Thresholds(), start=9.0).chosen] == told
+    assert [c.fit.name for c in decide(on(("a plane",)), nothing, found, 1.5, Thresholds(), start=9.0).chosen] == told
 
 
 def test_what_noise_hides_is_one_effect_where_bodies_slide_too(still):
     _, nothing = still
-    fit = dataclasses.replace(nothing, effects=(effect("friction"),), values=(np.ones(2),))
-    found = [Candidate(fit=fit, score=400.0, gain=400.0, explained=0.96, kept=0.9)]
-    there = SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=("a plane",))))
-    assert decide(there, nothing, found, 1.0, Thresholds(), start=1.1).kind == "explained"
+    found = [fitted(nothing, "friction", 400.0, 0.96, kept=0.9)]
+    assert decide(on(("a plane",)), nothing, found, 1.0, Thresholds(), start=1.1).kind == "explained"
 
 
 @pytest.mark.parametrize("best, other, told", [(0.8, 0.77, 2), (0.8, 0.74, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
 def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
     problem, nothing = still
     found = [
-        Candidate(
-            fit=dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(1),)),
-            score=score,
-            gain=400.0,
-            explained=share,
-        )
-        for name, score, share in (("density", 480.0, best), ("drag", 440.0, other))
+        fitted(nothing, name, score, share) for name, score, share in (("density", 480.0, best), ("drag", 440.0, other))
     ]
     assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen) == told
 
