@@ -101,6 +101,14 @@ def test_what_predicts_far_worse_than_another_is_not_believed(still):
     assert decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
 
 
+def test_a_threshold_does_not_part_what_predicts_alike(still):
+    problem, nothing = still
+    found = [fitted(nothing, name, 400.0, 0.96, kept=kept) for name, kept in (("density", 0.853), ("drag", 0.849))]
+    assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen) == 2
+    # If none is believed, what comes near it is not either.
+    assert not decide(problem, nothing, found[:1], 1.5, Thresholds(), start=9.0).chosen
+
+
 @pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
 def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
     _, nothing = still

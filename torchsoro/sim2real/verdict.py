@@ -41,7 +41,7 @@ class Thresholds:
         noisy: The same where noise and numerics explain most and the gain is above ``sure``.
         sure: Such a gain; without anything missing it has never been found.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
-        near: By how much it may be larger in any case, over the error without an effect.
+        near: By how much it may be larger in any case, even than ``lost``, over the error without an effect.
         left: Of the misfit, above which what the best effect leaves is due to its form, which is never just nature's.
         form: Times what the best then leaves, up to which another is not told apart from it.
     """
@@ -198,13 +198,13 @@ def decide(
     """
     believed = [c for c in found if c.gain > t.alarm]
     if any(math.isfinite(c.kept) for c in found):
-        least = min((c.kept for c in believed if math.isfinite(c.kept)), default=math.nan)
         # Where most of an error is noise, even the truth takes little of it away.
         most = [t.noisy if start < t.some and c.gain > t.sure else t.lost for c in believed]
+        least = min((c.kept for c, lost in zip(believed, most, strict=True) if c.kept <= lost), default=-math.inf)
         believed = [
             c
             for c, lost in zip(believed, most, strict=True)
-            if c.kept <= min(lost, max(t.worse * least, least + t.near))
+            if c.kept <= max(min(lost, t.worse * least), least + t.near)
         ]
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
