@@ -9,6 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+# Threads of linear algebra, in this process and those that it starts: the matrices are small, the two cores are shared.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import hypothesis
 import matplotlib
 import pytest

@@ -62,10 +62,12 @@ def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndar
     unit = max(bare, 2 * FORM * gained)
     worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
     freed = [f for f in fits if f.effects and all(isinstance(e, Modulus | PressureGain) for e in f.effects)]
-    if freed:
-        # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
-        enough = min(f.misfit for f in freed) - LEANS * unit
-        fits = [f for f in fits if f in freed or f.misfit <= enough or _strained(f) <= BELIEVED]
+    # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
+    fits = [
+        f
+        for f in fits
+        if not any(max(_strained(g), BELIEVED) < _strained(f) and f.misfit > g.misfit - LEANS * unit for g in freed)
+    ]
     found = [
         Candidate(
             fit=fit,

@@ -31,8 +31,8 @@ class Thresholds:
         rough: The same as a share of the score where bodies slide and bounce: there the misfit has many dents, and in
             which of them a search ends is chance.
         halves: The same between a modulus and a soft side, which differ in what a whole and a half do otherwise.
-        quiet: Times what noise and numerics explain, without an effect, below which nothing is missing if none is
-            believed.
+        covered: Times what noise and numerics explain, as believed, below which nothing is missing: all is within them.
+        quiet: The same, without an effect, below which nothing is missing if none is believed.
         some: The same, above which an effect must take away ``part`` of it.
         part: The least share of the misfit.
         beyond: As ``quiet``, with the best effect, above which it leaves something.
@@ -48,8 +48,9 @@ class Thresholds:
 
     alarm: float = 40.0
     margin: float = 3.0
-    rough: float = 0.3
+    rough: float = 0.45
     halves: float = 10.0
+    covered: float = 0.8
     quiet: float = 1.7
     some: float = 1.3
     part: float = 0.5
@@ -57,11 +58,11 @@ class Thresholds:
     share: float = 0.9
     lost: float = 0.85
     noisy: float = 0.95
-    sure: float = 150.0
+    sure: float = 200.0
     worse: float = 1.3
     near: float = 0.02
     left: float = 0.05
-    form: float = 1.25
+    form: float = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -110,7 +111,7 @@ def judge(
     problem, nothing, best = search(problem, effects, budget, report)
     believed = within(problem, nothing)
     plain = rank(best, nothing, believed, problem.camera.deviations)
-    start = nothing.misfit / nothing.samples
+    start, plainly = nothing.misfit / nothing.samples, believed / nothing.samples
     excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
     own = problem
     problem, nothing, fits = priced(problem, nothing, best, report)
@@ -124,7 +125,7 @@ def judge(
     found, heldout = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
-    verdict = decide(problem, nothing, found, excess, thresholds or Thresholds(), start=start)
+    verdict = decide(problem, nothing, found, excess, thresholds or Thresholds(), start=start, plainly=plainly)
     shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
     return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
 
@@ -184,7 +185,14 @@ def _halves(one: Fit, other: Fit) -> bool:
 
 
 def decide(
-    problem: Problem, nothing: Fit, found: Sequence[Candidate], excess: float, t: Thresholds, *, start: float
+    problem: Problem,
+    nothing: Fit,
+    found: Sequence[Candidate],
+    excess: float,
+    t: Thresholds,
+    *,
+    start: float,
+    plainly: float = math.inf,
 ) -> Verdict:
     """The verdict on a ranking.
 
@@ -195,6 +203,7 @@ def decide(
         excess: Times what noise and numerics explain that the best leaves.
         t: What decides.
         start: As ``excess``, without an effect.
+        plainly: The same, with modulus and pressure as believed.
     """
     believed = [c for c in found if c.gain > t.alarm]
     if any(math.isfinite(c.kept) for c in found):
@@ -209,7 +218,7 @@ def decide(
     best = believed[0] if believed else None
     common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
     little = best is not None and start > t.some and best.explained < t.part
-    if best is None or best.score < t.alarm or little:
+    if best is None or best.score < t.alarm or little or plainly < t.covered:
         return Verdict(kind="nothing_missing" if start < t.quiet else "unknown_physics", **common)
     if excess > t.beyond and best.explained < t.share:
         return Verdict(kind="unknown_physics", **common)
