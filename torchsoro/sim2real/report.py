@@ -240,7 +240,8 @@ def lead(e: Explanation) -> str:
     if second is not None:
         lost = (
             f" Next best is {second.fit.name}, which takes away {100 * max(second.explained, 0):.0f} % of the "
-            f"difference against {100 * v.chosen[0].explained:.0f} %."
+            f"difference against {100 * v.chosen[0].explained:.0f} %, and leaves "
+            f"{second.fit.misfit / v.chosen[0].fit.misfit:.3g} times the misfit."
         )
     return f"Missing is {parts}.{gain}{lost}{_beyond(e)}"
 
