@@ -9,8 +9,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
-# Threads of linear algebra, in this process and those that it starts: the matrices are small, the two cores are shared.
+# Here and in processes that tests start: what is small gains nothing by threads, and two processes share two cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("TI_CPU_MAX_NUM_THREADS", "1")
 
 import hypothesis
 import matplotlib
