@@ -75,7 +75,7 @@ def elements(robot: Robot) -> list[list[float]]:
 
 
 def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tuple[Body, list[Load], dict[str, Any]]:
-    """The body and what is attached to it, with what is hidden; the truth. Air is believed of this stiffness [Pa]."""
+    """The body and what is attached to it, with what is hidden; the truth. Its air has this stiffness [Pa]."""
     solid = body.chamber < 0
     x = body.position
     if options.hide == "tube":
