@@ -76,7 +76,7 @@ def bar(folder: Path):
             camera = Camera(found.setup, [trial])
             errors = np.zeros(len(camera.deviations))
             errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
-            seen = camera.see(ensemble([scenario])[0].alone(), 0, errors)[0]
+            seen = camera.see(ensemble([scenario])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             place[7, 0] = np.nan
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))

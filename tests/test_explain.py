@@ -52,11 +52,11 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
     camera = Camera(Two(), [trial], slips=[slip])  # type: ignore[arg-type]
     assert len(camera.names) == len(camera.deviations) == 1 + 5 + 6 + 3
     at = 0.5 * camera.deviations * rng.normal(size=len(camera.deviations))
-    _, by = camera.see(motion, 0, at)
+    _, by = camera.linearise(motion, 0, at)
     for k, scale in enumerate(camera.deviations):
         step = np.zeros_like(at)
         step[k] = 1e-3 * scale
-        difference = (camera.see(motion, 0, at + step)[0] - camera.see(motion, 0, at - step)[0]) / (2e-3 * scale)
+        difference = (camera.see(motion, 0, at + step) - camera.see(motion, 0, at - step)) / (2e-3 * scale)
         # Rotations add up only where they are small, and a spline's second derivative jumps.
         np.testing.assert_allclose(by[..., k], difference, rtol=0.02, atol=0.02 * np.abs(difference).max() + 1e-9)
 
@@ -358,7 +358,7 @@ def test_two_effects_are_found_where_one_does_not_do(made):
     for trial in one.trials:
         s = thrown(twin.scenario(trial), values, twin)
         s = effect("drag")(s, torch.tensor([[600.0]], dtype=torch.float64), twin)
-        seen = Camera(one.setup, [trial]).see(ensemble([s])[0].alone(), 0, np.zeros(12))[0]
+        seen = Camera(one.setup, [trial]).see(ensemble([s])[0].alone(), 0, np.zeros(12))
         noise = 5e-5 * np.random.default_rng(5).normal(size=seen.shape)
         trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=seen + noise)))
     both = dataclasses.replace(one, trials=tuple(trials))

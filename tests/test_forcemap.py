@@ -48,7 +48,7 @@ def made(tmp_path_factory):
             camera = Camera(found.setup, [trial])
             errors = np.zeros(len(camera.deviations))
             errors[0], errors[6:] = 0.002, 2e-4
-            seen = camera.see(ensemble([s])[0].alone(), 0, errors)[0]
+            seen = camera.see(ensemble([s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
         return Problem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)

@@ -285,13 +285,16 @@ for form in ({"blend": 0.7, "spread": 6.0}, {"formulation": "total"}):
 """
 
 
-def test_the_bits_do_not_depend_on_the_number_of_threads():
+def test_the_bits_do_not_depend_on_the_number_of_threads(tmp_path):
     own = {name: value for name, value in os.environ.items() if name != "TI_CPU_MAX_NUM_THREADS"}
+    own["TI_OFFLINE_CACHE_FILE_PATH"] = str(tmp_path)
     digests = []
     for threads in (1, 3):
         command = [sys.executable, "-W", "ignore", "-c", BITS, str(threads), str(HERE)]
         done = subprocess.run(command, capture_output=True, text=True, check=True, env=own)
         digests.append(done.stdout.split()[-2:])
+        # Two operators, forward and adjoint, that another process with as many threads need not compile.
+        assert len(list(tmp_path.rglob("*.tic"))) == 4 * len(digests)
     assert [len(digest) for digest in digests[0]] == [64, 64]
     assert digests[0] == digests[1]
 

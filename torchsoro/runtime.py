@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 from typing import Any
 
@@ -10,8 +11,32 @@ import torch
 os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import taichi as ti
+from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 _started: str | None = None
+
+# What is compiled goes to the cache on disk when Taichi ends, which by itself it may not do.
+atexit.register(ti.reset)
+
+
+def _remember_positions() -> None:
+    """Describe the place of a kernel's node, for messages, once and not each time that its function is inlined.
+
+    Half of the time that Taichi takes to read the adjoint kernels, in the cache or not, goes into that.
+    """
+    describe, known = ASTTransformerContext.get_pos_info, {}
+
+    def remembered(self: ASTTransformerContext, node: Any) -> str:
+        first, last = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)
+        at = self.file, self.lineno_offset, first, last, type(node)
+        if at not in known:
+            known[at] = describe(self, node)
+        return known[at]
+
+    ASTTransformerContext.get_pos_info = remembered
+
+
+_remember_positions()
 
 
 def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> None:

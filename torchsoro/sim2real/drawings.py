@@ -29,8 +29,11 @@ def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:
     assert recording is not None
     names = [m.name for m in trial.setup.markers]
     count, axes = len(names), recording.axes
-    figure = Figure(figsize=(11, 1.2 + 1.35 * count), layout="constrained")
+    high = 1.2 + 1.35 * count
+    figure = Figure(figsize=(11, high))
     panels: Any = figure.subplots(count, len(axes), sharex=True, squeeze=False)
+    # By hand: to have dozens of panels laid out takes longer than to draw them.
+    figure.subplots_adjust(left=0.065, right=0.99, bottom=0.5 / high, top=1 - 0.35 / high, wspace=0.14, hspace=0.12)
     for m, a in np.ndindex(count, len(axes)):
         panel: Axes = panels[m, a]
         panel.plot(recording.time, 1e3 * recording.place[:, m, a], ".", ms=2, color=RECORDED, label="recorded")

@@ -149,7 +149,7 @@ class Problem(Likelihood):
             at += n
             if not sound[list(mine)].all():
                 continue
-            left = [self.residual([m.alone(k) for m in motions], base.errors)[0] for k in mine]
+            left = [self.residual([m.alone(k) for m in motions], base.errors) for k in mine]
             slopes = np.stack([base.r - r for r in left], 1)
             if number < linear:
                 # Any strength within bounds.
@@ -320,7 +320,7 @@ class Problem(Likelihood):
         misfit, errors, r, J = self.measure(base, errors)
         columns = np.zeros((len(r), len(at)))
         for k, i in enumerate(moving, start=1):
-            left, _ = self.residual([m.alone(k) for m in motions], errors)
+            left = self.residual([m.alone(k) for m in motions], errors)
             columns[:, i] = (r - left) / steps[i]
         misfit += float((self.belief(at, held)[0] ** 2).sum())
         if not (math.isfinite(misfit) and np.isfinite(columns).all()):
@@ -376,7 +376,7 @@ class Problem(Likelihood):
             misfit=point.misfit,
             samples=self.samples,
             unknowns=size - len(self.common),
-            seen=tuple(self.camera.see(m, i, point.errors)[0] for i, m in enumerate(point.motions)),
+            seen=tuple(self.camera.see(m, i, point.errors) for i, m in enumerate(point.motions)),
             whitened=tuple(np.split(point.r, cuts)),
             point=point.at,
             end=point,

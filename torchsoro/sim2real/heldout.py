@@ -63,14 +63,14 @@ def _seen(problem: Problem, there: Problem, fit: Fit, motions: Sequence[Motion])
         one = motion.alone()
         errors = np.concatenate([np.zeros(count), known])
         for _ in range(6):
-            seen, by = there.camera.see(one, i, errors)
+            seen, by = there.camera.linearise(one, i, errors)
             left, slope = trial.recording.place - seen, by[..., i]
             good = np.isfinite(left)
             weight = (problem.noise / there.camera.deviations[i]) ** 2
             errors[i] += (float((left[good] * slope[good]).sum()) - weight * errors[i]) / (
                 float((slope[good] ** 2).sum()) + weight
             )
-        seen, _ = there.camera.see(one, i, errors)
+        seen = there.camera.see(one, i, errors)
         square = (trial.recording.place - seen) ** 2
         error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
         total = float(np.sqrt(np.nanmean(square.sum(-1))))

@@ -130,9 +130,9 @@ class Lines:
     ) -> None:
         self.errors, self.n = errors, len(problem.common)
         trials, count, windows, _ = forces.shape
-        r, J = problem.residual(row(motions, 0), errors)
+        r, J = problem.linear(row(motions, 0), errors)
         rows = range(1, 1 + self.n + count * windows * 3)
-        slopes = np.stack([r - problem.residual(row(motions, k), errors)[0] for k in rows], 1)
+        slopes = np.stack([r - problem.residual(row(motions, k), errors) for k in rows], 1)
         rise = slopes[:, self.n :].reshape(len(r), count, windows, 3)
         # What begins and ends: the difference of two steps.
         pulse = rise - np.concatenate([rise[:, :, 1:], np.zeros_like(rise[:, :, :1])], 2)

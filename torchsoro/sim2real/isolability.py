@@ -135,8 +135,8 @@ def changes(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion], m
     still = np.zeros(len(camera.deviations))
     parts = []
     for i, (band, base, motion) in enumerate(zip(bands, believed, motions, strict=True)):
-        seen = camera.see(base, i, still)[0]
-        each = [camera.see(motion.alone(k), i, still)[0] - seen if good else 0 * seen for k, good in enumerate(sound)]
+        seen = camera.see(base, i, still)
+        each = [camera.see(motion.alone(k), i, still) - seen if good else 0 * seen for k, good in enumerate(sound)]
         parts.append(band.whiten(np.stack(each, -1)))
     return np.concatenate(parts)
 
@@ -144,8 +144,8 @@ def changes(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion], m
 def errors_of(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion]) -> np.ndarray:
     """Whitened change by each measurement error [N, L]."""
     still = np.zeros(len(camera.deviations))
-    seen = [band.whiten(camera.see(m, i, still)[1]) for i, (band, m) in enumerate(zip(bands, believed, strict=True))]
-    return np.concatenate(seen)
+    slopes = [camera.linearise(motion, i, still)[1] for i, motion in enumerate(believed)]
+    return np.concatenate([band.whiten(by) for band, by in zip(bands, slopes, strict=True)])
 
 
 def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, camera: Camera) -> np.ndarray:

@@ -217,12 +217,20 @@ class Likelihood:
 
     # Residuals --------------------------------------------------------------------------------------------------
 
-    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Whitened residual of all trials, and its slopes by the measurement errors."""
+    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> np.ndarray:
+        """Whitened residual of all trials."""
+        left = []
+        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+            assert trial.recording is not None
+            left.append(band.whiten(trial.recording.place - self.camera.see(motion, i, errors)))
+        return np.concatenate(left)
+
+    def linear(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`residual`, and its slopes by the measurement errors."""
         left, slopes = [], []
         for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
             assert trial.recording is not None
-            seen, by = self.camera.see(motion, i, errors)
+            seen, by = self.camera.linearise(motion, i, errors)
             left.append(band.whiten(trial.recording.place - seen))
             slopes.append(band.whiten(by))
         return np.concatenate(left), np.concatenate(slopes)
@@ -234,7 +242,7 @@ class Likelihood:
         weight = 1 / self.camera.deviations
         best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
         for _ in range(6):
-            r, J = self.residual(motions, errors)
+            r, J = self.linear(motions, errors)
             misfit = float(r @ r + ((errors * weight) ** 2).sum())
             if misfit < best[0]:
                 gained = best[0] - misfit

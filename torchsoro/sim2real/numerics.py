@@ -141,7 +141,7 @@ def measure(
     found = []
     for i, motion in enumerate(own[: len(trials)]):
         left = SURE * np.sqrt(sum(d[i] ** 2 for d in deviations))
-        seen = here.camera.see(motion, i, np.zeros(len(here.camera.deviations)))[0]
+        seen = here.camera.see(motion, i, np.zeros(len(here.camera.deviations)))
         # Error is shared: no marker is far better than the others.
         shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
@@ -195,7 +195,7 @@ def _told(here: Problem, motions: Sequence[Motion]) -> list[Trial]:
     told = []
     for i, (trial, motion) in enumerate(zip(here.trials, motions, strict=False)):
         assert trial.recording is not None
-        place = here.camera.see(motion.alone(), i, np.zeros(len(here.camera.deviations)))[0]
+        place = here.camera.see(motion.alone(), i, np.zeros(len(here.camera.deviations)))
         recording = dataclasses.replace(trial.recording, place=place)
         told.append(dataclasses.replace(trial, recording=recording))
     return told

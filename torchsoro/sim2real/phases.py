@@ -153,8 +153,8 @@ def _before(there: Problem, i: int, motion: Motion, point: np.ndarray) -> np.nda
     x, good = np.zeros(len(prior)), None
 
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        seen, by = there.camera.see(motion.alone(0), i, x[n:])
-        rise = [(there.camera.see(motion.alone(k + 1), i, x[n:])[0] - seen) / STEP for k in range(n)]
+        seen, by = there.camera.linearise(motion.alone(0), i, x[n:])
+        rise = [(there.camera.see(motion.alone(k + 1), i, x[n:]) - seen) / STEP for k in range(n)]
         slopes = np.concatenate([np.stack(rise, -1), by], -1) / wide[..., None]
         return (recording.place - seen) / wide - slopes[..., :n] @ x[:n], slopes
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 from scipy.linalg import solve_triangular
 from scipy.optimize import linear_sum_assignment
 
@@ -90,7 +89,7 @@ class Camera:
         self.names += [f"{m.name}_{a}_m" for m in setup.markers for a in "xyz"]
         self.names += [f"slip_{s.trial}_{setup.markers[s.marker].name}_{a}_m" for s in slips for a in "xyz"]
 
-    def see(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def see(self, motion: Motion, number: int, errors: np.ndarray) -> np.ndarray:
         """What trial ``number`` would have recorded.
 
         Args:
@@ -99,51 +98,74 @@ class Camera:
             errors: Measurement errors [K].
 
         Returns:
-            Places [T, M, A] m, and their derivatives by the errors [T, M, A, K].
+            Places [T, M, A] m.
         """
-        recording = self.trials[number].recording
-        assert recording is not None
-        count = len(self.trials)
-        rate, ln_scale = errors[count : count + 2]
-        own_errors = count + 5 + 3 * self.markers
-        turn, place = errors[count + 2 : count + 5], errors[count + 5 : own_errors].reshape(self.markers, 3)
-        clock = recording.time - errors[number]
-        own = np.clip(clock / (1 + rate), 0.0, float(motion.time[-1]))
-        x, v, gradient = _at(motion, own)
-        v = v * ((clock > 0) & (clock < float(motion.time[-1])))[:, None, None]
-        body = x + np.einsum("tmij,mj->tmi", gradient, place)
-        scale, R = math.exp(ln_scale), _rotation(turn)
-        seen = scale * body @ R.T
+        own, place, frame = self._view(motion, number, errors)
+        body, _, gradient = _at(motion, own)
+        return self._recorded((body + np.einsum("tmij,mj->tmi", gradient, place)) @ frame.T, number, errors)
+
+    def linearise(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`see`, and the derivatives of the places by the errors [T, M, A, K]."""
+        count, rate = len(self.trials), errors[len(self.trials)]
+        own, place, frame = self._view(motion, number, errors)
+        body, velocity, gradient = _at(motion, own)
+        seen = (body + np.einsum("tmij,mj->tmi", gradient, place)) @ frame.T
+        # The clock does nothing before the motion begins and after it ends.
+        turned = (velocity * ((own > 0) & (own < float(motion.time[-1])))[:, None, None]) @ frame.T
         by = np.zeros((*seen.shape, len(errors)))
-        turned = scale * v @ R.T
         by[..., number] = -turned / (1 + rate)
         by[..., count] = -turned * own[:, None, None] / (1 + rate)
         by[..., count + 1] = seen
-        for axis in range(3):
-            unit = np.zeros(3)
-            unit[axis] = 1.0
+        for axis, unit in enumerate(np.eye(3)):
             by[..., count + 2 + axis] = np.cross(unit, seen)
-        moved = scale * np.einsum("ia,tmaj->tmij", R, gradient)
+        moved = np.einsum("ia,tmaj->tmij", frame, gradient)
         for m in range(self.markers):
             by[:, m, :, count + 5 + 3 * m : count + 8 + 3 * m] = moved[:, m]
-        for k, slip in enumerate(self.slips):
-            if slip.trial == self.trials[number].name:
-                first, course = own_errors + 3 * k, slip.course(recording.time)
-                seen[:, slip.marker] += course[:, None] * errors[first : first + 3]
-                for axis in range(3):
-                    by[:, slip.marker, axis, first + axis] = course
-        axes = list(self.setup.axes)
-        return seen[:, :, axes], by[:, :, axes]
+        for marker, first, course in self._slipping(number):
+            for axis in range(3):
+                by[:, marker, axis, first + axis] = course
+        return self._recorded(seen, number, errors), by[:, :, list(self.setup.axes)]
+
+    def _view(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times by the body's clock [T] s, places of markers [M, 3] m, and scale times rotation [3, 3]."""
+        recording, count = self.trials[number].recording, len(self.trials)
+        assert recording is not None
+        rate, ln_scale = errors[count : count + 2]
+        own = np.clip((recording.time - errors[number]) / (1 + rate), 0.0, float(motion.time[-1]))
+        place = errors[count + 5 : count + 5 + 3 * self.markers].reshape(self.markers, 3)
+        return own, place, math.exp(ln_scale) * _rotation(errors[count + 2 : count + 5])
+
+    def _slipping(self, number: int) -> list[tuple[int, int, np.ndarray]]:
+        """Markers that slip in a trial: which, where its errors begin, and share of the way [T]."""
+        trial, first = self.trials[number], len(self.trials) + 5 + 3 * self.markers
+        assert trial.recording is not None
+        return [
+            (slip.marker, first + 3 * k, slip.course(trial.recording.time))
+            for k, slip in enumerate(self.slips)
+            if slip.trial == trial.name
+        ]
+
+    def _recorded(self, seen: np.ndarray, number: int, errors: np.ndarray) -> np.ndarray:
+        """Places [T, M, 3] m with what slips, along the axes that are recorded."""
+        seen = seen.copy()
+        for marker, first, course in self._slipping(number):
+            seen[:, marker] += course[:, None] * errors[first : first + 3]
+        return seen[:, :, list(self.setup.axes)]
 
 
 def _at(motion: Motion, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places, velocities and deformation gradients at times."""
+    """Places and velocities at times, by Hermite's cubic between samples, and deformation gradients."""
     t = motion.time
-    spline = CubicHermiteSpline(t, motion.place, motion.velocity)
     at = np.clip(np.searchsorted(t, time, side="right") - 1, 0, len(t) - 2)
-    share = ((time - t[at]) / (t[at + 1] - t[at]))[:, None, None, None]
-    gradient = motion.gradient
-    return spline(time), spline(time, 1), (1 - share) * gradient[at] + share * gradient[at + 1]
+    h = (t[at + 1] - t[at])[:, None, None]
+    s = (time - t[at])[:, None, None] / h
+    begin, end = motion.place[at], motion.place[at + 1]
+    chord = (end - begin) / h
+    first, last = motion.velocity[at] - chord, motion.velocity[at + 1] - chord
+    place = begin + s * (end - begin) + h * s * (1 - s) * ((1 - s) * first - s * last)
+    velocity = chord + (1 - s) * (1 - 3 * s) * first + s * (3 * s - 2) * last
+    s = s[..., None]
+    return place, velocity, (1 - s) * motion.gradient[at] + s * motion.gradient[at + 1]
 
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
