@@ -4,7 +4,8 @@
     python recipes/explain.py runs/gap --out runs/gap-explained
 
 The robot is simulated as it was designed, by particles, in four trials with different pressures; eight points of one
-side are filmed, with noise. ``setup.toml`` holds what is believed, without what ``--hide`` names:
+side are filmed, with noise. ``setup.toml`` holds what is believed, without what ``--hide`` names, and ``simulated.csv``
+of each trial where the same simulation has the points then:
 
 - tube: the supply's tube at the rear, a mass on a spring with a dashpot;
 - relaxation: the Maxwell elements, which the paper left out of simulations that took too long;
@@ -13,7 +14,8 @@ side are filmed, with noise. ``setup.toml`` holds what is believed, without what
 - nothing: the twin's own error, to be seen before anything is believed of the others.
 
 What was hidden is in ``<out>-truth.json``, beside the experiment. A demonstration, not a proof: body and contact are
-simulated by another formulation than the twin's, but the effects have the forms that it knows.
+simulated by another formulation than the twin's, but the effects have the forms that it knows. With ``--no-simulated``
+the twin has to do by itself.
 """
 
 from __future__ import annotations
@@ -33,12 +35,12 @@ from replay import find
 from torchsoro.archive import load_design, read_settings
 from torchsoro.fabricate import surface
 from torchsoro.loads import Drag, Load, PointMass, Spring
-from torchsoro.material import Body, without_void
+from torchsoro.material import Body, Prony, without_void
 from torchsoro.robot import Robot, build
-from torchsoro.settings import plain_errors
+from torchsoro.settings import Settings, plain_errors
 
 TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # of the pressure
-RATE = 200.0  # Hz, of the camera
+RATE, FINE = 200.0, 1000.0  # Hz, of the camera and of what is simulated
 MARKERS = 8
 TUBE = {"mass_kg": 2e-3, "stiffness_n_m": 10.0, "damping_n_s_m": 0.02}
 REACH = 4e-3  # m around the rearmost point, on which the tube hangs
@@ -65,6 +67,8 @@ class Options:
     """Standard deviation [m]."""
     seed: int = 0
     """Of the noise."""
+    simulated: bool = True
+    """Whether the experiment comes with the simulation of what is believed."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute."""
 
@@ -122,6 +126,41 @@ def believed(options: Options, robot: Robot, stiffness: float) -> str:
     return "\n".join(tables)
 
 
+def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, rate: float) -> dict[str, np.ndarray]:
+    """Times [T] s and places of some particles [T, M, 3] m of a trial."""
+    told = robot.simulator()(
+        body,
+        duration=robot.settings.settle + robot.settings.duration,
+        prony=robot.prony,
+        pressure=robot.pressure,
+        gravity=robot.gravity,
+        planes=robot.planes,
+        loads=loads,
+        sample_every=1 / rate,
+        probes=probes,
+    )
+    return {"time": told.time.cpu().double().numpy(), "place": told.position.cpu().double().numpy()}
+
+
+def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: torch.Tensor) -> dict[str, np.ndarray]:
+    """As :func:`simulate`, of what is believed."""
+    if options.hide == "air":
+        settings = dataclasses.replace(settings, air_stiffness=2 * settings.air_stiffness)
+    robot = build(settings)
+    if options.hide == "relaxation":
+        robot.prony = Prony.paper(0)
+    body, _ = without_void(robot.filled(gamma))
+    return simulate(robot, body, [], probes, FINE)
+
+
+def columns(track: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of a table of markers."""
+    named = {
+        f"m{i}_{a}_m": track["place"][:, i, k] for i in range(track["place"].shape[1]) for k, a in enumerate("xyz")
+    }
+    return {"time_s": track["time"], **named}
+
+
 def spread(places: np.ndarray, count: int) -> list[int]:
     """Numbers of places [N, 3] that lie far from each other."""
     chosen = [0]
@@ -154,27 +193,18 @@ def main(options: Options) -> dict[str, Any]:
         side = torch.nonzero((body.chamber < 0) & (body.position[:, 1] < robot.domain.origin[1] + robot.domain.spacing))
         side = side.squeeze(-1)
         probes = side[spread(body.position[side].cpu().numpy(), MARKERS)]
-        told = robot.simulator()(
-            body,
-            duration=options.settle + options.duration,
-            prony=robot.prony,
-            pressure=robot.pressure,
-            gravity=robot.gravity,
-            planes=robot.planes,
-            loads=loads,
-            sample_every=1 / RATE,
-            probes=probes,
-        )
-        track = told.position.cpu().double().numpy()
-        track += options.noise * rng.standard_normal(track.shape)
-        columns = {"time_s": told.time.cpu().double().numpy()}
-        columns |= {f"m{i}_{a}_m": track[:, i, k] for i in range(len(probes)) for k, a in enumerate("xyz")}
-        time = torch.arange(0.0, float(told.time[-1]) + 2e-3, 1e-3, dtype=torch.float64)
+        track = simulate(robot, body, loads, probes, RATE)
+        track["place"] += options.noise * rng.standard_normal(track["place"].shape)
+        time = torch.arange(0.0, float(track["time"][-1]) + 2e-3, 1e-3, dtype=torch.float64)
         supply = robot.pressure.at(time).reshape(-1).double().numpy()
         chamber = robot.domain.chambers[0].name
-        pressure = {"time_s": time.numpy(), f"{chamber}_pa": supply}
-        trials[name] = Files(kept=name in KEPT, markers=columns, pressure=pressure)
-        print(f"{name}: moved by {1e3 * np.abs(track - track[0]).max():.1f} mm")
+        trials[name] = Files(
+            kept=name in KEPT,
+            markers=columns(track),
+            pressure={"time_s": time.numpy(), f"{chamber}_pa": supply},
+            simulated=columns(nominal(options, settings, gamma, probes)) if options.simulated else None,
+        )
+        print(f"{name}: moved by {1e3 * np.abs(track['place'] - track['place'][0]).max():.1f} mm")
     places = body.position[probes].cpu().numpy().tolist()
     text = believed(options, robot, base.air_stiffness * (2 if options.hide == "air" else 1))
     write(options.out, setup(text, {f"m{i}": at for i, at in enumerate(places)}, options.noise), trials)

@@ -148,12 +148,14 @@ class Files:
         markers: Columns of markers.csv.
         pressure: Those of pressure.csv, if there is one.
         trial: Text of trial.toml, if there is one.
+        simulated: Columns of simulated.csv, if there is one.
     """
 
     kept: bool
     markers: dict[str, np.ndarray]
     pressure: dict[str, np.ndarray] | None = None
     trial: str = ""
+    simulated: dict[str, np.ndarray] | None = None
 
 
 def write(out: Path, text: str, trials: Mapping[str, Files]) -> None:
@@ -163,8 +165,9 @@ def write(out: Path, text: str, trials: Mapping[str, Files]) -> None:
     for trial, files in trials.items():
         folder = out / ("heldout" if files.kept else "trials") / trial
         write_table(folder / "markers.csv", files.markers)
-        if files.pressure is not None:
-            write_table(folder / "pressure.csv", files.pressure)
+        for name, columns in (("pressure", files.pressure), ("simulated", files.simulated)):
+            if columns is not None:
+                write_table(folder / f"{name}.csv", columns)
         if files.trial:
             (folder / "trial.toml").write_text(files.trial, encoding="utf-8")
 

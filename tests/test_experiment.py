@@ -121,6 +121,31 @@ def test_bad_tables_are_refused(tmp_path, table, message):
         read_experiment(experiment(tmp_path, markers=table))
 
 
+def test_a_simulation_of_ones_own_is_read_along_all_axes(tmp_path):
+    table = tmp_path / "trials" / "a" / "simulated.csv"
+    folder = experiment(tmp_path)
+    assert read_experiment(folder).trials[0].simulated is None
+    table.write_text("time_s,tip_x_m,tip_y_m,tip_z_m\n0,0.04,0.01,0.02\n0.05,0.05,0.01,0.02\n0.1,0.06,0.01,0.02\n")
+    simulated = read_experiment(folder).trials[0].simulated
+    assert simulated.place[:, 0, 0].tolist() == [0.04, 0.05, 0.06]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("0,0.04,0.01,0.02\n0.05,,0.01,0.02\n0.1,0.06,0.01,0.02", "an empty cell, wanted all places"),
+        ("0,0.04,0.01,0.02\n0.03,0.04,0.01,0.02\n0.06,0.06,0.01,0.02", r"0 to 0\.06 s, wanted 0 to 0\.1 s"),
+        ("0.02,0.04,0.01,0.02\n0.03,0.04,0.01,0.02\n0.1,0.06,0.01,0.02", r"0\.02 to 0\.1 s, wanted 0 to 0\.1 s"),
+        ("0,40,10,20\n0.05,40,10,20\n0.1,40,10,20", "is it in metres"),
+    ],
+)
+def test_a_simulation_that_says_too_little_is_refused(tmp_path, rows, message):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "a" / "simulated.csv").write_text(f"time_s,tip_x_m,tip_y_m,tip_z_m\n{rows}\n")
+    with pytest.raises(ValueError, match=rf"simulated\.csv.*{message}"):
+        read_experiment(folder)
+
+
 def test_no_trial_is_refused(tmp_path):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "markers.csv").unlink()

@@ -19,7 +19,7 @@ from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
-from torchsoro.sim2real.numerics import choose_twin, cost
+from torchsoro.sim2real.numerics import choose_twin, cost, measure
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
@@ -262,6 +262,26 @@ def test_a_finer_twin_corrects_where_one_is(made):
     for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
         assert np.abs(motion.place - right.place).max() < 1e-7
     assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
+
+
+def test_a_simulation_of_ones_own_is_what_is_believed(made):
+    twin, ensemble, record = made
+    experiment = record(None)
+    still = [((), np.zeros((1, 1)))]
+    problem = Problem(experiment, twin, ensemble=ensemble)
+    time, trials = np.arange(0.0, 0.2001, 0.0025), []
+    for trial, motion in zip(experiment.trials, problem.simulate(still)[0], strict=True):
+        place = motion.alone().place[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
+        trials.append(dataclasses.replace(trial, simulated=Recording(time=time, place=place)))
+    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
+    numerics = measure(dataclasses.replace(experiment, trials=tuple(trials)), ensemble, fine)
+    told = {"shift": numerics.shift, "correction": numerics.correction}
+    problem = Problem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
+    for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
+        np.testing.assert_allclose(motion.alone().place[: len(time)], trial.simulated.place, atol=1e-9)
+    # Also where modulus and pressure are not what is believed.
+    moved = problem.corrected(np.array([0.8])).correction
+    assert all(moved[t.name] is numerics.correction[t.name] for t in trials)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

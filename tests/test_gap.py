@@ -34,15 +34,22 @@ def track(found):
     return np.stack([t.recording.place for t in found.trials])
 
 
+def simulated(found):
+    """At the times of the recordings."""
+    return np.stack([t.simulated.place[:: round(0.005 / 0.001)] for t in found.trials])
+
+
 def test_every_hidden_effect_has_a_name_and_is_not_in_what_is_believed(hide):
     plain, truth = hide("nothing")
     assert truth == {} and [t.name for t in plain.heldout] == ["kept"]
     assert np.ptp(track(plain), axis=1).max() > 1e-5
+    np.testing.assert_allclose(simulated(plain), track(plain), atol=1e-7)
     names = {e.name for e in library()}
     for what in ("tube", "asymmetry"):
         found, truth = hide(what)
         assert truth["name"] in names
         assert np.abs(track(found) - track(plain)).max() > 1e-7
+        np.testing.assert_allclose(simulated(found), track(plain), atol=1e-7)
         # All is believed that is true without it.
         assert found.setup == dataclasses.replace(plain.setup, surface=found.setup.surface)
     found, truth = hide("air")
@@ -50,10 +57,13 @@ def test_every_hidden_effect_has_a_name_and_is_not_in_what_is_believed(hide):
     assert truth == {"name": "air_stiffness", "parameters": {"air_stiffness_pa": -once}}
     assert twice == 2 * once > 0
     np.testing.assert_allclose(track(found), track(plain), atol=1e-7)
+    assert np.abs(simulated(found) - track(plain)).max() > 1e-7
     relaxed, truth = hide("relaxation")
     assert truth["name"] in names and len(truth["prony"]) == 2
     assert not relaxed.setup.prony and len(plain.setup.prony) == 2
     np.testing.assert_allclose(track(relaxed), track(plain), atol=1e-7)
+    assert np.abs(simulated(relaxed) - track(plain)).max() > 1e-7
+    assert all(t.simulated is None for t in hide("nothing", simulated=False)[0].trials)
 
 
 def test_the_twin_of_a_robot_stands_on_its_ground(hide):

@@ -131,12 +131,15 @@ class Trial:
         setup: With what differs in this trial.
         recording: Marker places; None for a trial that is to be predicted.
         pressure: Supply pressure [chambers, S] Pa; None without a chamber.
+        simulated: Where a simulation of one's own has the markers of what is believed, along x, y and z; None if there
+            is none.
     """
 
     name: str
     setup: Setup
     recording: Recording | None
     pressure: Waveform | None
+    simulated: Recording | None = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -173,7 +176,7 @@ def read_experiment(folder: Path) -> Experiment:
 
 
 def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
-    """Read a trial's folder: markers.csv, pressure.csv and trial.toml where they are.
+    """Read a trial's folder: markers.csv, simulated.csv, pressure.csv and trial.toml where they are.
 
     Args:
         folder: Of the trial.
@@ -201,7 +204,21 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
         if not supply.is_file():
             raise ValueError(f"{folder}: no pressure.csv, wanted one, as the body has a chamber")
         pressure = _pressure(supply, [c.name for c in setup.cavities])
-    return Trial(name=folder.name, setup=setup, recording=recording, pressure=pressure)
+    own = folder / "simulated.csv"
+    simulated = _simulated(own, setup) if own.is_file() else None
+    return Trial(name=folder.name, setup=setup, recording=recording, pressure=pressure, simulated=simulated)
+
+
+def _simulated(path: Path, setup: Setup) -> Recording:
+    found = Recording.read(path, [m.name for m in setup.markers])
+    if not found.seen.all():
+        raise ValueError(f"{path}: an empty cell, wanted all places of a simulation")
+    if found.time[0] > 0 or found.time[-1] < setup.duration - SHORTEST:
+        raise ValueError(
+            f"{path}: times from {found.time[0]:g} to {found.time[-1]:g} s, wanted 0 to {setup.duration:g} s"
+        )
+    _check_places(found, dataclasses.replace(setup, axes=(0, 1, 2)), path)
+    return found
 
 
 def _check_places(recording: Recording, setup: Setup, path: Path) -> None:

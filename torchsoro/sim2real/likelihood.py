@@ -135,15 +135,18 @@ class Likelihood:
         return there
 
     def corrected(self, at: np.ndarray) -> Self:
-        """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales."""
+        """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales.
+
+        A simulation of one's own is of what is believed, and stays what it is.
+        """
         if self.fine is None:
             return self
         still: list[Request] = [((), at[None])]
         there = type(self)(self.experiment, self.fine.twin, trials=self.trials, noise=self.noise, ensemble=self.fine)
         own = self.only(self.trials, correction={}).simulate(still)[0]
-        return self.only(
-            self.trials, correction={**self.correction, **added(self.trials, own, there.simulate(still)[0])}
-        )
+        known = {t.name: self.correction[t.name] for t in self.trials if t.simulated and t.name in self.correction}
+        found = added(self.trials, own, there.simulate(still)[0])
+        return self.only(self.trials, correction={**self.correction, **found, **known})
 
     def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those of the effects for which there is something in a trial that they change."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.interpolate import Akima1DInterpolator
 
 from torchsoro.sim2real.ensemble import Ensemble, safety
 from torchsoro.sim2real.experiment import Experiment, Setup, Trial
@@ -27,6 +28,7 @@ SURE = 1.5  # times the differences that were seen
 FINER = (2.0, 1.5)  # times as many cells along each axis, of the twin that corrects the one in use
 GAP = 2e-5  # m
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
+OWN = 1 / 3  # of what a simulation of one's own does otherwise, that may be different with an effect
 FLOOR = 0.003  # of the motion, below which no twin is trusted
 
 
@@ -114,6 +116,9 @@ def measure(
 ) -> Numerics:
     """Simulate what is believed with a finer twin, and see what measurement errors and beliefs cannot take up.
 
+    A trial that comes with a simulation of one's own has that in place of the finer twin's: asked is then what that
+    simulation left out.
+
     Args:
         experiment: What is to be explained, with trials that are only predicted.
         ensemble: Of the twin in use.
@@ -125,7 +130,7 @@ def measure(
     everything = [*trials, *(t for t in experiment.heldout if t.recording is not None)]
     common = {"noise": 1e-4, "report": report}
     there = Problem(experiment, fine.twin, trials=everything, ensemble=fine, **common)
-    other = _believed(there)
+    other = [_as_simulated(motion, t) for motion, t in zip(_believed(there), everything, strict=True)]
     here = Problem(experiment, twin, trials=trials, ensemble=ensemble, priors=EXACT, **common)
     fit = here.only(_told(here, other)).fit([((), None)], rounds=4)[0]
     shift = np.zeros(len(here.common)) if fit is None else fit.belief
@@ -136,8 +141,9 @@ def measure(
     # blows do not.
     ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
     share = 1.0 if here.scenarios[0].grounds else 1 / (ratio**2 - 1)
-    deviations = [_apart(here, other[: len(trials)], share)]
-    deviations += [_apart(here, touching, 0.5) for touching in _touching(here)]
+    shares = [share if t.simulated is None else OWN for t in trials]
+    deviations = [_apart(here, other[: len(trials)], shares)]
+    deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
     found = []
     for i, motion in enumerate(own[: len(trials)]):
         left = SURE * np.sqrt(sum(d[i] ** 2 for d in deviations))
@@ -173,8 +179,18 @@ def _touching(here: Problem) -> list[list[Motion]]:
     return [[m.alone(k) for m in motions] for k in range(2)]
 
 
-def _apart(here: Problem, other: Sequence[Motion], share: float) -> list[np.ndarray]:
-    """A share of how far other motions are off, once modulus, pressure and measurement errors are fitted.
+def _as_simulated(motion: Motion, trial: Trial) -> Motion:
+    """A motion with the places of the trial's own simulation, where there is one."""
+    own = trial.simulated
+    if own is None:
+        return motion
+    course = Akima1DInterpolator(own.time, own.place)
+    time = np.minimum(motion.time, own.time[-1])
+    return dataclasses.replace(motion, place=course(time), velocity=course(time, 1))
+
+
+def _apart(here: Problem, other: Sequence[Motion], shares: Sequence[float]) -> list[np.ndarray]:
+    """Shares of how far other motions are off, once modulus, pressure and measurement errors are fitted.
 
     Returns:
         For each trial [M, A] m.
@@ -185,7 +201,7 @@ def _apart(here: Problem, other: Sequence[Motion], share: float) -> list[np.ndar
         return [np.zeros(n.shape) for n in here.numerics]
     return [
         share * np.sqrt(((t.recording.place - seen) ** 2).mean(0))
-        for t, seen in zip(told, fit.seen, strict=True)
+        for t, seen, share in zip(told, fit.seen, shares, strict=True)
         if t.recording is not None
     ]
 
