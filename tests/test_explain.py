@@ -274,9 +274,12 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
         place = motion.alone().place[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
         trials.append(dataclasses.replace(trial, simulated=Recording(time=time, place=place)))
     fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
-    numerics = measure(dataclasses.replace(experiment, trials=tuple(trials)), ensemble, fine)
+    assert not problem.stated
+    experiment = dataclasses.replace(experiment, trials=(trials[0],), heldout=(trials[1],))
+    numerics = measure(experiment, ensemble, fine)
     told = {"shift": numerics.shift, "correction": numerics.correction}
     problem = Problem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
+    assert problem.stated.keys() == {t.name for t in trials}
     for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
         np.testing.assert_allclose(motion.alone().place[: len(time)], trial.simulated.place, atol=1e-9)
     # Also where modulus and pressure are not what is believed.

@@ -144,9 +144,14 @@ class Likelihood:
         still: list[Request] = [((), at[None])]
         there = type(self)(self.experiment, self.fine.twin, trials=self.trials, noise=self.noise, ensemble=self.fine)
         own = self.only(self.trials, correction={}).simulate(still)[0]
-        known = {t.name: self.correction[t.name] for t in self.trials if t.simulated and t.name in self.correction}
         found = added(self.trials, own, there.simulate(still)[0])
-        return self.only(self.trials, correction={**self.correction, **found, **known})
+        return self.only(self.trials, correction={**self.correction, **found, **self.stated})
+
+    @property
+    def stated(self) -> dict[str, Motion]:
+        """Of the corrections, those by a simulation of one's own."""
+        trials = (*self.experiment.trials, *self.experiment.heldout)
+        return {t.name: self.correction[t.name] for t in trials if t.simulated and t.name in self.correction}
 
     def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those of the effects for which there is something in a trial that they change."""

@@ -50,7 +50,7 @@ def search(
     if nothing.misfit > FAR * nothing.samples:
         # Nothing is linear here, but less is wrong at first, where a wrong frequency is not yet a wrong phase. What a
         # finer twin adds to the motion that is believed says little about one that is so different.
-        problem = problem.only(problem.trials, correction={})
+        problem = problem.only(problem.trials, correction=problem.stated)
         carried = _from_the_beginning(problem, effects, most)
         problem, nothing = _nothing(problem, [t for t in carried if not t[0]], report)
     else:
