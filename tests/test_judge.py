@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import csv
 import importlib
 import json
 import math
@@ -279,7 +280,11 @@ def test_a_perfect_and_a_silent_answer_are_scored_as_such(judge, batch, tmp_path
         clean = (batch / "sealed" / case["case"] / "clean.csv").read_text()
         (tmp_path / "perfect" / case["case"] / "predicted.csv").write_text(clean)
     folders = (f"perfect={tmp_path / 'perfect'}", f"silent={tmp_path / 'silent'}")
-    tables = judge.score.score(batch, answers=folders, threshold=0.0, out=tmp_path / "score.json")
+    written = {"out": tmp_path / "score.json", "cases": tmp_path / "cases.csv"}
+    tables = judge.score.score(batch, answers=folders, threshold=0.0, **written)
+    rows = list(csv.DictReader(written["cases"].read_text().splitlines()))
+    assert [row["case"] for row in rows] == [c["case"] for c in truth["cases"]]
+    assert all(row["names"] == row["truth"] for row in rows if row["verdict"] == "explained")
     assert "acceptance" not in capsys.readouterr().err
     perfect, silent = tables["perfect"], tables["silent"]
     assert perfect["false alarms, nulls and decoys (<= 10 %)"].startswith("0 % [0, 84] 0/2")

@@ -9,6 +9,7 @@ least twice ``--threshold``, the strength at which an effect can just be seen.
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import itertools
 import json
@@ -172,9 +173,30 @@ def check(batch: Path) -> dict[str, Any]:
     return truth
 
 
+def write_cases(path: Path, truth: Sequence[dict[str, Any]], cases: Sequence[Scored]) -> None:
+    """Write each case with what was answered, as a CSV file; what there is not is empty."""
+    head = "case specimen kind strength truth decoy verdict names set place_error_over_length parameter_errors "
+    head += "intervals_hold sealed_after_over_before seconds"
+    known = {t["case"]: t for t in truth}
+
+    def told(*values: float | None) -> str:
+        return " ".join("" if v is None else f"{v:.3g}" for v in values)
+
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(head.split())
+        for c in cases:
+            place = None if c.location_error is None else c.location_error / c.length
+            holds = " ".join("yes" if held else "no" for held in c.covered)
+            case = (c.case, known[c.case]["specimen"], c.kind, told(c.strength), " + ".join(c.truth))
+            names = (known[c.case]["decoy"], c.verdict, " + ".join(c.names), " / ".join(c.set))
+            numbers = (told(place), told(*c.parameter_errors), holds, told(c.sealed_ratio), told(c.seconds or None))
+            rows.writerow((*case, *names, *numbers))
+
+
 def score(
     batch: Path, /, *, answers: tuple[str, ...], threshold: float = 1.0, rename: Path | None = None,
-    asked: bool = False, out: Path | None = None,
+    asked: bool = False, out: Path | None = None, cases: Path | None = None,
 ) -> dict[str, dict[str, str]]:  # fmt: skip
     """Print the tables.
 
@@ -185,6 +207,7 @@ def score(
         rename: JSON {"effects": {theirs: ours}, "parameters": {"effect": {theirs: ours}}} for other vocabularies.
         asked: Leave out what no answer was written for, as of a tool that was not asked for all.
         out: JSON file for the tables and every case.
+        cases: CSV file for every case of the first folder of answers.
 
     Returns:
         The acceptance table of each folder of answers.
@@ -194,25 +217,27 @@ def score(
     found: dict[str, list[Scored]] = {}
     for item in answers:
         label, _, folder = item.rpartition("=")
-        cases = [match(t, Path(folder), batch, words) for t in truth["cases"]]
-        found[label or Path(folder).name] = [c for c in cases if not asked or c.verdict != "missing"]
-    tables = {label: table(cases, threshold) for label, cases in found.items()}
+        every = [match(t, Path(folder), batch, words) for t in truth["cases"]]
+        found[label or Path(folder).name] = [c for c in every if not asked or c.verdict != "missing"]
+    tables = {label: table(every, threshold) for label, every in found.items()}
     rows = next(iter(tables.values()))
     width = max(map(len, rows))
     columns = [max(len(label), *(len(v) for v in rows.values())) for label, rows in tables.items()]
     print(f"{len(truth['cases'])} cases, batch {truth['batch']}, strong: at least {2 * threshold:g}")
     if asked:
-        print("answered: " + ", ".join(f"{label} {len(cases)}" for label, cases in found.items()))
+        print("answered: " + ", ".join(f"{label} {len(every)}" for label, every in found.items()))
     print("  ".join(["".ljust(width), *(label.ljust(w) for label, w in zip(tables, columns, strict=True))]))
     for row in rows:
         cells = [t[row].ljust(w) for t, w in zip(tables.values(), columns, strict=True)]
         print("  ".join([row.ljust(width), *cells]))
-    for label, cases in found.items():
-        print(f"\n{label}: over strength (half are seen at {half_seen(cases):.2g})", *over_strength(cases), sep="\n")
-        print(f"\n{label}: what was answered", *confusion(cases), sep="\n")
+    for label, every in found.items():
+        print(f"\n{label}: over strength (half are seen at {half_seen(every):.2g})", *over_strength(every), sep="\n")
+        print(f"\n{label}: what was answered", *confusion(every), sep="\n")
     if out is not None:
-        every = {label: [asdict(c) for c in cases] for label, cases in found.items()}
-        out.write_text(json.dumps({"tables": tables, "cases": every}, indent=1))
+        whole = {label: [asdict(c) for c in every] for label, every in found.items()}
+        out.write_text(json.dumps({"tables": tables, "cases": whole}, indent=1))
+    if cases is not None:
+        write_cases(cases, truth["cases"], next(iter(found.values())))
     return tables
 
 
