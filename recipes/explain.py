@@ -22,9 +22,9 @@ import tyro
 from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
-from torchsoro.sim2real.fit import Problem
+from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.forcemap import force_map
-from torchsoro.sim2real.heldout import predict
+from torchsoro.sim2real.heldout import Prediction, predict
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.isolability import isolability
 from torchsoro.sim2real.library import library
@@ -74,7 +74,8 @@ def predicted(options: Options) -> None:
     assert options.predict is not None
     if options.trial is None:
         raise ValueError("trial: wanted the trial.toml to predict")
-    write_table(options.out, predict_trial(read_model(options.predict), options.trial, options.predict))
+    model, threads = read_model(options.predict), options.threads or THREADS
+    write_table(options.out, predict_trial(model, options.trial, options.predict, threads, options.device))
 
 
 def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
@@ -115,6 +116,9 @@ def prepared(options: Options) -> tuple[Problem, Numerics]:
         ValueError: for an experiment that cannot be read or simulated.
     """
     experiment, trials, twin = begun(options)
+    chosen = named(options.effects)
+    if chosen and not any(e.applies(twin.scenario(t), twin) for e in chosen for t in trials):
+        raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
     print(f"twin: {twin.count} points, cells of {1e3 * twin.edge:.2f} mm")
     ensemble = Ensemble(twin, options.threads or THREADS, options.device)
     fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads, options.device)
@@ -137,6 +141,18 @@ def prepared(options: Options) -> tuple[Problem, Numerics]:
     return problem, numerics
 
 
+def shown(
+    problem: Problem, best: Fit, trials: list[Trial], kept: list[Trial]
+) -> tuple[list[Trial], tuple[Prediction, ...], tuple[Prediction, ...]]:
+    """The trials that do not break down, as believed and as explained."""
+    for asked in ([*trials, *kept], trials):
+        before, after = (tuple(predict(problem, best, asked, believed=b)) for b in (True, False))
+        if before and after:
+            break
+        print("a trial that was left out breaks down, and is not shown")
+    return asked, before, after
+
+
 def main(options: Options) -> Explanation | None:
     """Explain an experiment, or predict a trial.
 
@@ -145,6 +161,8 @@ def main(options: Options) -> Explanation | None:
     """
     if options.predict is not None:
         return predicted(options)
+    if options.out.exists() and not options.out.is_dir():
+        raise ValueError(f"out = {options.out}: a file, wanted a folder")
     effects = named(options.effects)
     begin = time.perf_counter()
     problem, numerics = prepared(options)
@@ -158,8 +176,7 @@ def main(options: Options) -> Explanation | None:
     if verdict.kind == "cannot_distinguish":
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
-    everything = [*trials, *kept]
-    after = tuple(predict(problem, best, everything))
+    everything, before, after = shown(problem, best, trials, kept)
     # Without what the best effect leaves, which was priced for the verdict.
     known = problem.only(problem.trials, numerics=numerics.deviation)
     forces = None
@@ -172,7 +189,7 @@ def main(options: Options) -> Explanation | None:
         problem=problem,
         numerics=numerics,
         verdict=verdict,
-        before=tuple(predict(problem, best, everything, believed=True)),
+        before=before,
         after=after,
         heldout=tuple(t.name for t in kept),
         mismatches=tuple(mismatches(known, verdict.nothing, everything, after)),

@@ -29,7 +29,7 @@ import numpy as np
 import torch
 import trimesh
 import tyro
-from recordings import Files, setup, write
+from recordings import Files, fresh, setup, write
 from replay import find
 
 from torchsoro.archive import load_design, read_settings
@@ -177,9 +177,10 @@ def main(options: Options) -> dict[str, Any]:
         What was hidden.
 
     Raises:
-        ValueError: for a robot that does not exist.
+        ValueError: for a robot that does not exist, or a folder that holds an experiment already.
         SimulationDiverged: if the simulation breaks down.
     """
+    fresh(options.out)
     folder = find(options.robot)
     base = read_settings(folder / "settings.json", device=options.device)
     rng, trials, truth = np.random.default_rng(options.seed), {}, {}

@@ -158,6 +158,17 @@ class Files:
     simulated: dict[str, np.ndarray] | None = None
 
 
+def fresh(out: Path) -> Path:
+    """A folder for an experiment.
+
+    Raises:
+        ValueError: if it holds trials already, among which new ones would be lost.
+    """
+    if (out / "trials").exists() or (out / "heldout").exists():
+        raise ValueError(f"out = {out}: holds an experiment already, wanted a new folder")
+    return out
+
+
 def write(out: Path, text: str, trials: Mapping[str, Files]) -> None:
     """Write an experiment."""
     out.mkdir(parents=True, exist_ok=True)
@@ -267,13 +278,15 @@ def main(options: Options) -> None:
     """Write the experiment.
 
     Raises:
-        ValueError: if the folder is none of those, or a recording is not there; before anything is written.
+        ValueError: if the folder is none of those, a recording is not there, or an experiment is in its place; before
+            anything is written.
     """
     name = options.recordings.resolve().name
     if name not in MAKERS:
         raise ValueError(f"recordings = {options.recordings}, wanted a folder named {' or '.join(MAKERS)}")
+    out = fresh(options.out)
     text, trials = MAKERS[name](options)
-    write(options.out, text, trials)
+    write(out, text, trials)
     print(options.out)
 
 

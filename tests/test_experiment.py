@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -67,7 +68,7 @@ def test_a_trial_replaces_tables_of_the_setup(tmp_path):
 
 
 def test_an_empty_cell_is_a_lost_sample(tmp_path):
-    table = "time_s,tip_x_m,tip_z_m\n0,1,2\n0.1,,2\n0.2,1,2\n"
+    table = "time_s,tip_x_m,tip_z_m\n0,0.04,0.02\n0.05,,0.02\n0.1,0.04,0.02\n"
     recording = read_experiment(experiment(tmp_path, markers=table)).trials[0].recording
     assert recording.seen[:, 0].tolist() == [[True, True], [False, True], [True, True]]
 
@@ -80,6 +81,7 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path):
         ("poisson_ratio = 0.4", "poisson_ratio = 0.5", r"poisson_ratio = 0\.5, wanted less than 0\.5"),
         ("[[0.5, 0.01]]", "[[0.5, -1]]", r"prony = .*, wanted at most five pairs of positive numbers"),
         ("size = [0.04, 0.02, 0.02]", "size = [0.04, 0.02]", r"size = \[0\.04, 0\.02\], wanted three finite numbers"),
+        ("[body]", '[body]\nshape = "mesh"\nfile = "../a.stl"', r"file = '\.\./a\.stl', wanted one beside it"),
         ('kind = "video"', 'kind = "film"', r"kind = 'film', wanted one of 'mocap', 'video'"),
         ('name = "tip"', 'name = "end"', r"columns time_s, tip_x_m, tip_z_m, wanted also end_x_m, end_z_m"),
         ("box = [[-0.001, -0.001, -0.001],", "box = [[0.1, 0.1, 0.1],", r"wanted the lower corner first"),
@@ -143,6 +145,50 @@ def test_a_simulation_that_says_too_little_is_refused(tmp_path, rows, message):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "simulated.csv").write_text(f"time_s,tip_x_m,tip_y_m,tip_z_m\n{rows}\n")
     with pytest.raises(ValueError, match=rf"simulated\.csv.*{message}"):
+        read_experiment(folder)
+
+
+def test_what_is_recorded_after_the_end_is_not_used(tmp_path):
+    rows = "\n".join(f"{0.01 * k},{0.04 + 1e-3 * k},0.02" for k in range(-2, 30))
+    recording = read_experiment(experiment(tmp_path, markers=f"time_s,tip_x_m,tip_z_m\n{rows}\n")).trials[0].recording
+    assert recording.time[[0, -1]] == pytest.approx([-0.02, 0.1])
+
+
+def test_another_frame_is_refused(tmp_path):
+    table = "time_s,tip_x_m,tip_z_m\n0,0.34,0.02\n0.02,0.34,0.02\n0.04,0.34,0.02\n"
+    with pytest.raises(ValueError, match=r"tip begins at \[0\.34, 0\.02\], .* in the frame of setup\.toml"):
+        read_experiment(experiment(tmp_path, markers=table))
+    # Who is seen only later may have come far.
+    read_experiment(
+        experiment(tmp_path, markers=table.replace("\n0,0.34,0.02", "\n0,,").replace("0.02,0.34", "0.03,0.34"))
+    )
+
+
+def test_a_trial_that_differs_in_what_a_twin_is_built_of_is_refused(tmp_path):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "a" / "trial.toml").write_text("[body]\nsize = [0.05, 0.02, 0.02]\n")
+    with pytest.raises(ValueError, match=r"trial\.toml: table body, wanted the same in all trials"):
+        read_experiment(folder)
+
+
+def test_a_pressure_without_a_chamber_is_refused(tmp_path):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "a" / "pressure.csv").write_text("time_s,c_pa\n0,0\n0.1,0\n")
+    with pytest.raises(ValueError, match=r"pressure\.csv: a pressure, wanted none"):
+        read_experiment(folder)
+
+
+def test_a_name_is_that_of_one_trial(tmp_path):
+    folder = experiment(tmp_path)
+    shutil.copytree(folder / "trials", folder / "heldout")
+    with pytest.raises(ValueError, match="a in both trials and heldout"):
+        read_experiment(folder)
+
+
+def test_a_trial_without_markers_is_refused(tmp_path):
+    folder = experiment(tmp_path)
+    (folder / "trials" / "b").mkdir()
+    with pytest.raises(ValueError, match=r"trials/b, wanted folders trials/<name> with a markers\.csv each"):
         read_experiment(folder)
 
 

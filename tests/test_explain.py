@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -308,6 +309,47 @@ def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
     assert chosen == [coarse.count, fine.count]
     with pytest.raises(ValueError, match=r"budget: .* minutes, wanted"):
         choose_twin(setup, 2, 0.01)
+
+
+def test_what_cannot_be_asked_is_refused_before_any_work(made, tmp_path, monkeypatch):
+    import explain
+
+    _, _, record = made
+    recorded = record("drag", (800.0,))
+    monkeypatch.setattr(explain, "read_experiment", lambda folder: recorded)
+    monkeypatch.setattr(explain, "measure", None)
+    asked = explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE)
+    with pytest.raises(ValueError, match="effects = friction: wanted one that can act"):
+        explain.main(dataclasses.replace(asked, effects=("friction",)))
+    asked.out.write_text("")
+    with pytest.raises(ValueError, match=r"out = .*: a file, wanted a folder"):
+        explain.main(asked)
+    with pytest.raises(ValueError, match=r"trial = .*: wanted a file named trial\.toml"):
+        predict_trial(SimpleNamespace(), tmp_path / "trial.toml", tmp_path)
+
+
+def test_a_beginning_without_samples_is_none(made):
+    twin, ensemble, record = made
+    experiment = record(None)
+    early = Problem(experiment, twin, ensemble=ensemble).early(0.35)
+    assert early is not None and all(t.setup.duration == pytest.approx(0.07) for t in early.trials)
+    assert Problem(experiment, twin, ensemble=ensemble).early(0.12) is None
+    recording = experiment.trials[0].recording
+    before = dataclasses.replace(recording, time=recording.time - 0.06)
+    experiment = dataclasses.replace(experiment, trials=(dataclasses.replace(experiment.trials[0], recording=before),))
+    early = Problem(experiment, twin, ensemble=ensemble).early(0.12)
+    assert early is not None and early.trials[0].setup.duration == pytest.approx(0.024)
+
+
+def test_planes_of_one_trial_alone_are_touched(made):
+    twin, ensemble, record = made
+    experiment = record(None)
+    ground = Boundary(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
+    one, other = experiment.trials
+    other = dataclasses.replace(other, setup=dataclasses.replace(other.setup, planes=(ground,)))
+    experiment = dataclasses.replace(experiment, trials=(one, other))
+    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
+    assert [np.isfinite(d).all() for d in measure(experiment, ensemble, fine).deviation] == [True, True]
 
 
 def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):

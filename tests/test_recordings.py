@@ -93,3 +93,9 @@ def test_the_bellows_are_held_by_a_force_that_ends(recipe, tmp_path):
         -np.tan(angle / 2), rel=1e-2
     )
     assert np.abs(place[-1] - [0.064, found.setup.size[2] / 2]).max() < 1e-3
+
+
+def test_an_experiment_is_not_mixed_with_another(recipe, tmp_path):
+    (tmp_path / "trials").mkdir()
+    with pytest.raises(ValueError, match="holds an experiment already, wanted a new folder"):
+        recipe.fresh(tmp_path)

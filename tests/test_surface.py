@@ -67,7 +67,8 @@ def folder(path: Path, mesh, body=MESH, duration=0.1, more=""):
     trial.mkdir(parents=True)
     rows = "\n".join(f"{0.01 * k},0.08,0.01,0.01" for k in range(9))
     (trial / "markers.csv").write_text(f"time_s,tip_x_m,tip_y_m,tip_z_m\n{rows}\n")
-    (trial / "pressure.csv").write_text("time_s,c_pa\n0,0\n1,1000\n")
+    if "[[chamber]]" in more:
+        (trial / "pressure.csv").write_text("time_s,c_pa\n0,0\n1,1000\n")
     return read_experiment(path)
 
 

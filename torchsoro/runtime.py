@@ -53,7 +53,7 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
         ValueError: if the device is neither, or CUDA is asked for where there is none.
     """
     global _started
-    kind = torch.device(device).type
+    kind = str(device).partition(":")[0]
     if kind not in ("cpu", "cuda"):
         raise ValueError(f"device = {str(device)!r}: wanted 'cpu' or 'cuda'")
     if kind == "cuda" and not torch.cuda.is_available():

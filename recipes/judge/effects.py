@@ -358,7 +358,6 @@ LIBRARY: dict[str, Draw] = {
     )
 }  # fmt: skip
 OUTSIDE: dict[str, Draw] = {f.__name__: f for f in (sloshing, magnet, gust, heat, foam)}
-LOCAL = ("soft_side", "attached_mass", "tether")
 
 
 def own_world(s: Specimen, rng: np.random.Generator) -> World:

@@ -5,6 +5,8 @@
       trials/<name>/markers.csv      time_s, <marker>_x_m, <marker>_y_m, <marker>_z_m, ...; an empty cell is lost
       trials/<name>/pressure.csv     time_s, <chamber>_pa; gauge pressure at the supply, where there is a chamber
       trials/<name>/trial.toml       tables of setup.toml that differ in this trial
+      trials/<name>/simulated.csv    as markers.csv, x, y and z: where a simulation of one's own has the markers
+      heldout/<name>/                trials that are only predicted
 
 SI units; z is up.
 """
@@ -26,6 +28,8 @@ from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.surface import Surface, read_surface
 
 SHORTEST = 0.03  # s, three times what a clock may be late
+FAR = 2.0  # times a body's size, that a marker may be from where it is stated, when all begins
+WHOLE = ("title", "body", "clamp", "marker", "recording")  # tables that are the same in all trials
 Vector = tuple[float, float, float]
 Box = tuple[Vector, Vector]
 
@@ -169,9 +173,14 @@ def read_experiment(folder: Path) -> Experiment:
     tables = read_tables(file)
     setup = setup_of(tables, file)
     trials = [read_trial(path, tables, file) for path in _folders(folder / "trials")]
-    if not trials:
-        raise ValueError(f"{folder}: no trial, wanted folders trials/<name> with a markers.csv each")
+    if not trials or any(t.recording is None for t in trials):
+        empty = [f"trials/{t.name}" for t in trials if t.recording is None]
+        raise ValueError(
+            f"{folder}: {', '.join(empty) or 'no trial'}, wanted folders trials/<name> with a markers.csv each"
+        )
     heldout = [read_trial(path, tables, file) for path in _folders(folder / "heldout")]
+    if twice := {t.name for t in trials} & {t.name for t in heldout}:
+        raise ValueError(f"{folder}: {', '.join(sorted(twice))} in both trials and heldout, wanted another name")
     return Experiment(folder=folder, setup=setup, trials=tuple(trials), heldout=tuple(heldout))
 
 
@@ -188,6 +197,8 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     """
     own = folder / "trial.toml"
     changed = read_tables(own) if own.is_file() else {}
+    if other := [name for name in WHOLE if name in changed]:
+        raise ValueError(f"{own}: table {', '.join(other)}, wanted the same in all trials, in setup.toml only")
     setup = setup_of({**tables, **changed}, own if changed else file, file.parent)
     markers, supply = folder / "markers.csv", folder / "pressure.csv"
     recording = None
@@ -199,11 +210,14 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
                 f"{SHORTEST:g} to {setup.duration:g} s from release, in seconds"
             )
         _check_places(recording, setup, markers)
+        recording = recording.until(setup.duration)
     pressure = None
     if setup.cavities:
         if not supply.is_file():
             raise ValueError(f"{folder}: no pressure.csv, wanted one, as the body has a chamber")
         pressure = _pressure(supply, [c.name for c in setup.cavities])
+    elif supply.is_file():
+        raise ValueError(f"{supply}: a pressure, wanted none, as the body has no [[chamber]]")
     own = folder / "simulated.csv"
     simulated = _simulated(own, setup) if own.is_file() else None
     return Trial(name=folder.name, setup=setup, recording=recording, pressure=pressure, simulated=simulated)
@@ -224,16 +238,17 @@ def _simulated(path: Path, setup: Setup) -> Recording:
 def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
     reach = max(setup.size)
     for m, marker in enumerate(setup.markers):
-        seen = recording.place[np.isfinite(recording.place[:, m]).all(-1), m]
-        if not len(seen):
+        there = recording.seen[:, m].all(-1)
+        if not there.any():
             raise ValueError(
                 f"{path}: marker {marker.name} has no sample, wanted some, or no such marker in setup.toml"
             )
-        stated = np.array(marker.at)[list(setup.axes)]
-        if np.abs(seen[0] - stated).max() > 100 * reach:
+        stated, first = np.array(marker.at)[list(setup.axes)], int(there.argmax())
+        seen = recording.place[first, m]
+        if np.abs(seen - stated).max() > (FAR if recording.time[first] < SHORTEST else 100) * reach:
             raise ValueError(
-                f"{path}: marker {marker.name} begins at {seen[0].tolist()}, wanted about {stated.tolist()} m: "
-                "is it in metres?"
+                f"{path}: marker {marker.name} begins at {seen.tolist()}, wanted about {stated.tolist()} m: "
+                "is it in metres, and in the frame of setup.toml?"
             )
 
 
@@ -338,8 +353,10 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
     surface = None
     if shape == "mesh":
         at = body.vector("origin") if "origin" in body.values else None
-        path = (folder or file.parent) / body.text("file")
-        surface = read_surface(path, body.number("scale", 1.0, least=1e-9), at)
+        mesh = Path(body.text("file"))
+        if ".." in mesh.parts:
+            raise ValueError(f"{file}: [body]: file = '{mesh}', wanted one beside it or below, or an absolute path")
+        surface = read_surface((folder or file.parent) / mesh, body.number("scale", 1.0, least=1e-9), at)
     material = _Table(top.values.pop("material", None), f"{file}: [material]")
     recording = _Table(top.values.pop("recording", {}), f"{file}: [recording]")
     kind: Any = recording.text("kind", "mocap", among=("mocap", "video"))

@@ -22,6 +22,7 @@ from torchsoro.sim2real.scenario import Scenario
 from torchsoro.sim2real.twin import Motion, Twin
 
 EDGE = 0.15  # of a belief's tolerance, over which it ends
+FEWEST = 8  # samples of a trial's beginning
 WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that bears what acts on it"
@@ -52,7 +53,7 @@ class Likelihood:
     Args:
         experiment: What to explain.
         twin: Its body.
-        trials: To fit; those with a recording if None.
+        trials: To fit, with a recording each; those of the experiment if None.
         numerics: The twin's own error for each trial [M, A] m; none if None.
         shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
         correction: By trial, what a finer twin then adds to motions [S, M, ...].
@@ -157,16 +158,20 @@ class Likelihood:
         """Those of the effects for which there is something in a trial that they change."""
         return [e for e in effects if any(e.applies(scenario, self.twin) for scenario in self.scenarios)]
 
-    def early(self, share: float) -> Self:
-        """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase."""
+    def early(self, share: float) -> Self | None:
+        """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase.
+
+        None where a trial has too few samples then.
+        """
         cut = []
         for t in self.trials:
             assert t.recording is not None
-            begin = float(t.recording.time[0])
+            begin = max(float(t.recording.time[0]), 0.0)
             end = begin + share * (t.setup.duration - begin)
-            held = t.recording.time <= end
-            recording = dataclasses.replace(t.recording, time=t.recording.time[held], place=t.recording.place[held])
-            cut.append(dataclasses.replace(t, setup=dataclasses.replace(t.setup, duration=end), recording=recording))
+            if np.count_nonzero(t.recording.time <= end) < FEWEST:
+                return None
+            setup = dataclasses.replace(t.setup, duration=end)
+            cut.append(dataclasses.replace(t, setup=setup, recording=t.recording.until(end)))
         return self.only(cut)
 
     # Simulating -------------------------------------------------------------------------------------------------

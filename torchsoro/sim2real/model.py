@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from torchsoro.sim2real.body_effects import Modulus
-from torchsoro.sim2real.ensemble import Ensemble
+from torchsoro.sim2real.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.experiment import Setup, Trial, read_tables, read_trial, setup_of
 from torchsoro.sim2real.fit import Fit
 from torchsoro.sim2real.hypothesis import Hypothesis
@@ -90,9 +90,11 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         if effect.local:
             lines.append(f"at = {values[count:].tolist()!r} # m")
     mesh = read_tables(setup)["body"].get("file")
-    if mesh is not None and not Path(mesh).is_absolute() and path.parent.resolve() != setup.parent.resolve():
-        (path.parent / mesh).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(setup.parent / mesh, path.parent / mesh)
+    if mesh is not None and not Path(mesh).is_absolute():
+        source, copy = setup.parent.resolve() / mesh, path.parent.resolve() / mesh
+        if source != copy:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, copy)
     with atomic_write(path) as file:
         file.write(("\n".join(lines) + "\n").encode())
 
@@ -131,13 +133,17 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **numbers)
 
 
-def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarray]:
-    """Markers in a trial that nobody has recorded yet.
+def predict_trial(
+    model: Model, trial: Path, source: Path, threads: int = THREADS, device: str = "auto"
+) -> dict[str, np.ndarray]:
+    """Markers in a trial that nobody has recorded yet, by the finer twin alone: no ``simulated.csv`` counts here.
 
     Args:
         model: What is known.
         trial: Its trial.toml; a pressure.csv stands beside it where the body has a chamber.
         source: Where the model comes from, for messages.
+        threads: That simulate.
+        device: See :class:`Ensemble`.
 
     Returns:
         Columns of a markers.csv.
@@ -145,11 +151,11 @@ def predict_trial(model: Model, trial: Path, source: Path) -> dict[str, np.ndarr
     Raises:
         ValueError: if the trial cannot be read, or the simulation breaks down.
     """
-    if trial.name != "trial.toml":
+    if trial.name != "trial.toml" or not trial.is_file():
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
     twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
-    motion = Ensemble(twin)([model.apply(twin.scenario(told), twin)])[0].alone()
+    motion = Ensemble(twin, threads, device)([model.apply(twin.scenario(told), twin)])[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
     axes = told.setup.axes

@@ -19,7 +19,7 @@ from torchsoro.sim2real.residual import Priors
 from torchsoro.sim2real.twin import Motion, Twin
 
 SPEED = 6e7  # points times variations times steps in a second of a thread
-CORES = 2  # that a budget is meant for, wherever it is spent: the twin, and the answer, are the same everywhere
+CORES = 2  # that a budget is meant for, wherever it is spent: the twin is the same everywhere
 WALLS = 1  # cells through each wall, at least; each bends by itself
 SIMULATIONS = 400  # that an explanation takes for each trial
 SLOW = 64.0  # times as long an explanation may take that finds something, on a slow machine
@@ -140,8 +140,8 @@ def measure(
     # Of the difference to cells that are so much larger, the finer twin's own error, which falls with their square;
     # blows do not.
     ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
-    share = 1.0 if here.scenarios[0].grounds else 1 / (ratio**2 - 1)
-    shares = [share if t.simulated is None else OWN for t in trials]
+    smooth = 1 / (ratio**2 - 1)
+    shares = [OWN if t.simulated else 1.0 if s.grounds else smooth for t, s in zip(trials, here.scenarios, strict=True)]
     deviations = [_apart(here, other[: len(trials)], shares)]
     deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
     found = []
@@ -164,7 +164,7 @@ def measure(
 
 def _touching(here: Problem) -> list[list[Motion]]:
     """Motions with planes that are a little nearer or farther: where a body touches is not known better."""
-    if not here.scenarios[0].grounds:
+    if not any(s.grounds for s in here.scenarios):
         return []
     moved = [
         s.replace(
@@ -176,7 +176,8 @@ def _touching(here: Problem) -> list[list[Motion]]:
         for s in here.scenarios
     ]
     motions = here.ensemble(moved)
-    return [[m.alone(k) for m in motions] for k in range(2)]
+    # A trial without planes moves in one way only.
+    return [[m.alone(min(k, len(m.place) - 1)) for m in motions] for k in range(2)]
 
 
 def _as_simulated(motion: Motion, trial: Trial) -> Motion:

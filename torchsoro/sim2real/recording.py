@@ -27,7 +27,7 @@ class Recording:
         axes: Which axes those are, 0 to 2.
 
     Raises:
-        ValueError: for shapes that do not fit, times that do not increase, or a marker that was never seen.
+        ValueError: for shapes that do not fit, times that do not increase, or a place that is infinite.
     """
 
     time: np.ndarray
@@ -54,6 +54,11 @@ class Recording:
     def seen(self) -> np.ndarray:
         """Where a sample was not lost, bool [T, M, A]."""
         return np.isfinite(self.place)
+
+    def until(self, end: float) -> Recording:
+        """What was recorded up to a time [s], the first three samples in any case."""
+        count = max(int(np.searchsorted(self.time, end, side="right")), 3)
+        return dataclasses.replace(self, time=self.time[:count], place=self.place[:count])
 
     def columns(self, markers: Sequence[str]) -> dict[str, np.ndarray]:
         """Columns [T] of a markers.csv by name; NaN where a sample was lost.

@@ -72,10 +72,11 @@ class Explanation:
 
 def effect_rows(fit: Fit, weight: float, problem: Problem) -> list[dict[str, Any]]:
     """The effects of a fit, as in explanation.json; intervals by the law of errors, within bounds."""
-    wide, rows, scenario = float(norm.ppf((1 + LEVEL) / 2)), [], problem.scenarios[0]
+    wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
     spread, size = max(1.0, fit.misfit / fit.samples) * correlation(fit), np.array(problem.twin.setup.size)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
+        scenario = next(s for s in problem.scenarios if effect.applies(s, problem.twin))
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
         own = np.where(logarithm, 1.0, values[:count])
         whole = spread * covariance[:count, :count] + np.diag((effect.form * own) ** 2)
@@ -326,6 +327,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     considered = [
         {
             "effect": c.fit.name,
+            "changes": " and ".join(e.seam for e in c.fit.effects),
             "score": c.score,
             "of the difference [%]": 100 * c.explained,
             "misfit / samples": c.fit.misfit / c.fit.samples,

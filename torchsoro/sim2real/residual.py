@@ -195,6 +195,8 @@ class Band:
         known: dict[tuple[bytes, float], int] = {}
         for m, a in np.ndindex(*numerics.shape):
             rows = np.flatnonzero(recording.seen[:, m, a])
+            if not len(rows):
+                continue
             key = rows.tobytes(), float(numerics[m, a])
             if key in known:
                 self.channels[known[key]][1].append((m, a))

@@ -152,7 +152,7 @@ def _from_the_beginning(problem: Problem, effects: Sequence[Hypothesis], most: i
     carried: list[Task] = [((), None)]
     for share in EARLY:
         early = problem.early(share)
-        if min(len(t.recording.time) for t in early.trials if t.recording) < 8:
+        if early is None:
             continue
         still = [f for f in early.fit([t for t in carried if not t[0]], rounds=8) if f is not None]
         if not still:
@@ -177,7 +177,10 @@ def _pairs(
                 tasks.append(((*one.effects, other), np.concatenate([one.point, other.looks(problem.twin)[-1][0]])))
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
-        where, whole = (problem.early(share), False) if share < 1 else (problem, True)
+        whole = share == 1
+        where = problem if whole else problem.early(share)
+        if where is None:
+            continue
         chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
         leading = ", ".join(f"{fit.name} {fit.misfit:.0f}" for fit in chosen[:4])
         report(f"pairs, first {100 * share:.0f} % of the trials: {leading}")

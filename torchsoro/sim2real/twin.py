@@ -107,8 +107,8 @@ class Twin:
         for low, high in setup.clamps:
             on = ((self.grid.places > np.array(low) - tiny) & (self.grid.places < np.array(high) + tiny)).all(-1)
             self.held |= on
-        if setup.clamps and not self.held.any():
-            raise ValueError(f"clamp: boxes {setup.clamps}, wanted one that holds a part of the body")
+            if not on.any():
+                raise ValueError(f"clamp: box {low}, {high}, wanted one that holds a part of the body, in metres")
 
     @property
     def count(self) -> int:

@@ -206,7 +206,7 @@ def decide(
         plainly: The same, with modulus and pressure as believed.
     """
     believed = [c for c in found if c.gain > t.alarm]
-    if any(math.isfinite(c.kept) for c in found):
+    if not all(math.isnan(c.kept) for c in found):
         # Where most of an error is noise, even the truth takes little of it away.
         most = [t.noisy if start < t.some and c.gain > t.sure else t.lost for c in believed]
         least = min((c.kept for c, lost in zip(believed, most, strict=True) if c.kept <= lost), default=-math.inf)
