@@ -22,7 +22,7 @@ atexit.register(ti.reset)
 def _remember_positions() -> None:
     """Describe the place of a kernel's node, for messages, once and not each time that its function is inlined.
 
-    Half of the time that Taichi takes to read the adjoint kernels, in the cache or not, goes into that.
+    A third to a half of the time that Taichi takes to read the adjoint kernels, in the cache or not, goes into that.
     """
     describe, known = ASTTransformerContext.get_pos_info, {}
 

@@ -209,8 +209,8 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
                 f"{markers}: times from {recording.time[0]:g} to {recording.time[-1]:g} s, wanted some of the "
                 f"{SHORTEST:g} to {setup.duration:g} s from release, in seconds"
             )
-        _check_places(recording, setup, markers)
         recording = recording.until(setup.duration)
+        _check_places(recording, setup, markers)
     pressure = None
     if setup.cavities:
         if not supply.is_file():
