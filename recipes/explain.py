@@ -103,7 +103,9 @@ def begun(options: Options) -> tuple[Experiment, list[Trial], Twin]:
     experiment, confused = reordered(read_experiment(options.experiment))
     if confused:
         print(confused)
-    trials = [t for t in experiment.trials if t.recording is not None]
+    trials = list(experiment.trials)
+    if empty := [f"trials/{t.name}" for t in trials if t.recording is None]:
+        raise ValueError(f"{options.experiment}: {', '.join(empty)}: no markers.csv, wanted one in each trial")
     if options.edge > 0:
         return experiment, trials, Twin(experiment.setup, edge=options.edge, walls=options.walls)
     return experiment, trials, choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)

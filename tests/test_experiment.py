@@ -185,13 +185,6 @@ def test_a_name_is_that_of_one_trial(tmp_path):
         read_experiment(folder)
 
 
-def test_a_trial_without_markers_is_refused(tmp_path):
-    folder = experiment(tmp_path)
-    (folder / "trials" / "b").mkdir()
-    with pytest.raises(ValueError, match=r"trials/b, wanted folders trials/<name> with a markers\.csv each"):
-        read_experiment(folder)
-
-
 def test_no_trial_is_refused(tmp_path):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "markers.csv").unlink()

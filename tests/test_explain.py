@@ -321,6 +321,10 @@ def test_what_cannot_be_asked_is_refused_before_any_work(made, tmp_path, monkeyp
     asked = explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE)
     with pytest.raises(ValueError, match="effects = friction: wanted one that can act"):
         explain.main(dataclasses.replace(asked, effects=("friction",)))
+    blank = (*recorded.trials, dataclasses.replace(recorded.trials[0], name="c", recording=None))
+    monkeypatch.setattr(explain, "read_experiment", lambda folder: dataclasses.replace(recorded, trials=blank))
+    with pytest.raises(ValueError, match=r"trials/c: no markers\.csv, wanted one in each trial"):
+        explain.main(asked)
     asked.out.write_text("")
     with pytest.raises(ValueError, match=r"out = .*: a file, wanted a folder"):
         explain.main(asked)

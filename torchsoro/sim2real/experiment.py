@@ -173,11 +173,8 @@ def read_experiment(folder: Path) -> Experiment:
     tables = read_tables(file)
     setup = setup_of(tables, file)
     trials = [read_trial(path, tables, file) for path in _folders(folder / "trials")]
-    if not trials or any(t.recording is None for t in trials):
-        empty = [f"trials/{t.name}" for t in trials if t.recording is None]
-        raise ValueError(
-            f"{folder}: {', '.join(empty) or 'no trial'}, wanted folders trials/<name> with a markers.csv each"
-        )
+    if not trials:
+        raise ValueError(f"{folder}: no trial, wanted folders trials/<name> with a markers.csv each")
     heldout = [read_trial(path, tables, file) for path in _folders(folder / "heldout")]
     if twice := {t.name for t in trials} & {t.name for t in heldout}:
         raise ValueError(f"{folder}: {', '.join(sorted(twice))} in both trials and heldout, wanted another name")
