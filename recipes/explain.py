@@ -165,13 +165,12 @@ def main(options: Options) -> Explanation | None:
         return predicted(options)
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"out = {options.out}: a file, wanted a folder")
-    effects = named(options.effects)
     begin = time.perf_counter()
     problem, numerics = prepared(options)
     trials = list(problem.trials)
     kept = [t for t in problem.experiment.heldout if t.recording is not None]
     tells = isolability(problem)
-    verdict = judge(problem, effects, kept=kept, budget=60 * options.budget)
+    verdict = judge(problem, named(options.effects), kept=kept, budget=60 * options.budget)
     problem = verdict.problem
     best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
     following = []

@@ -327,7 +327,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     considered = [
         {
             "effect": c.fit.name,
-            "changes": " and ".join(e.seam for e in c.fit.effects),
+            "changes": " and ".join(effect.seam for effect in c.fit.effects),
             "score": c.score,
             "of the difference [%]": 100 * c.explained,
             "misfit / samples": c.fit.misfit / c.fit.samples,
