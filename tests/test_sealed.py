@@ -18,7 +18,7 @@ def test_sealed_cases_are_explained_in_a_copy_and_scored(tmp_path, monkeypatch):
     for case in sorted((BATCH / "cases").iterdir()):
         copy, answer = tmp_path / case.name, tmp_path / "answers" / case.name
         shutil.copytree(case, copy)
-        explain.main(explain.Options(experiment=copy, out=answer, budget=2.0))
+        explain.main(explain.Options(experiment=copy, out=answer, budget=0.5))
         trial = copy / "heldout" / "d" / "trial.toml"
         explain.main(explain.Options(predict=answer / "model.toml", trial=trial, out=answer / "predicted.csv"))
     table = score.score(BATCH, answers=(f"tool={tmp_path / 'answers'}",))["tool"]
