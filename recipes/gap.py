@@ -143,9 +143,7 @@ def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, 
 
 
 def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: torch.Tensor) -> dict[str, np.ndarray]:
-    """As :func:`simulate`, of what is believed."""
-    if options.hide == "air":
-        settings = dataclasses.replace(settings, air_stiffness=2 * settings.air_stiffness)
+    """As :func:`simulate`, of what is believed, by these settings."""
     robot = build(settings)
     if options.hide == "relaxation":
         robot.prony = Prony.paper(0)
@@ -183,6 +181,7 @@ def main(options: Options) -> dict[str, Any]:
     fresh(options.out)
     folder = find(options.robot)
     base = read_settings(folder / "settings.json", device=options.device)
+    air = base.air_stiffness * (2 if options.hide == "air" else 1)
     rng, trials, truth = np.random.default_rng(options.seed), {}, {}
     for name, share in (TRIALS | KEPT).items():
         timed = {"settle": options.settle, "duration": options.duration, "sample_every": 1 / RATE}
@@ -199,15 +198,16 @@ def main(options: Options) -> dict[str, Any]:
         time = torch.arange(0.0, float(track["time"][-1]) + 2e-3, 1e-3, dtype=torch.float64)
         supply = robot.pressure.at(time).reshape(-1).double().numpy()
         chamber = robot.domain.chambers[0].name
+        thought = dataclasses.replace(settings, air_stiffness=air)
         trials[name] = Files(
             kept=name in KEPT,
             markers=columns(track),
             pressure={"time_s": time.numpy(), f"{chamber}_pa": supply},
-            simulated=columns(nominal(options, settings, gamma, probes)) if options.simulated else None,
+            simulated=columns(nominal(options, thought, gamma, probes)) if options.simulated else None,
         )
         print(f"{name}: moved by {1e3 * np.abs(track['place'] - track['place'][0]).max():.1f} mm")
     places = body.position[probes].cpu().numpy().tolist()
-    text = believed(options, robot, base.air_stiffness * (2 if options.hide == "air" else 1))
+    text = believed(options, robot, air)
     write(options.out, setup(text, {f"m{i}": at for i, at in enumerate(places)}, options.noise), trials)
     trimesh.Trimesh(*surface(robot.domain, gamma.cpu().numpy())).export(options.out / "body.stl")
     (options.out.parent / f"{options.out.name}-truth.json").write_text(json.dumps(truth, indent=2) + "\n")

@@ -140,13 +140,14 @@ class Likelihood:
 
         A simulation of one's own is of what is believed, and stays what it is.
         """
-        if self.fine is None:
+        trials = [t for t in self.trials if t.name not in self.stated]
+        if self.fine is None or not trials:
             return self
         still: list[Request] = [((), at[None])]
-        there = type(self)(self.experiment, self.fine.twin, trials=self.trials, noise=self.noise, ensemble=self.fine)
-        own = self.only(self.trials, correction={}).simulate(still)[0]
-        found = added(self.trials, own, there.simulate(still)[0])
-        return self.only(self.trials, correction={**self.correction, **found, **self.stated})
+        there = type(self)(self.experiment, self.fine.twin, trials=trials, noise=self.noise, ensemble=self.fine)
+        own = self.only(trials, correction={}).simulate(still)[0]
+        found = added(trials, own, there.simulate(still)[0])
+        return self.only(self.trials, correction={**self.correction, **found})
 
     @property
     def stated(self) -> dict[str, Motion]:

@@ -101,15 +101,14 @@ class Camera:
             Places [T, M, A] m.
         """
         own, place, frame = self._view(motion, number, errors)
-        body, _, gradient = _at(motion, own)
-        return self._recorded((body + np.einsum("tmij,mj->tmi", gradient, place)) @ frame.T, number, errors)
+        return self._recorded(_at(motion, own, place)[0] @ frame.T, number, errors)
 
     def linearise(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`see`, and the derivatives of the places by the errors [T, M, A, K]."""
         count, rate = len(self.trials), errors[len(self.trials)]
         own, place, frame = self._view(motion, number, errors)
-        body, velocity, gradient = _at(motion, own)
-        seen = (body + np.einsum("tmij,mj->tmi", gradient, place)) @ frame.T
+        body, velocity, gradient = _at(motion, own, place)
+        seen = body @ frame.T
         # The clock does nothing before the motion begins and after it ends.
         turned = (velocity * ((own > 0) & (own < float(motion.time[-1])))[:, None, None]) @ frame.T
         by = np.zeros((*seen.shape, len(errors)))
@@ -153,8 +152,11 @@ class Camera:
         return seen[:, :, list(self.setup.axes)]
 
 
-def _at(motion: Motion, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places and velocities at times, by Hermite's cubic between samples, and deformation gradients."""
+def _at(motion: Motion, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places and velocities at times, by Hermite's cubic between samples, and deformation gradients.
+
+    The places are of points that lie so far [M, 3] m from the motion's own in the undeformed body.
+    """
     t = motion.time
     at = np.clip(np.searchsorted(t, time, side="right") - 1, 0, len(t) - 2)
     h = (t[at + 1] - t[at])[:, None, None]
@@ -165,7 +167,8 @@ def _at(motion: Motion, time: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nd
     place = begin + s * (end - begin) + h * s * (1 - s) * ((1 - s) * first - s * last)
     velocity = chord + (1 - s) * (1 - 3 * s) * first + s * (3 * s - 2) * last
     s = s[..., None]
-    return place, velocity, (1 - s) * motion.gradient[at] + s * motion.gradient[at + 1]
+    gradient = (1 - s) * motion.gradient[at] + s * motion.gradient[at + 1]
+    return place + np.einsum("tmij,mj->tmi", gradient, beside), velocity, gradient
 
 
 def _rotation(turn: np.ndarray) -> np.ndarray:
