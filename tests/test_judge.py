@@ -227,7 +227,7 @@ def test_a_setup_survives_toml_and_an_experiment_its_files(judge, tmp_path):
 @pytest.fixture(scope="module")
 def batch(judge, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("judge")
-    settings = {"batch": "smoke", "effects": 2, "nulls": 2, "pairs": 1, "outside": 1, "seed": 5, "processes": 1}
+    settings = {"batch": "smoke", "effects": 2, "nulls": 2, "pairs": 1, "outside": 1, "seed": 6, "processes": 1}
     digest = judge.seal.seal(out=out, finer=0.35, **settings)
     stamps = {p: p.stat().st_mtime_ns for p in (out / "cases").rglob("*.csv")}
     assert judge.seal.seal(out=out, finer=0.35, **settings) == digest
