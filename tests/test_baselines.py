@@ -62,7 +62,7 @@ def test_a_network_learns_a_force_against_the_velocity(baselines):
 )
 def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
     case = ROOT / "tests" / "judged" / "cases" / "case-111"
-    baselines.main(baselines.Options(experiment=case, out=tmp_path, method=method, budget=2.0))
+    baselines.main(baselines.Options(experiment=case, out=tmp_path, method=method, budget=0.5))
     told = json.loads((tmp_path / "explanation.json").read_text())
     assert verdict is None or told["verdict"] == verdict
     assert named <= set(told["set"])

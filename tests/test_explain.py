@@ -377,7 +377,9 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     assert answer["force_map"] is None and answer["mismatch"]["b"]["phase"].endswith("swing")
     assert answer["error_after"]["a"]["all"] < 0.5 * answer["error_before"]["a"]["all"]
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Missing is drag" in page and page.count("data:image/png") == 5
+    parting = r"Simulation and recording part at [\d.]+ s in trial [ab], in the \w+ swing, most at marker \w+\. "
+    assert re.search(parting + r"Missing is drag: density drag \d+ kg/m3 \(90 %: ", page)
+    assert page.count("data:image/png") == 5
     folder = tmp_path / "new"
     folder.mkdir()
     (folder / "trial.toml").write_text("duration = 0.05\n[start]\nvelocity = [0.0, 0.0, 0.2]\n")

@@ -107,7 +107,7 @@ class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 
     name, seam, form = "soft_side", "Young's modulus over the body", LAW
-    quantities = tuple(Quantity(f"slope_{axis}", "1 over the body", 0.2, -10.0, 10.0) for axis in "xyz")
+    quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
     def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:

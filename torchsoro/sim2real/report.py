@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -226,35 +227,54 @@ def lead(e: Explanation) -> str:
     if v.kind == "unknown_physics":
         best = v.ranking[0] if v.ranking else None
         tried = (
-            f" The best of what is known, {best.fit.name}, takes away {100 * best.explained:.0f} % of it."
+            f" The best of what is known, {_plain(best.fit.name)}, takes away {100 * best.explained:.0f} % of it."
             if best
             else ""
         )
         force = f" {e.forces}" if e.forces else ""
-        return f"Something is missing that is none of the known effects.{tried}{gain}{force}"
+        return f"{_parting(e)}Something is missing that is none of the known effects.{tried}{gain}{force}"
     parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
         following = f" {advice(e.following)}" if advice(e.following) else ""
-        return f"One of these is missing, and this recording cannot tell which: {parts}.{following}{gain}{_beyond(e)}"
+        which = f"One of these is missing, and this recording cannot tell which: {parts}."
+        return f"{_parting(e)}{which}{following}{gain}{_beyond(e)}"
     second = next((c for c in v.ranking if c is not v.chosen[0]), None)
     lost = ""
     if second is not None:
         lost = (
-            f" Next best is {second.fit.name}, which takes away {100 * max(second.explained, 0):.0f} % of the "
+            f" Next best is {_plain(second.fit.name)}, which takes away {100 * max(second.explained, 0):.0f} % of the "
             f"difference against {100 * v.chosen[0].explained:.0f} %, and leaves "
             f"{second.fit.misfit / v.chosen[0].fit.misfit:.3g} times the misfit."
         )
-    return f"Missing is {parts}.{gain}{lost}{_beyond(e)}"
+    return f"{_parting(e)}Missing is {parts}.{gain}{lost}{_beyond(e)}"
+
+
+def _plain(name: str, unit: str = "") -> str:
+    """A name without its unit and underscores."""
+    suffix = re.sub(r"[ /]", "_", unit).lower()
+    return name.removesuffix(f"_{suffix}").replace("_", " ")
+
+
+def _parting(e: Explanation) -> str:
+    """Where and when, in the trial in which it is first."""
+    apart = [(m.start, m.phase, m) for m in e.mismatches if m.start is not None and m.phase is not None]
+    if not apart:
+        return ""
+    start, phase, m = min(apart, key=lambda one: one[0])
+    return (
+        f"Simulation and recording part at {start:.2g} s in trial {m.trial}, in the {phase.name}, most at marker "
+        f"{m.marker}. "
+    )
 
 
 def _beyond(e: Explanation) -> str:
     """Measurement errors that are larger than can be believed: something else is hidden in them."""
     camera = e.problem.camera
-    large = [
-        f"{name} {value:.2g} (believed within {deviation:.2g})"
-        for name, value, deviation in zip(camera.names, e.best.errors, camera.deviations, strict=True)
-        if abs(value) > BELIEVED * deviation
-    ]
+    large = []
+    for name, value, deviation in zip(camera.names, e.best.errors, camera.deviations, strict=True):
+        if abs(value) > BELIEVED * deviation:
+            unit = next((u for u in ("rad", "m", "s") if name.endswith(f"_{u}")), "1")
+            large.append(f"{_plain(name, unit)} {number(value, unit)} (believed within {deviation:.2g})")
     if not large:
         return ""
     return (
@@ -268,7 +288,7 @@ def _said(candidate: Candidate, problem: Problem) -> str:
     parts = []
     for row in effect_rows(candidate.fit, 0.0, problem):
         numbers = ", ".join(
-            f"{name} {number(p['value'], p['unit'])} (90 %: {p['low']:.3g} to {p['high']:.3g})"
+            f"{_plain(name, p['unit'])} {number(p['value'], p['unit'])} (90 %: {p['low']:.3g} to {p['high']:.3g})"
             for name, p in row["parameters"].items()
         )
         place = ""
@@ -276,7 +296,7 @@ def _said(candidate: Candidate, problem: Problem) -> str:
             within = [f" ± {1e3 * w:.0f}" for w in row["location_within_m"] or []] or [""] * 3
             at = [f"{1e3 * x:.0f}{w}" for x, w in zip(row["location_m"], within, strict=True)]
             place = f" at ({', '.join(at)}) mm"
-        parts.append(f"{row['name']}{place}: {numbers}")
+        parts.append(f"{_plain(row['name'])}{place}: {numbers}")
     return " and ".join(parts)
 
 
