@@ -174,6 +174,26 @@ def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
         assert share == pytest.approx(0.4, abs=0.05)
 
 
+def test_a_clock_that_is_behind_has_seen_what_comes_after_the_end(made):
+    """What it shows at the end happened later; the body has not stopped by then."""
+    twin, ensemble, record = made
+    experiment, behind, trials = record(None), 0.012, []
+    for trial in experiment.trials:
+        (motion,) = ensemble([twin.scenario(trial).replace(until=0.3)])
+        camera = Camera(experiment.setup, [trial])
+        place = camera.see(motion.alone(), 0, np.where(np.arange(len(camera.deviations)) == 0, -behind, 0.0))
+        recording = dataclasses.replace(trial.recording, place=place)
+        trials.append(dataclasses.replace(trial, recording=recording))
+    problem = Problem(experiment, twin, trials=trials, ensemble=ensemble)
+    for part, end in ((problem, 0.2), (problem.early(0.5), 0.1)):
+        motions = [m.alone() for m in part.simulate([((), np.zeros((1, 1)))])[0]]
+        misfit, errors, _, _ = part.measure(motions, np.zeros(len(part.camera.deviations)))
+        # Nothing is left but what so late a clock costs by its prior.
+        assert errors[:2] == pytest.approx(-behind, abs=2e-4)
+        assert misfit < 2 * (behind / part.camera.deviations[0]) ** 2
+        assert all(s.duration == pytest.approx(end) for s in part.scenarios)
+
+
 def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
     leak = effect("leak")
     assert leak.simpler(np.array([0.1, 0.02])) is None
@@ -282,7 +302,11 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
     problem = Problem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
     assert problem.stated.keys() == {t.name for t in trials}
     for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
-        np.testing.assert_allclose(motion.alone().place[: len(time)], trial.simulated.place, atol=1e-9)
+        place = motion.alone().place
+        np.testing.assert_allclose(place[: len(time)], trial.simulated.place, atol=1e-9)
+        # What a clock that is behind has seen after its end goes on.
+        steps = np.abs(np.diff(place[len(time) - 2 :], axis=0)).max((1, 2))
+        assert len(steps) > 8 and (steps > 5e-5).all() and (steps < 1e-3).all()
     # Also where modulus and pressure are not what is believed.
     moved = problem.corrected(np.array([0.8])).correction
     assert all(moved[t.name] is numerics.correction[t.name] for t in trials)

@@ -83,7 +83,7 @@ class Ensemble:
             members.sort(key=lambda lane: steps[lane[0]][lane[1]])
             kinds.append([members[k : k + LANES] for k in range(0, len(members), LANES)])
         markers = len(self.twin.setup.markers)
-        longest = max(s.duration for s in scenarios)
+        longest = max(s.until for s in scenarios)
         samples = math.ceil(longest / SAMPLE - 1e-9) + 1
         seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
 

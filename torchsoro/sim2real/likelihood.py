@@ -97,7 +97,7 @@ class Likelihood:
         self.camera = Camera(experiment.setup, self.trials, priors, slips)
         self.bands = [Band(r, self.noise, n, lasting) for r, n in zip(recordings, self.numerics, strict=True)]
         self.samples = sum(b.count for b in self.bands)
-        self.scenarios = [twin.scenario(t) for t in self.trials]
+        self.scenarios = [twin.scenario(t).replace(until=self.camera.until(i)) for i, t in enumerate(self.trials)]
         self.beliefs = beliefs or Beliefs()
         self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.beliefs.modulus)]
         if experiment.setup.cavities:

@@ -181,13 +181,19 @@ def _touching(here: Problem) -> list[list[Motion]]:
 
 
 def _as_simulated(motion: Motion, trial: Trial) -> Motion:
-    """A motion with the places of the trial's own simulation, where there is one."""
+    """A motion with the places of the trial's own simulation, where there is one; it goes on by itself after that."""
     own = trial.simulated
     if own is None:
         return motion
     course = Akima1DInterpolator(own.time, own.place)
-    time = np.minimum(motion.time, own.time[-1])
-    return dataclasses.replace(motion, place=course(time), velocity=course(time, 1))
+    last = np.searchsorted(motion.time, own.time[-1], side="right") - 1
+    at = np.minimum(np.arange(len(motion.time)), last)
+    time = motion.time[at]
+    return dataclasses.replace(
+        motion,
+        place=course(time) + (motion.place - motion.place[at]),
+        velocity=course(time, 1) + (motion.velocity - motion.velocity[at]),
+    )
 
 
 def _apart(here: Problem, other: Sequence[Motion], shares: Sequence[float]) -> list[np.ndarray]:

@@ -17,6 +17,7 @@ from torchsoro.sim2real.twin import Motion
 
 CORRELATION = 0.03  # s over which the twin's own error lasts, and a part of the noise
 LASTING = 0.25  # of the variance of the noise
+LATE = 3.0  # standard deviations that a clock may be behind
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,6 +89,13 @@ class Camera:
         self.names += ["clock_rate", "ln_scale", *(f"rotation_{a}_rad" for a in "xyz")]
         self.names += [f"{m.name}_{a}_m" for m in setup.markers for a in "xyz"]
         self.names += [f"slip_{s.trial}_{setup.markers[s.marker].name}_{a}_m" for s in slips for a in "xyz"]
+
+    def until(self, number: int) -> float:
+        """When trial ``number`` may have ended by the body's clock at the latest [s]: its clock may be behind."""
+        trial, clock, rate = self.trials[number], self.deviations[number], self.deviations[len(self.trials)]
+        assert trial.recording is not None
+        last = float(trial.recording.time[-1])
+        return max(trial.setup.duration, (last + LATE * clock) * (1 + LATE * rate))
 
     def see(self, motion: Motion, number: int, errors: np.ndarray) -> np.ndarray:
         """What trial ``number`` would have recorded.

@@ -82,7 +82,8 @@ class Scenario:
         grounds: Planes.
         pushes: Dead forces.
         springs: What else holds the body.
-        duration: [s].
+        duration: Of the trial [s].
+        until: To be simulated until then [s]: a recording whose clock is behind goes on after the trial.
     """
 
     stiffness: Tensor
@@ -103,6 +104,7 @@ class Scenario:
     pushes: tuple[Push, ...]
     springs: tuple[Tie, ...]
     duration: float
+    until: float
 
     def replace(self, **changes) -> Scenario:
         """A scenario with other values."""

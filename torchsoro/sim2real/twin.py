@@ -183,6 +183,7 @@ class Twin:
             ),
             springs=(),
             duration=s.duration,
+            until=s.duration,
         )
 
 
