@@ -44,7 +44,6 @@ class Tally:
     """What was spent on simulating."""
 
     simulations: int = 0
-    seconds: float = 0.0
 
 
 class Likelihood:
@@ -225,7 +224,6 @@ class Likelihood:
         spent = time.perf_counter() - begin
         simulations = count * sum(len(points) for _, points in requests)
         self.tally.simulations += simulations
-        self.tally.seconds += spent
         self.report(f"{simulations} simulations, {spent:.1f} s")
         return [found[k : k + count] for k in range(0, len(found), count)]
 

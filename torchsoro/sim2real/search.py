@@ -10,6 +10,7 @@ import numpy as np
 from torchsoro.sim2real.fit import Fit, Problem
 from torchsoro.sim2real.hypothesis import Hypothesis
 from torchsoro.sim2real.likelihood import BREAKS
+from torchsoro.sim2real.numerics import cost
 from torchsoro.sim2real.ranking import BELIEVED, FAINT, correlation, varied
 from torchsoro.sim2real.residual import find_slips
 
@@ -19,6 +20,7 @@ FAR = 3.0  # times what noise and numerics explain, above which searches begin w
 EARLY = (0.12, 0.35)  # of the trials
 PRICED = 1.5  # times what noise and numerics explain, above which what the best effect leaves counts as one of them
 PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
+PARTLY = 4.0  # times as long as with all lanes filled a simulation takes in a search, that fills some
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
 TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
@@ -36,15 +38,15 @@ def search(
     Args:
         problem: Recordings and twin.
         effects: To think of.
-        budget: Time that this may take, about [s]; sets how many searches are begun.
+        budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
 
     Returns:
         The problem with slips and corrections that were found, the fit without an effect, and those with, best first.
     """
     problem, nothing = _nothing(problem, [((), None)], report, rounds=3)
-    begin = problem.tally
-    each = begin.seconds / max(begin.simulations, 1) * len(problem.trials)
+    # By count, not by the clock: what is searched must not depend on the machine.
+    each = cost(problem.twin, len(problem.trials), PARTLY)
     most = int(np.clip(0.3 * budget / (10 * each), KEPT, MOST))
     carried: list[Task] = []
     if nothing.misfit > FAR * nothing.samples:

@@ -104,7 +104,7 @@ def judge(
         effects: What is thought of; the library if None.
         kept: Trials that are only predicted. Without any, each of three or more is predicted from the others.
         thresholds: What decides.
-        budget: Time that this may take, about [s]; sets how many searches are begun.
+        budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
     """
     effects = problem.thought_of(library() if effects is None else effects)
