@@ -82,6 +82,13 @@ class Mismatch:
         on = self.time >= 0 if phase is None else (self.time >= (self.start or 0.0)) & (self.time <= phase.end)
         return self.markers[int(np.nan_to_num(_mean(self.before[on], 0)).argmax())]
 
+    @property
+    def where(self) -> str:
+        """Where and when they part, in words; empty if they do not."""
+        if self.start is None or self.phase is None:
+            return ""
+        return f"at {self.start:.2g} s, in the {self.phase.name}, most at marker {self.marker}"
+
     def by_phase(self, after: bool = False) -> np.ndarray:
         """Root mean square in each phase, by marker [phases, M]; not a number where nothing was recorded."""
         values = self.after if after else self.before
@@ -89,13 +96,12 @@ class Mismatch:
 
     def __str__(self) -> str:
         """For people."""
-        if self.start is None or self.phase is None:
+        if not self.where:
             return f"Trial {self.trial}: recording and simulation agree throughout."
-        worst = together(self.before)[self.time >= self.start].max()
+        worst = together(self.before)[self.time >= (self.start or 0.0)].max()
         return (
-            f"Trial {self.trial}: they part at {self.start:.2g} s, in the {self.phase.name}, most at marker "
-            f"{self.marker}; from then on they are up to {worst:.2g} times as far apart as noise and the simulation's "
-            "own error explain."
+            f"Trial {self.trial}: they part {self.where}; from then on they are up to {worst:.2g} times as far apart "
+            "as noise and the simulation's own error explain."
         )
 
 
@@ -274,9 +280,9 @@ def _loads(trial: Trial, time: np.ndarray) -> list[str]:
     if not starts and not ends:
         return []
     count = np.searchsorted(starts, time, side="right")
-    of = [f" {k + 1}" if len(starts) > 1 else "" for k in range(len(starts))] or [""]
-    first = f"time before the load{of[0]}" if starts else "time under the load"
-    names = [first if k == 0 else f"time under the load{of[k - 1]}" for k in count]
+    of = [f"load {k + 1}" if len(starts) > 1 else "the load" for k in range(len(starts))]
+    first = f"time before {of[0]}" if starts else "time under the load"
+    names = [first if k == 0 else f"time under {of[k - 1]}" for k in count]
     return ["time after the load" if ends and t >= max(ends) else name for t, name in zip(time, names, strict=True)]
 
 

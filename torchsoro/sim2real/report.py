@@ -235,7 +235,7 @@ def lead(e: Explanation) -> str:
         return f"{_parting(e)}Something is missing that is none of the known effects.{tried}{gain}{force}"
     parts = "; ".join(_said(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
-        following = f" {advice(e.following)}" if advice(e.following) else ""
+        following = f" {advice(e.following)}".rstrip()
         which = f"One of these is missing, and this recording cannot tell which: {parts}."
         return f"{_parting(e)}{which}{following}{gain}{_beyond(e)}"
     second = next((c for c in v.ranking if c is not v.chosen[0]), None)
@@ -257,14 +257,11 @@ def _plain(name: str, unit: str = "") -> str:
 
 def _parting(e: Explanation) -> str:
     """Where and when, in the trial in which it is first."""
-    apart = [(m.start, m.phase, m) for m in e.mismatches if m.start is not None and m.phase is not None]
+    apart = [m for m in e.mismatches if m.where]
     if not apart:
         return ""
-    start, phase, m = min(apart, key=lambda one: one[0])
-    return (
-        f"Simulation and recording part at {start:.2g} s in trial {m.trial}, in the {phase.name}, most at marker "
-        f"{m.marker}. "
-    )
+    first = min(apart, key=lambda m: m.start or 0.0)
+    return f"Simulation and recording part in trial {first.trial} {first.where}. "
 
 
 def _beyond(e: Explanation) -> str:

@@ -180,9 +180,7 @@ def _pairs(
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         whole = share == 1
-        where = problem if whole else problem.early(share)
-        if where is None:
-            continue
+        where = problem if whole else problem.early(share) or problem
         chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
         leading = ", ".join(f"{fit.name} {fit.misfit:.0f}" for fit in chosen[:4])
         report(f"pairs, first {100 * share:.0f} % of the trials: {leading}")
