@@ -29,7 +29,7 @@ from torchsoro.settings import plain_errors
 from torchsoro.sim2real.ensemble import Ensemble
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
-from torchsoro.sim2real.forcemap import StepForce, patches
+from torchsoro.sim2real.forcemap import StepForce, force_map, patches
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.histories import Lines, simulate
 from torchsoro.sim2real.library import library
@@ -39,10 +39,11 @@ from torchsoro.sim2real.report import effect_rows
 from torchsoro.sim2real.verdict import Thresholds, judge
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
-Ablation = Literal["without-numerics", "without-heldout", "one-trial"]
+Ablation = Literal["without-numerics", "without-heldout", "one-trial", "force-map"]
 
 SURE = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
 PATCHES, WINDOWS = 4, 10  # that the force network acts on, in each trial
+SLICES = 8  # of the body, on which the force map puts its forces
 HIDDEN, EPOCHS, DECAY = 16, 1500, 1e-3  # of the force network
 HELPS = 0.85  # error on trials left out, over that without it, at which a network has found something
 SMOOTH = 9  # samples of the parabola that is differentiated twice for sparse regression
@@ -65,7 +66,8 @@ class Options:
     network of state and pressure, whose forces on the body explain the residual. sparse-regression: residual
     accelerations of the markers from a list of terms. without-numerics: explain.py with a twin that is corrected, but
     whose error is not part of the band; without-heldout: that believes an effect whatever it predicts; one-trial: that
-    sees the first trial only."""
+    sees the first trial only. force-map: where free forces on the body would explain what is left, without any effect
+    whose form is known."""
     predict: Path | None = None
     """A model.toml, to predict a trial with instead."""
     trial: Path | None = None
@@ -251,6 +253,16 @@ def force_network(problem: Problem) -> Answer:
     return Answer(verdict="unknown_physics" if other < HELPS * one else "nothing_missing", heldout=held)
 
 
+def mapped(problem: Problem) -> Answer:
+    """The place of the largest force that a force map needs, where something is missing."""
+    nothing = fitted(problem)
+    if nothing.misfit < Thresholds().quiet * nothing.samples:
+        return Answer(verdict="nothing_missing", fit=nothing)
+    needed = force_map(problem, nothing, count=SLICES, windows=WINDOWS).needed
+    rows = [{"name": "force", "parameters": {}, "location_m": n.place.tolist()} for n in needed[:1]]
+    return Answer(verdict="unknown_physics", effects=rows, fit=nothing)
+
+
 # Sparse regression -------------------------------------------------------------------------------------------------
 
 
@@ -365,10 +377,11 @@ def main(options: Options) -> Answer | None:
         "without-numerics": lambda: judged(without_band(problem), seconds),
         "without-heldout": lambda: judged(problem, seconds, lost=math.inf, worse=math.inf),
         "one-trial": lambda: judged(problem.only(problem.trials[:1]), seconds),
+        "force-map": lambda: mapped(problem),
     }[options.method]()
     told = {
         "verdict": answer.verdict,
-        "effects": answer.effects if answer.verdict == "explained" else [],
+        "effects": [] if answer.verdict == "cannot_distinguish" else answer.effects,
         "set": answer.names,
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in answer.heldout.items()],
         "cost": {

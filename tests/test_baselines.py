@@ -58,6 +58,7 @@ def test_a_network_learns_a_force_against_the_velocity(baselines):
         ("force-network", "unknown_physics", set()),  # a network has no names
         ("sparse-regression", None, set()),
         ("one-trial", "explained", {"density"}),
+        ("force-map", "unknown_physics", set()),  # no names either, but a place
     ],
 )
 def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
@@ -67,4 +68,5 @@ def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
     assert verdict is None or told["verdict"] == verdict
     assert named <= set(told["set"])
     assert (tmp_path / "model.toml").exists() == (method not in ("force-network", "sparse-regression"))
+    assert any(e["location_m"] for e in told["effects"]) == (method == "force-map")
     assert all(row["before"] > 0 and row["after"] > 0 for row in told["heldout"])

@@ -28,6 +28,7 @@ class Scored:
         set: Names that it cannot tell apart, those it commits to included.
         unknown: Whether it says that something is missing which it does not know.
         location_error: Distance of the place of the true effect [m].
+        place_error: The same of the nearest place that is told, whatever it is a place of.
         parameter_errors: Relative errors of the numbers that truth and answer share.
         covered: Whether the interval of each holds the truth.
         told_ratio: Held-out error after over before, as the answer states it.
@@ -45,6 +46,7 @@ class Scored:
     set: tuple[str, ...] = ()
     unknown: bool = False
     location_error: float | None = None
+    place_error: float | None = None
     parameter_errors: tuple[float, ...] = ()
     covered: tuple[bool, ...] = ()
     told_ratio: float | None = None
@@ -131,6 +133,8 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
     elif verdict == "cannot_distinguish":
         group = tuple(dict.fromkeys(listed or named))
     errors, covered, place = [], [], None
+    places = [e["location_m"] for e in named.values() if e.get("location_m") is not None]
+    sites = [e["location_m"] for e in truth["effects"] if e["location_m"] is not None]
     for effect in truth["effects"]:
         said = named.get(effect["name"])
         if said is None or verdict != "explained":
@@ -154,6 +158,7 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
         set=group,
         unknown=verdict == "unknown_physics" or any(n.startswith("unknown") for n in group),
         location_error=place,
+        place_error=min((math.dist(p, s) for p in places for s in sites), default=None),
         parameter_errors=tuple(errors),
         covered=tuple(covered),
         told_ratio=_told(answer),

@@ -80,6 +80,7 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
     spoke = [c for c in strong if c.verdict in SETS and c.set]
     right = [c for c in single if c.verdict in NAMED and c.truth[0] in c.names]
     local = [c.location_error / c.length for c in right if c.location_error is not None]
+    anywhere = [c.place_error / c.length for c in strong if c.place_error is not None]
     errors = [e for c in right for e in c.parameter_errors]
     covered = [x for c in right for x in c.covered]
     told = [c.told_ratio for c in strong if c.verdict in SETS and c.told_ratio is not None]
@@ -95,6 +96,7 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
         "  mean size of the set (<= 2.5)": f"{np.mean(sizes):.2f} ({len(sizes)})" if sizes else "no case",
         "  over all strong cases, silent ones too": str(rate(strong, lambda c: c.truth[0] in c.set)),
         "location, median over body length (<= 0.15)": _median(local),
+        "  whatever it is called, strong": _median(anywhere),
         "parameter error, median (<= 25 %)": _median(errors, " %", 100),
         "  coverage of 90 % intervals (80-97 %)": str(Rate(hits=sum(covered), of=len(covered))),
         "held-out after / before, as the answer says (<= 0.6)": _median(told),
