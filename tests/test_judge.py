@@ -168,6 +168,18 @@ def test_free_fall_onto_the_plane_and_sliding_to_a_stop(judge):
     assert way == pytest.approx(0.4**2 / (2 * 0.5 * 9.81), rel=0.05)
 
 
+def test_drag_slows_a_block_as_its_coefficient_says(judge):
+    world, effect = judge.effects.drag(judge.world.World(), None, np.random.default_rng(0))
+    setup = body((0.02, 0.02, 0.01), start={"velocity": [0.5, 0, 0]})
+    run = march(judge, setup, 0.01, world)
+    nodes, shapes = run.case.mesh.interpolation(np.array([[0.01, 0.01, 0.005]]))
+    # m dv/dt = - density drag A v^2 / 2, with the area of the front.
+    rate = effect.parameters["density_drag_kg_m3"] * 0.02 * 0.01 / 2 / run.mass.sum()
+    way = run.run(np.array([0.1]), nodes, shapes)[0, 0, 0] - 0.01
+    assert way == pytest.approx(math.log1p(rate * 0.5 * 0.1) / rate, rel=5e-3)
+    assert way < 0.049
+
+
 def test_a_spinning_vibrating_block_keeps_its_energy_and_momentum(judge):
     setup = body((0.03, 0.02, 0.02), start={"velocity": [0.1, 0, 0], "angular_velocity": [3.0, 5.0, 20.0]})
     run = march(judge, setup, 0.01)

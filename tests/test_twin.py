@@ -270,6 +270,18 @@ def test_a_free_body_keeps_its_momentum_and_falls(trial):
     np.testing.assert_allclose(np.linalg.norm(edge, axis=-1), t.setup.size[0], rtol=0.01)
 
 
+def test_a_fluid_slows_a_free_body_as_its_drag_says(trial):
+    t = changed(trial, clamps=(), loads=(), gravity=(0.0, 0.0, 0.0), velocity=(0.5, 0.0, 0.0), duration=0.1)
+    twin, drag = Twin(t.setup, edge=EDGE), next(e for e in library() if e.name == "drag")
+    through = drag(twin.scenario(t), torch.tensor([[1600.0]], dtype=torch.float64), twin)
+    way = Ensemble(twin)([through])[0].place[0, -1, :, 0].mean() - np.mean([m.at[0] for m in t.setup.markers])
+    # m dv/dt = - density drag A v^2 / 2, with the area of the front.
+    length, *front = t.setup.size
+    rate = 1600.0 * math.prod(front) / 2 / (t.setup.density * length * math.prod(front))
+    assert way == pytest.approx(math.log1p(rate * 0.5 * 0.1) / rate, rel=5e-3)
+    assert way < 0.049
+
+
 def test_a_spin_that_was_left_out_is_one_that_is_believed(trial):
     t = changed(trial, clamps=(), velocity=(0.0, 0.0, 0.0), duration=0.05)
     effect = next(e for e in library() if type(e).__name__ == "InitialSpin")

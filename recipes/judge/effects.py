@@ -282,9 +282,12 @@ def initial_motion(world: World, s: Specimen, rng: np.random.Generator) -> tuple
 
 
 def drag(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Effect]:
-    """Quadratic, on the normal motion of the surface; scored as fluid density times drag coefficient."""
+    """Quadratic, on the normal motion of the surface; scored as fluid density times drag coefficient.
+
+    The force on a body of frontal area A is that times A v^2 / 2; here half of it acts on the front, half on the back.
+    """
     value = log_uniform(rng, 8, 2000)
-    effect = Effect(name="drag", parameters={"density_drag_kg_m3": 2 * value}, form={})
+    effect = Effect(name="drag", parameters={"density_drag_kg_m3": 4 * value}, form={})
     return replace(world, drag=value), effect
 
 

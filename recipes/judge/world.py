@@ -192,7 +192,8 @@ class World:
         velocity: Added at the start [m/s]: to every point of a free body, to the far end of a clamped one, falling
             with the square of the distance from the clamp.
         spin: Angular velocity added at the start [rad/s], of a free body.
-        drag: Fluid density times drag coefficient over two [kg/m3], on the normal motion of the surface.
+        drag: Pressure on every side, in front and behind, over the square of its normal motion [kg/m3]: a quarter of
+            fluid density times drag coefficient.
         magnet: Point of the undeformed body that is drawn, the fixed point that draws [m], and the force at 10 mm [N],
             which falls with the cube of the distance.
         gust: Traction of a wind [Pa, 3] on the surface that faces it, then its first and last time [s].
