@@ -24,7 +24,7 @@ from torchsoro.sim2real.numerics import choose_twin, cost, measure
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
-from torchsoro.sim2real.search import _simpler
+from torchsoro.sim2real.search import _simpler, search
 from torchsoro.sim2real.twin import Motion, Twin
 from torchsoro.sim2real.verdict import judge
 
@@ -283,6 +283,44 @@ def test_a_finer_twin_corrects_where_one_is(made):
     for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
         assert np.abs(motion.place - right.place).max() < 1e-7
     assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
+
+
+def test_each_effect_is_corrected_where_it_is(made):
+    twin, ensemble, record = made
+    fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
+    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
+    drag, tilt = (effect(name) for name in ("drag", "gravity_tilt"))
+    points = [((), np.array([[0.3]])), ((drag,), np.array([[0.5, 20.0]]))]
+    told = problem.corrected_each(points)
+    wanted = Problem(record(None), fine.twin, ensemble=fine).simulate(points)
+    for motions, right in zip(told.simulate(points), wanted, strict=True):
+        for one, other in zip(motions, right, strict=True):
+            assert np.abs(one.place - other.place).max() < 1e-7
+    others = [((tilt,), np.array([[0.5, 1.0, 1.0]]))]
+    (found,), (bare,) = told.simulate(others), problem.simulate(others)
+    assert all(np.array_equal(a.place, b.place) for a, b in zip(found, bare, strict=True))
+
+
+def test_what_the_twin_gets_wrong_is_not_taken_for_the_effect(made):
+    """Recordings by a finer twin, of a body that is so different that the twin's error is another than believed."""
+    twin, _, record = made
+    experiment = record(None)
+    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
+    drag, trials = effect("drag"), []
+    for trial in experiment.trials:
+        scenario = drag(fine.twin.scenario(trial), torch.tensor([[3000.0]], dtype=torch.float64), fine.twin)
+        camera = Camera(experiment.setup, [trial])
+        place = camera.see(fine([scenario])[0].alone(), 0, np.zeros(len(camera.deviations)))
+        recording = dataclasses.replace(trial.recording, place=place)
+        trials.append(dataclasses.replace(trial, recording=recording))
+    left = []
+    for other in (None, fine):
+        problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin), fine=other)
+        _, nothing, best = search(problem, [drag, effect("gravity_tilt")], 600.0, lambda line: None)
+        assert nothing.misfit > 3 * nothing.samples and best[0].name == "drag"
+        assert best[0].values[0][0] == pytest.approx(3000.0, rel=0.02)
+        left.append(best[0].misfit)
+    assert left[1] < 0.1 * left[0]
 
 
 def test_a_simulation_of_ones_own_is_what_is_believed(made):

@@ -75,6 +75,13 @@ def test_what_is_said_of_the_best_effect(still, start, excess, explained, gain, 
     assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
 
 
+def test_where_trials_that_are_left_out_tell_little_but_noise_a_little_better_is_believed(still):
+    problem, nothing = still
+    found = [fitted(nothing, "density", 400.0, 0.96, kept=0.9)]
+    for faint, chosen in ((1.5, 1), (3.0, 0)):
+        assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0, faint=faint).chosen) == chosen
+
+
 def test_a_strained_belief_is_set_free_too(still):
     problem, nothing = still
     assert not _freed(problem, library(), nothing)

@@ -285,8 +285,9 @@ def drag(world: World, s: Specimen, rng: np.random.Generator) -> tuple[World, Ef
     """Quadratic, on the normal motion of the surface; scored as fluid density times drag coefficient.
 
     The force on a body of frontal area A is that times A v^2 / 2; here half of it acts on the front, half on the back.
+    The largest is that of a plate across its motion in water.
     """
-    value = log_uniform(rng, 8, 2000)
+    value = log_uniform(rng, 8, 500)
     effect = Effect(name="drag", parameters={"density_drag_kg_m3": 4 * value}, form={})
     return replace(world, drag=value), effect
 

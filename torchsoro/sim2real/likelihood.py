@@ -56,6 +56,7 @@ class Likelihood:
         numerics: The twin's own error for each trial [M, A] m; none if None.
         shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
         correction: By trial, what a finer twin then adds to motions [S, M, ...].
+        own: By effects, the same with them, where it is known.
         beliefs: See there.
         priors: Of measurement errors.
         noise: [m]; that of the setup, or estimated, if None.
@@ -75,6 +76,7 @@ class Likelihood:
         numerics: Sequence[np.ndarray] | None = None,
         shift: Sequence[float] = (),
         correction: Mapping[str, Motion] | None = None,
+        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
         beliefs: Beliefs | None = None,
         priors: Priors | None = None,
         noise: float | None = None,
@@ -91,7 +93,7 @@ class Likelihood:
         self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
         shape = recordings[0].place.shape[1:]
         self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
-        self.correction = correction or {}
+        self.correction, self.own = correction or {}, own or {}
         self.priors, self.slips, self.lasting = priors, tuple(slips), lasting
         self.camera = Camera(experiment.setup, self.trials, priors, slips)
         self.bands = [Band(r, self.noise, n, lasting) for r, n in zip(recordings, self.numerics, strict=True)]
@@ -111,6 +113,7 @@ class Likelihood:
         slips: Sequence[Slip] | None = None,
         numerics: Sequence[np.ndarray] | None = None,
         correction: Mapping[str, Motion] | None = None,
+        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
     ) -> Self:
         """The same of other trials, with other slips, or another error or correction of the twin."""
         known = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
@@ -122,6 +125,7 @@ class Likelihood:
             numerics=numerics or [known.get(t.name, common) for t in trials],
             shift=tuple(self.shift),
             correction=self.correction if correction is None else correction,
+            own=self.own if own is None else own,
             beliefs=self.beliefs,
             priors=self.priors,
             noise=self.noise,
@@ -139,14 +143,24 @@ class Likelihood:
 
         A simulation of one's own is of what is believed, and stays what it is.
         """
-        trials = [t for t in self.trials if t.name not in self.stated]
-        if self.fine is None or not trials:
-            return self
-        still: list[Request] = [((), at[None])]
-        there = type(self)(self.experiment, self.fine.twin, trials=trials, noise=self.noise, ensemble=self.fine)
-        own = self.only(trials, correction={}).simulate(still)[0]
-        found = added(trials, own, there.simulate(still)[0])
+        (found,) = self._finer(self.trials, [((), at[None])])
         return self.only(self.trials, correction={**self.correction, **found})
+
+    def corrected_each(self, points: Sequence[Request]) -> Self:
+        """The same, but effects are corrected by the finer twin where each of them is now, at one point."""
+        kept = [t for t in self.experiment.heldout if t.recording is not None]
+        found = self._finer([*self.trials, *kept], points)
+        own = {e: {**self.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
+        return self.only(self.trials, own={**self.own, **own})
+
+    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, Motion]]:
+        """What the finer twin adds at points, by trial; nothing to those with a simulation of one's own."""
+        trials = [t for t in trials if t.name not in self.stated]
+        if self.fine is None or not trials:
+            return [{} for _ in points]
+        there = type(self)(self.experiment, self.fine.twin, trials=trials, noise=self.noise, ensemble=self.fine)
+        coarse = self.only(trials, correction={}, own={}).simulate(points)
+        return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
 
     @property
     def stated(self) -> dict[str, Motion]:
@@ -217,10 +231,10 @@ class Likelihood:
         begin = time.perf_counter()
         varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
         count = len(self.scenarios)
-        found = [
-            motion.plus(self.correction[name]) if (name := self.trials[k % count].name) in self.correction else motion
-            for k, motion in enumerate(self.ensemble(varied))
-        ]
+        found = []
+        for k, motion in enumerate(self.ensemble(varied)):
+            known, name = self.own.get(requests[k // count][0], self.correction), self.trials[k % count].name
+            found.append(motion.plus(known[name]) if name in known else motion)
         spent = time.perf_counter() - begin
         simulations = count * sum(len(points) for _, points in requests)
         self.tally.simulations += simulations

@@ -144,7 +144,7 @@ class FluidDrag(Hypothesis):
 
     name, seam, form = "drag", "drag of what surrounds the body", LAW
     # Water, and a plate across its motion: 1000 kg/m3 times 2.
-    quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 1000.0),)
+    quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 125.0),)
     starts = ((1.0,), (5.0,), (25.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:

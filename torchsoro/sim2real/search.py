@@ -20,6 +20,8 @@ FAR = 3.0  # times what noise and numerics explain, above which searches begin w
 EARLY = (0.12, 0.35)  # of the trials
 PRICED = 1.5  # times what noise and numerics explain, above which what the best effect leaves counts as one of them
 PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
+CLEAR = 1.5  # times what noise and numerics explain, above which what a finer twin adds depends on the effect
+REFINED = 2  # times that the best are corrected by the finer twin
 PARTLY = 4.0  # times as long as with all lanes filled a simulation takes in a search, that fills some
 MOST = 10  # effects for which searches are begun
 BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
@@ -77,11 +79,26 @@ def search(
         tasks = [(f.effects, f.point) for f in led]
     tasks += freed
     best = _best([*problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS), *tried])
+    if best and nothing.misfit > CLEAR * nothing.samples:
+        problem, nothing, best = _refined(problem, nothing, best, report)
     if best and best[0].misfit > FAR * best[0].samples and each < PAIRS * budget:
         left = best[0].misfit - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.misfit - f.samples < TWICE * left]
         best = _best([*best, *pairs])
     return problem, nothing, _simpler(problem, effects, best)
+
+
+def _refined(
+    problem: Problem, nothing: Fit, best: list[Fit], report: Callable[[str], None]
+) -> tuple[Problem, Fit, list[Fit]]:
+    """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin."""
+    leading = [nothing, *best[:KEPT]]
+    for _ in range(REFINED):
+        problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
+        tasks: list[Task] = [(f.effects, f.point) for f in leading]
+        leading = [f for f in problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS) if f is not None]
+        report("by the finer twin: " + ", ".join(f"{f.name} {f.misfit:.0f}" for f in leading))
+    return problem, next((f for f in leading if not f.effects), nothing), _best(f for f in leading if f.effects)
 
 
 def _simpler(problem: Problem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:

@@ -38,7 +38,10 @@ class Thresholds:
         beyond: As ``quiet``, with the best effect, above which it leaves something.
         share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
-        noisy: The same where noise and numerics explain most and the gain is above ``sure``.
+        noisy: The same where noise and numerics explain most, or noise most of what is left of the trials left out
+            without an effect, and the gain is above ``sure``.
+        faint: Square of the error on trials left out without an effect, over that of the noise, below which it is
+            mostly noise.
         sure: Such a gain; without anything missing it has never been found.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
         near: By how much it may be larger in any case, even than ``lost``, over the error without an effect.
@@ -58,6 +61,7 @@ class Thresholds:
     share: float = 0.9
     lost: float = 0.85
     noisy: float = 0.95
+    faint: float = 2.0
     sure: float = 200.0
     worse: float = 1.3
     near: float = 0.02
@@ -122,10 +126,11 @@ def judge(
         dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0))
         for c in rank(fits, nothing, believed, problem.camera.deviations)
     ]
-    found, heldout = _proved(problem, nothing, found, kept)
+    found, heldout, faint = _proved(problem, nothing, found, kept)
     for c in found:
         report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
-    verdict = decide(problem, nothing, found, excess, thresholds or Thresholds(), start=start, plainly=plainly)
+    t = thresholds or Thresholds()
+    verdict = decide(problem, nothing, found, excess, t, start=start, plainly=plainly, faint=faint)
     shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
     return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
 
@@ -147,14 +152,17 @@ def tell(fit: Fit) -> str:
 
 def _proved(
     problem: Problem, nothing: Fit, found: list[Candidate], kept: Sequence[Trial]
-) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]]]:
-    """The candidates near the best with their error on trials left out; and by name, errors as believed and with it."""
+) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]], float]:
+    """The candidates near the best with their error on trials left out; by name, errors as believed and with it.
+
+    Last the square of the error without an effect, over that of the noise.
+    """
     near = [c for c in found if c.gain > FAINT and c.score > 0.5 * found[0].score][:3]
     fits = [nothing, *(c.fit for c in near)]
     if kept:
         folds = [(problem, fits, list(kept))]
     elif len(problem.trials) < 3 or not near:
-        return found, {}
+        return found, {}, math.inf
     else:
         folds = []
         for i, trial in enumerate(problem.trials[:FOLDS]):
@@ -168,13 +176,15 @@ def _proved(
         told = predict_all(where, mine, trials)
         believed = predict_all(where, mine[:1], trials, believed=True)[0]
         if not told[0] or not believed:
-            return found, {}
+            return found, {}, math.inf
         for k, (fit, row) in enumerate(zip(mine, told, strict=True)):
             squares[k] += sum(p.total**2 for p in row) if row else math.inf
             heldout[fit.name] |= {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
     ratios = np.sqrt(squares / squares[0])
     proved = {id(c): float(ratio) for c, ratio in zip(near, ratios[1:], strict=True)}
-    return [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found], heldout
+    noise = len(heldout[nothing.name]) * len(problem.experiment.setup.axes) * problem.noise**2
+    found = [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found]
+    return found, heldout, float(squares[0]) / noise
 
 
 def _halves(one: Fit, other: Fit) -> bool:
@@ -193,6 +203,7 @@ def decide(
     *,
     start: float,
     plainly: float = math.inf,
+    faint: float = math.inf,
 ) -> Verdict:
     """The verdict on a ranking.
 
@@ -204,11 +215,12 @@ def decide(
         t: What decides.
         start: As ``excess``, without an effect.
         plainly: The same, with modulus and pressure as believed.
+        faint: Square of the error on trials left out without an effect, over that of the noise.
     """
     believed = [c for c in found if c.gain > t.alarm]
     if not all(math.isnan(c.kept) for c in found):
         # Where most of an error is noise, even the truth takes little of it away.
-        most = [t.noisy if start < t.some and c.gain > t.sure else t.lost for c in believed]
+        most = [t.noisy if (start < t.some or faint < t.faint) and c.gain > t.sure else t.lost for c in believed]
         least = min((c.kept for c, lost in zip(believed, most, strict=True) if c.kept <= lost), default=-math.inf)
         believed = [
             c
