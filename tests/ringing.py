@@ -61,22 +61,22 @@ def two_trials(folder: Path) -> tuple[Experiment, Trial]:
 
 
 def bar(folder: Path):
-    """The twin of a bar, its ensemble, and a function that makes what it would record with an effect in two trials."""
+    """The twin of a bar, its ensemble, and a function that makes what it, or another, would record in two trials."""
     found, loud = two_trials(folder)
     twin = Twin(found.setup, edge=EDGE, across=2)
     ensemble = Ensemble(twin)
 
-    def record(name: str | None, values=(), **change) -> Experiment:
+    def record(name: str | None, values=(), by: Ensemble = ensemble, **change) -> Experiment:
         rng, trials = np.random.default_rng(1), []
         for k, trial in enumerate((found.trials[0], loud)):
             trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
-            scenario = twin.scenario(trial)
+            scenario = by.twin.scenario(trial)
             if name is not None:
-                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), twin)
+                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), by.twin)
             camera = Camera(found.setup, [trial])
             errors = np.zeros(len(camera.deviations))
             errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
-            seen = camera.see(ensemble([scenario])[0].alone(), 0, errors)
+            seen = camera.see(by([scenario])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             place[7, 0] = np.nan
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))

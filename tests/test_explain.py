@@ -20,11 +20,11 @@ from torchsoro.sim2real.fit import Problem
 from torchsoro.sim2real.heldout import predict
 from torchsoro.sim2real.library import library
 from torchsoro.sim2real.model import predict_trial, read_model
-from torchsoro.sim2real.numerics import choose_twin, cost, measure
+from torchsoro.sim2real.numerics import WALLS, choose_twin, cost, finer, measure
 from torchsoro.sim2real.recording import Recording, read_table
 from torchsoro.sim2real.report import as_json, effect_rows
 from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
-from torchsoro.sim2real.search import _simpler, search
+from torchsoro.sim2real.search import _simpler
 from torchsoro.sim2real.twin import Motion, Twin
 from torchsoro.sim2real.verdict import judge
 
@@ -272,84 +272,6 @@ def test_a_wrong_frequency_is_found_over_many_swings(made):
     assert told.chosen[0].fit.values[0][0] == pytest.approx(0.9, abs=0.01)
 
 
-def test_a_finer_twin_corrects_where_one_is(made):
-    twin, ensemble, record = made
-    setup = record(None).setup
-    fine = Ensemble(Twin(setup, edge=0.6 * twin.edge, across=5))
-    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
-    at = np.array([0.8])
-    there = Problem(record(None), fine.twin, ensemble=fine)
-    wanted = there.simulate([((), at[None])])[0]
-    for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
-        assert np.abs(motion.place - right.place).max() < 1e-7
-    assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
-
-
-def test_each_effect_is_corrected_where_it_is(made):
-    twin, ensemble, record = made
-    fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
-    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
-    drag, tilt = (effect(name) for name in ("drag", "gravity_tilt"))
-    points = [((), np.array([[0.3]])), ((drag,), np.array([[0.5, 20.0]]))]
-    told = problem.corrected_each(points)
-    wanted = Problem(record(None), fine.twin, ensemble=fine).simulate(points)
-    for motions, right in zip(told.simulate(points), wanted, strict=True):
-        for one, other in zip(motions, right, strict=True):
-            assert np.abs(one.place - other.place).max() < 1e-7
-    others = [((tilt,), np.array([[0.5, 1.0, 1.0]]))]
-    (found,), (bare,) = told.simulate(others), problem.simulate(others)
-    assert all(np.array_equal(a.place, b.place) for a, b in zip(found, bare, strict=True))
-
-
-def test_what_the_twin_gets_wrong_is_not_taken_for_the_effect(made):
-    """Recordings by a finer twin, of a body that is so different that the twin's error is another than believed."""
-    twin, _, record = made
-    experiment = record(None)
-    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
-    drag, trials = effect("drag"), []
-    for trial in experiment.trials:
-        scenario = drag(fine.twin.scenario(trial), torch.tensor([[3000.0]], dtype=torch.float64), fine.twin)
-        camera = Camera(experiment.setup, [trial])
-        place = camera.see(fine([scenario])[0].alone(), 0, np.zeros(len(camera.deviations)))
-        recording = dataclasses.replace(trial.recording, place=place)
-        trials.append(dataclasses.replace(trial, recording=recording))
-    left = []
-    for other in (None, fine):
-        problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin), fine=other)
-        _, nothing, best = search(problem, [drag, effect("gravity_tilt")], 600.0, lambda line: None)
-        assert nothing.misfit > 3 * nothing.samples and best[0].name == "drag"
-        assert best[0].values[0][0] == pytest.approx(3000.0, rel=0.02)
-        left.append(best[0].misfit)
-    assert left[1] < 0.1 * left[0]
-
-
-def test_a_simulation_of_ones_own_is_what_is_believed(made):
-    twin, ensemble, record = made
-    experiment = record(None)
-    still = [((), np.zeros((1, 1)))]
-    problem = Problem(experiment, twin, ensemble=ensemble)
-    time, trials = np.arange(0.0, 0.2001, 0.0025), []
-    for trial, motion in zip(experiment.trials, problem.simulate(still)[0], strict=True):
-        place = motion.alone().place[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
-        trials.append(dataclasses.replace(trial, simulated=Recording(time=time, place=place)))
-    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
-    assert not problem.stated
-    experiment = dataclasses.replace(experiment, trials=(trials[0],), heldout=(trials[1],))
-    numerics = measure(experiment, ensemble, fine)
-    told = {"shift": numerics.shift, "correction": numerics.correction}
-    problem = Problem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
-    assert problem.stated.keys() == {t.name for t in trials}
-    for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
-        place = motion.alone().place
-        np.testing.assert_allclose(place[: len(time)], trial.simulated.place, atol=1e-9)
-        # What a clock that is behind has seen after its end goes on.
-        steps = np.abs(np.diff(place[len(time) - 2 :], axis=0)).max((1, 2))
-        assert len(steps) > 8 and (steps > 5e-5).all() and (steps < 1e-3).all()
-    # Also where modulus and pressure are not what is believed.
-    moved = problem.corrected(np.array([0.8])).correction
-    assert all(moved[t.name] is numerics.correction[t.name] for t in trials)
-
-
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_refused(made):
     with pytest.raises(ValueError, match="device = 'cuda'"):
@@ -422,7 +344,8 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     import explain
 
     _, _, record = made
-    recorded = record("drag", (800.0,))
+    setup = record(None).setup
+    recorded = record("drag", (800.0,), by=Ensemble(finer(Twin(setup, edge=EDGE, walls=WALLS), 2, 40.0)))
     monkeypatch.setattr(explain, "read_experiment", lambda folder: recorded)
     monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (effect("drag"),))
     told = explain.main(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))

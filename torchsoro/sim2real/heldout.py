@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,7 +10,10 @@ import numpy as np
 
 from torchsoro.sim2real.experiment import Trial
 from torchsoro.sim2real.fit import Fit, Problem
+from torchsoro.sim2real.residual import LATE
 from torchsoro.sim2real.twin import Motion
+
+ROUNDS = 10  # in which a trial's clock is found
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,14 +66,23 @@ def _seen(problem: Problem, there: Problem, fit: Fit, motions: Sequence[Motion])
         assert trial.recording is not None
         one = motion.alone()
         errors = np.concatenate([np.zeros(count), known])
-        for _ in range(6):
+        weight, most = (problem.noise / there.camera.deviations[i]) ** 2, LATE * there.camera.deviations[i]
+        clock, least, step = 0.0, math.inf, 0.0
+        for _ in range(ROUNDS):
             seen, by = there.camera.linearise(one, i, errors)
             left, slope = trial.recording.place - seen, by[..., i]
             good = np.isfinite(left)
-            weight = (problem.noise / there.camera.deviations[i]) ** 2
-            errors[i] += (float((left[good] * slope[good]).sum()) - weight * errors[i]) / (
-                float((slope[good] ** 2).sum()) + weight
-            )
+            now = float((left[good] ** 2).sum()) + weight * errors[i] ** 2
+            if now < least:
+                clock, least = float(errors[i]), now
+                step = (float((left[good] * slope[good]).sum()) - weight * clock) / (
+                    float((slope[good] ** 2).sum()) + weight
+                )
+            else:  # too far
+                step /= 4
+            # A simulation that is far off would otherwise bend the clock without end.
+            errors[i] = np.clip(clock + step, -most, most)
+        errors[i] = clock
         seen = there.camera.see(one, i, errors)
         square = (trial.recording.place - seen) ** 2
         error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))

@@ -274,11 +274,16 @@ def _beyond(e: Explanation) -> str:
             large.append(f"{_plain(name, unit)} {number(value, unit)} (believed within {deviation:.2g})")
     if not large:
         return ""
-    return (
+    told = (
         " But the fit bends measurement errors further than can be believed, so that more is missing than this: "
-        f"{', '.join(large)}. What is left over is {e.verdict.excess:.2g} times what noise and the simulation's own "
-        "error explain; where and when is drawn below."
+        f"{', '.join(large)}."
     )
+    if e.verdict.excess > 1:
+        told += (
+            f" What is left over is {e.verdict.excess:.2g} times what noise and the simulation's own error explain; "
+            "where and when is drawn below."
+        )
+    return told
 
 
 def _said(candidate: Candidate, problem: Problem) -> str:
