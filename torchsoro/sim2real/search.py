@@ -98,7 +98,9 @@ def _refined(
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
         leading = [f for f in problem.fit(tasks, errors=nothing.errors, rounds=ROUNDS) if f is not None]
         report("by the finer twin: " + ", ".join(f"{f.name} {f.misfit:.0f}" for f in leading))
-    return problem, next((f for f in leading if not f.effects), nothing), _best(f for f in leading if f.effects)
+    # Where all of them break down once they are corrected, they are told as they were.
+    refined = _best(f for f in leading if f.effects) or best
+    return problem, next((f for f in leading if not f.effects), nothing), refined
 
 
 def _simpler(problem: Problem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
@@ -197,10 +199,11 @@ def _pairs(
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         whole = share == 1
-        where = problem if whole else problem.early(share) or problem
+        early = None if whole else problem.early(share)
+        where = early or problem
         chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
         leading = ", ".join(f"{fit.name} {fit.misfit:.0f}" for fit in chosen[:4])
-        report(f"pairs, first {100 * share:.0f} % of the trials: {leading}")
+        report(f"pairs, {f'first {100 * share:.0f} %' if early else 'all'} of the trials: {leading}")
         tasks = [(f.effects, f.point) for f in chosen[:most]]
     return chosen
 
