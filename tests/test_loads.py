@@ -36,6 +36,12 @@ def test_a_force_accelerates(way):
     torch.testing.assert_close(pushed.center_velocity, pushed.time.unsqueeze(1) * push / MASS, rtol=1e-9, atol=1e-12)
 
 
+def test_a_force_over_time_may_stay_on_the_processor(cuda):
+    force = Force(particles=EVERY, value=torch.stack([vector(0, 0, 0), vector(1, 2, 3)]), time=vector(0.0, 1.0))
+    t = torch.linspace(0, 1, 5, dtype=torch.float64, device=cuda)
+    torch.testing.assert_close(force.at(t), t.cpu()[:, None] * vector(1, 2, 3))
+
+
 @ways("apic", "total")
 def test_a_force_on_some_particles_moves_the_whole_by_its_impulse(way):
     pushed = run([Force(particles=torch.tensor([0, 5, 9]), value=vector(0.001, 0.0, 0.002))], **way)

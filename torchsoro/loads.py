@@ -32,10 +32,10 @@ class Force:
     share: Tensor | None = None
 
     def at(self, t: Tensor) -> Tensor:
-        """Force at times t [T]: [..., T, 3] N."""
+        """Force at times t [T]: [..., T, 3] N, in the type and on the device of ``value``."""
         if self.time is None:
             return self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
-        return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t).transpose(-1, -2)
+        return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t.to(self.time)).transpose(-1, -2)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
