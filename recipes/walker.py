@@ -18,6 +18,7 @@ import math
 import statistics
 import time
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -97,10 +98,24 @@ def fell(robot: Robot, outcome: Outcome) -> bool:
     return s.upright > 0 and outcome.fall.item() > 0.1 * s.size[2]
 
 
-def optimize(robot: Robot, name: str) -> dict[str, float]:
-    """Run the design loop to the stopping rule and write what came out of it: the best design within the limit on C.
+def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian) -> bool:
+    """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
 
-    Travel is rough, so that the last design is seldom the best; without any within the limit the last is taken.
+    As long as none is within the limit, what is gained and what is violated weigh as in the loss of now.
+    """
+    if best is None:
+        return True
+    if violation <= 0 or best["violation"] <= 0:
+        return (violation <= 0, worth) > (best["violation"] <= 0, best["worth"])
+    pairs = (worth, violation), (best["worth"], best["violation"])
+    new, old = (float(lagrangian(torch.tensor(w), torch.tensor(v))) for w, v in pairs)
+    return new < old
+
+
+def optimize(robot: Robot, name: str) -> dict[str, float]:
+    """Run the design loop to the stopping rule and write what came out of it: the best design (see :func:`better`).
+
+    Travel is rough, so that the last design is seldom the best. Designs count once gravity is whole.
 
     Args:
         robot: What to design.
@@ -128,7 +143,7 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
     )
     stopped = False
     good = field.phi.detach().clone()
-    best = {"worth": -math.inf, "phi": good}
+    best: dict[str, Any] | None = None
     with RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, free=s.free, amend=s.amend) as run:
         if state := run.load():
             field.load_state_dict(state["field"])
@@ -148,8 +163,8 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
             if not fell(robot, outcome):
                 good = field.phi.detach().clone()
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf, error_if_nonfinite=True)
-            if violation.item() <= 0 and worth.item() > best["worth"] and s.gravity_scale(k) == 1.0:
-                best = {"worth": worth.item(), "phi": field.phi.detach().clone()}
+            if s.gravity_scale(k) == 1.0 and better(worth.item(), violation.item(), best, lagrangian):
+                best = {"worth": worth.item(), "violation": violation.item(), "phi": field.phi.detach().clone()}
             end = time.perf_counter()
             adam.step()
             field.clamp_()
@@ -183,7 +198,7 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
             run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good)
             if stopped:
                 break
-        if best["worth"] > -math.inf:
+        if best is not None:
             with torch.no_grad():
                 field.phi.copy_(best["phi"])
         metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name)

@@ -26,6 +26,7 @@ from tiny import TINY, tiny
 
 from torchsoro.archive import load_design, load_shape
 from torchsoro.errors import SimulationDiverged
+from torchsoro.lagrangian import AugmentedLagrangian
 from torchsoro.robot import climber, walker
 from torchsoro.settings import Settings
 
@@ -320,13 +321,41 @@ def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path,
     # Every design but the first is within the limit on C.
     settings = tiny(tmp_path / "run", c_max=0.249, gravity_steps=1, gravity_every=2, iterations=2)
     recipe.main(settings)
-    assert items(settings.out)["best"]["worth"] == -math.inf
+    assert items(settings.out)["best"] is None
     robot = walker(settings)
     robot.field.load_state_dict(items(settings.out)["field"])
     assert torch.equal(delivered[0], robot.field())  # without a best one the last is delivered
     recipe.main(dataclasses.replace(settings, iterations=3, resume=True))
     last = float(metrics(settings.out)[2]["objective/L"])
     assert items(settings.out)["best"]["worth"] == pytest.approx(last / robot.domain.cell, rel=1e-6)
+
+
+def test_a_design_is_better_within_the_limit_then_if_it_goes_farther_and_before_that_by_the_loss(recipes):
+    better = recipes["walker"].better
+    soft, hard = (AugmentedLagrangian(previous=0.24, penalty=price) for price in (1.0, 1e4))
+    assert better(-1.0, 0.5, None, soft)
+    within, beyond = {"worth": 1.0, "violation": -0.01}, {"worth": 1.0, "violation": 0.02}
+    assert better(1.1, -0.001, within, soft) and not better(0.9, -0.02, within, soft)
+    assert better(-1.0, 0.0, beyond, soft) and not better(9.0, 0.001, within, soft)
+    # A tenth more travel for a hundredth more of violation, at different prices.
+    assert better(1.1, 0.03, beyond, soft) and not better(1.1, 0.03, beyond, hard)
+    assert not better(0.9, 0.01, beyond, soft) and better(0.9, 0.01, beyond, hard)
+
+
+def test_without_a_design_within_the_limit_the_one_with_the_least_loss_is_delivered(recipes, tmp_path):
+    settings = tiny(tmp_path / "run", c_max=1e-6, iterations=4, upright=20.0)  # the last sinks a little
+    result = recipes["walker"].main(settings)
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    loss, cell = AugmentedLagrangian(previous=0.24, penalty=settings.penalty), walker(settings).domain.cell
+    violations = [float(row["constraint/C"]) - settings.c_max for row in rows]
+    worths = [(float(row["objective/L"]) - settings.upright * float(row["objective/fall"])) / cell for row in rows]
+    lost = [float(loss(torch.tensor(w), torch.tensor(v))) for w, v in zip(worths, violations, strict=True)]
+    least = int(np.argmin(lost))
+    assert least == 2
+    assert items(settings.out)["best"]["violation"] == pytest.approx(violations[least], abs=1e-7)
+    assert items(settings.out)["best"]["worth"] == pytest.approx(worths[least], rel=1e-5)
+    assert result["C"] == pytest.approx(violations[least] + settings.c_max, rel=1e-2)
 
 
 def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
