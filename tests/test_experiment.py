@@ -67,6 +67,12 @@ def test_a_trial_replaces_tables_of_the_setup(tmp_path):
     assert found.trials[0].setup.loads[0].force == (0.0, 0.0, -1.0)
 
 
+def test_two_samples_are_refused(tmp_path):
+    table = "time_s,tip_x_m,tip_z_m\n0,0.04,0.02\n0.05,0.04,0.02\n"
+    with pytest.raises(ValueError, match=r"markers\.csv: 2 samples, wanted three or more"):
+        read_experiment(experiment(tmp_path, markers=table))
+
+
 def test_an_empty_cell_is_a_lost_sample(tmp_path):
     table = "time_s,tip_x_m,tip_z_m\n0,0.04,0.02\n0.05,,0.02\n0.1,0.04,0.02\n"
     recording = read_experiment(experiment(tmp_path, markers=table)).trials[0].recording

@@ -36,10 +36,10 @@ class Recording:
 
     def __post_init__(self) -> None:
         """Check the table."""
-        if self.time.ndim != 1 or len(self.time) < 3 or self.place.shape[:1] != self.time.shape:
-            raise ValueError(
-                f"time, place: shapes {self.time.shape} and {self.place.shape}, wanted [T], [T, M, A], T > 2"
-            )
+        if self.time.ndim != 1 or self.place.shape[:1] != self.time.shape:
+            raise ValueError(f"time, place: shapes {self.time.shape} and {self.place.shape}, wanted [T], [T, M, A]")
+        if len(self.time) < 3:
+            raise ValueError(f"{len(self.time)} samples, wanted three or more")
         if self.place.ndim != 3 or self.place.shape[2] != len(self.axes):
             raise ValueError(f"place: shape {self.place.shape}, wanted [T, M, {len(self.axes)}] as axes = {self.axes}")
         late = np.flatnonzero(~(np.diff(self.time) > 0))
