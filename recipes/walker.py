@@ -164,7 +164,12 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
                 good = field.phi.detach().clone()
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf, error_if_nonfinite=True)
             if s.gravity_scale(k) == 1.0 and better(worth.item(), violation.item(), best, lagrangian):
-                best = {"worth": worth.item(), "violation": violation.item(), "phi": field.phi.detach().clone()}
+                best = {
+                    "iteration": k,
+                    "worth": worth.item(),
+                    "violation": violation.item(),
+                    "phi": field.phi.detach().clone(),
+                }
             end = time.perf_counter()
             adam.step()
             field.clamp_()
@@ -201,7 +206,8 @@ def optimize(robot: Robot, name: str) -> dict[str, float]:
         if best is not None:
             with torch.no_grad():
                 field.phi.copy_(best["phi"])
-        metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name)
+        chosen = None if best is None else best["iteration"]
+        metrics = deliver(s.out, robot, field().detach(), run.metrics, name=name, chosen=chosen)
     found = {
         **metrics,
         "iterations": len(run.metrics["iteration"]),

@@ -9,11 +9,13 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 from torchsoro.domain import Chamber, Domain
 from torchsoro.fabricate import surface
-from torchsoro.page import last_cycle, motion_of
+from torchsoro.page import history_panel, last_cycle, motion_of
 from torchsoro.picture import deform, movie, shape_image, summary
 from torchsoro.scene import Camera
 
@@ -153,6 +155,16 @@ def test_summary(tmp_path: Path, climb: bool) -> None:
         image = np.asarray(picture)
     assert image.shape == (1120, 1760, 3) and share_of(image, "blue") > 0.02
     assert [p.name for p in tmp_path.iterdir()] == ["summary.png"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "marked", "told"), [(None, (4, 3.0), "3"), (2, (3, 4.5), "4.5"), (1, (3, 4.5), "4.5")]
+)
+def test_a_history_marks_the_chosen_iteration_or_the_next_that_is_known(chosen, marked, told) -> None:
+    axes = Figure().add_subplot()
+    history_panel(axes, np.array([1.0, float("nan"), 4.5, 3.0]), "k", "L [mm]", "objective", chosen=chosen)
+    assert axes.lines[1].get_xydata().tolist() == [list(marked)]
+    assert any(f"objective: {told} mm" in text.get_text() for text in axes.findobj(Text))
 
 
 def test_refusals(tmp_path: Path) -> None:

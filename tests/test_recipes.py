@@ -353,6 +353,7 @@ def test_without_a_design_within_the_limit_the_one_with_the_least_loss_is_delive
     lost = [float(loss(torch.tensor(w), torch.tensor(v))) for w, v in zip(worths, violations, strict=True)]
     least = int(np.argmin(lost))
     assert least == 2
+    assert items(settings.out)["best"]["iteration"] == least
     assert items(settings.out)["best"]["violation"] == pytest.approx(violations[least], abs=1e-7)
     assert items(settings.out)["best"]["worth"] == pytest.approx(worths[least], rel=1e-5)
     assert result["C"] == pytest.approx(violations[least] + settings.c_max, rel=1e-2)

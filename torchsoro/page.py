@@ -266,17 +266,27 @@ def gait_panels(
 
 
 def history_panel(
-    axes: Axes, values: np.ndarray, color: str, label: str, head: str, limit: float | None = None
+    axes: Axes,
+    values: np.ndarray,
+    color: str,
+    label: str,
+    head: str,
+    limit: float | None = None,
+    chosen: int | None = None,
 ) -> None:
-    """A quantity over the iterations, its last value in the heading; numbers that are not finite are left out."""
+    """A quantity over the iterations, its value in the ``chosen`` one, or the last, in the heading.
+
+    Numbers that are not finite are left out.
+    """
     iterations = 1 + np.flatnonzero(np.isfinite(values))
     values = values[iterations - 1]
+    at = len(values) - 1 if chosen is None else int(np.searchsorted(iterations[:-1], chosen + 1))
     axes.plot(iterations, values, color=color, lw=1.9)
-    axes.plot(iterations[-1], values[-1], "o", color=color, ms=5)
+    axes.plot(iterations[at], values[at], "o", color=color, ms=5)
     axes.set_ylabel(label, color=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     plain(axes)
-    heading(axes, f"{head}: {values[-1]:.3g}" + (" mm" if "mm" in label else ""))
+    heading(axes, f"{head}: {values[at]:.3g}" + (" mm" if "mm" in label else ""))
     if limit is not None:
         axes.axhline(limit, color=FULL, lw=1.2, ls=(0, (4, 2)))
         axes.set_ylim(0, 1.15 * max(limit, float(values.max())))

@@ -261,6 +261,7 @@ def summary(
     elevation: float = 16.0,
     tilt: float = 0.0,
     level: float = 0.5,
+    chosen: int | None = None,
 ) -> Path:
     """Write the page of a run: shape, histories of L and C, one cycle of the gait, path of the centre of gravity.
 
@@ -281,6 +282,7 @@ def summary(
         elevation: of the camera [degrees].
         tilt: as for a movie [degrees].
         level: density at the surface.
+        chosen: iteration that the design is of, counted from 0; the last if None.
 
     Returns:
         The path.
@@ -303,9 +305,9 @@ def summary(
     heading(view, "design (orange: chamber wall; inside: cavity)")
 
     upper = figure.add_axes((0.425, 0.74, 0.24, 0.175))
-    history_panel(upper, objective * 1e3, REST, "L [mm]", "objective")
+    history_panel(upper, objective * 1e3, REST, "L [mm]", "objective", chosen=chosen)
     lower = figure.add_axes((0.425, 0.48, 0.24, 0.175), sharex=upper)
-    history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density", limit)
+    history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density", limit, chosen)
     lower.set_xlabel("iteration", color=INK)
     cycle = last_cycle(motion, period)
     path_panels(figure, motion, cycle)

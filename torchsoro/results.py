@@ -35,7 +35,13 @@ def drawn_planes(robot: Robot) -> tuple[tuple[int, float, int], ...]:
 
 
 def deliver(
-    path: Path, robot: Robot, gamma: torch.Tensor, history: Mapping[str, Sequence[float]], *, name: str
+    path: Path,
+    robot: Robot,
+    gamma: torch.Tensor,
+    history: Mapping[str, Sequence[float]],
+    *,
+    name: str,
+    chosen: int | None = None,
 ) -> dict[str, float]:
     """Write the design of a finished run into its folder, as ``design.npz``, and show it there: see :func:`show`.
 
@@ -45,6 +51,7 @@ def deliver(
         gamma: Its density [N]; judged as it is stored, with three decimals.
         history: Metrics of the run, for the summary.
         name: Of the robot: names the movie and the page.
+        chosen: Iteration that the design is of; the last if None.
 
     Returns:
         What :func:`show` measured.
@@ -53,7 +60,7 @@ def deliver(
         ValueError: if the design has no connected body to print; the design and the movie are written before.
     """
     gamma = save_design(path / "design.npz", robot.domain, gamma)
-    return show(path, robot, gamma, history=history, name=name)[0]
+    return show(path, robot, gamma, history=history, chosen=chosen, name=name)[0]
 
 
 @torch.no_grad()
@@ -64,6 +71,7 @@ def show(
     *,
     name: str,
     history: Mapping[str, Sequence[float]] | None = None,
+    chosen: int | None = None,
     void: bool = True,
 ) -> tuple[dict[str, float], Part]:
     """Simulate a gait with every particle recorded, and write what people look at and print.
@@ -77,6 +85,7 @@ def show(
         gamma: Its density [N].
         name: Of the robot: names the movie and the page.
         history: Metrics of its run.
+        chosen: Iteration of that run that the design is of; the last if None.
         void: Simulate void, too.
 
     Returns:
@@ -92,7 +101,7 @@ def show(
     frames = trajectory.position.cpu().numpy()
     time = trajectory.time.cpu().double().numpy()
     way = trajectory.center_of_gravity.cpu().double().numpy() @ np.array(robot.direction)
-    chosen = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
+    drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
     shown = {
         "domain": robot.domain,
@@ -104,9 +113,9 @@ def show(
     movie(
         path / f"{name}.mp4",
         **shown,
-        frames=frames[chosen],
-        time=time[chosen],
-        pressure=supply[chosen],
+        frames=frames[drawn],
+        time=time[drawn],
+        pressure=supply[drawn],
         fps=20,
         title=f"{name}, {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
     )
@@ -118,6 +127,7 @@ def show(
             time=time,
             pressure=supply,
             history=history,
+            chosen=chosen,
             limit=s.c_max,
             period=1 / s.frequency,
             title=f"{name} ({s.preset}): L = {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
