@@ -3,7 +3,7 @@
     python recipes/updated.py my-experiment another-experiment
     python recipes/explain.py my-experiment --out runs/explained     # what is missing from *that* simulation
 
-Writes ``simulated.csv`` into each trial that has a recording. Asked is then what the updated material point method left
+Writes ``simulated.csv`` into each folder of ``trials``. Asked is then what the updated material point method left
 out, its own errors included, and not the twin of explain.py: so can be seen what the formulation of a twin is worth.
 For boxes without chambers, clamped at whole faces, and planes along the axes. Trials that are believed to be the same
 are simulated once, in however many experiments they are.
@@ -131,8 +131,6 @@ def simulate(setup: Setup, options: Options) -> dict[str, np.ndarray]:
         ValueError: for a setup that this recipe is not made for.
         SimulationDiverged: if the simulation breaks down.
     """
-    if setup.cavities or setup.surface is not None:
-        raise ValueError("setup: wanted a box without chambers")
     twin = Twin(setup, edge=min(setup.size) / 2, walls=1)
     if len(twin.faces) < len(setup.clamps):
         raise ValueError("[[clamp]]: wanted whole faces of the body")
@@ -176,15 +174,21 @@ def main(options: Options) -> int:
         ValueError: for an experiment that cannot be read, or not be simulated so.
         SimulationDiverged: if a simulation breaks down.
     """
-    known: dict[Setup, dict[str, np.ndarray]] = {}
+    asked: dict[Path, Setup] = {}
     for folder in options.experiments:
         for trial in read_experiment(folder).trials:
+            if trial.setup.cavities or trial.setup.surface is not None:
+                raise ValueError(f"{folder}: wanted a box without chambers")
             # How it was recorded does not matter.
             setup = dataclasses.replace(trial.setup, title="", kind="mocap", axes=(), noise=None)
-            if setup not in known:
-                known[setup] = simulate(setup, options)
-                print(f"{folder}, trial {trial.name}: {len(known[setup]['time_s'])} samples", flush=True)
-            write_table(folder / "trials" / trial.name / "simulated.csv", known[setup])
+            asked[folder / "trials" / trial.name / "simulated.csv"] = setup
+    known: dict[Setup, dict[str, np.ndarray]] = {}
+    for path, setup in asked.items():
+        if setup not in known:
+            known[setup] = simulate(setup, options)
+            print(f"{path.parent}: {len(known[setup]['time_s'])} samples", flush=True)
+    for path, setup in asked.items():
+        write_table(path, known[setup])
     return len(known)
 
 

@@ -8,10 +8,11 @@ import importlib
 import numpy as np
 import pytest
 import torch
+import trimesh
 from test_experiment import SETUP, experiment
 
 from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Boundary, Cavity, Load, read_experiment
+from torchsoro.sim2real.experiment import Boundary, Load, read_experiment
 from torchsoro.sim2real.twin import Twin
 
 LOADED = SETUP + "[[load]]\nbox = [[0.03, 0.0, 0.0], [0.04, 0.02, 0.02]]\nforce = [0.0, 0.05, 0.0]\nstart = 0.02\n"
@@ -23,12 +24,6 @@ FREE = SETUP.replace("[[clamp]]\nbox = [[-0.001, -0.001, -0.001], [0.0001, 0.021
 @pytest.fixture
 def updated(recipes):
     return importlib.import_module("updated")
-
-
-def simulated(updated, folder, **options):
-    made = updated.main(updated.Options(experiments=(folder,), **options))
-    (trial,) = read_experiment(folder).trials
-    return made, trial
 
 
 def test_a_force_follows_its_load(updated):
@@ -56,7 +51,9 @@ def test_markers_move_with_what_is_linear(updated):
 
 
 def test_a_free_body_falls(updated, tmp_path):
-    _, trial = simulated(updated, experiment(tmp_path, FREE))
+    folder = experiment(tmp_path, FREE)
+    updated.main(updated.Options(experiments=(folder,)))
+    (trial,) = read_experiment(folder).trials
     t = trial.simulated.time[:, None]
     path = np.array([0.04, 0.01, 0.02]) + t * np.array([0.2, 0.0, 0.1]) - t**2 / 2 * np.array([0.0, 0.0, 9.81])
     # A symplectic step is ahead by half a step of gravity.
@@ -89,11 +86,9 @@ def test_a_clamped_and_loaded_bar_moves_as_the_twin_does(updated, tmp_path):
 def test_what_it_is_not_made_for_is_refused(updated, tmp_path):
     (trial,) = read_experiment(experiment(tmp_path)).trials
     options = updated.Options(experiments=())
-    cavity = Cavity(name="c", box=((0.01, 0.006, 0.007), (0.03, 0.014, 0.012)))
     half = ((-0.001, -0.001, -0.001), (0.0001, 0.011, 0.021))
     slope = Boundary(point=(0.0, 0.0, 0.0), normal=(0.6, 0.0, 0.8))
     for change, message in (
-        ({"cavities": (cavity,)}, "wanted a box without chambers"),
         ({"clamps": (half,)}, "wanted whole faces"),
         ({"planes": (slope,)}, "wanted one along x, y or z"),
         ({"size": (0.04, 0.02, 0.0199)}, "wanted edges that a lattice"),
@@ -101,3 +96,18 @@ def test_what_it_is_not_made_for_is_refused(updated, tmp_path):
     ):
         with pytest.raises(ValueError, match=message):
             updated.simulate(dataclasses.replace(trial.setup, **change), options)
+
+
+def test_nothing_is_written_where_one_of_them_is_refused(updated, tmp_path):
+    whole = experiment(tmp_path / "whole")
+    chamber = '[[chamber]]\nname = "c"\nbox = [[0.01, 0.006, 0.007], [0.03, 0.014, 0.012]]\n'
+    hollow = experiment(tmp_path / "hollow", SETUP + chamber)
+    (hollow / "trials" / "a" / "pressure.csv").write_text("time_s,c_pa\n0,0\n0.1,1000\n")
+    mesh = experiment(
+        tmp_path / "mesh", SETUP.replace("size = [0.04, 0.02, 0.02]", 'shape = "mesh"\nfile = "body.stl"')
+    )
+    trimesh.creation.box(bounds=((0.0, 0.0, 0.0), (0.04, 0.02, 0.02))).export(mesh / "body.stl")
+    for other in (hollow, mesh):
+        with pytest.raises(ValueError, match="wanted a box without chambers"):
+            updated.main(updated.Options(experiments=(whole, other)))
+    assert not list(tmp_path.rglob("simulated.csv"))
