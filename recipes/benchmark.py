@@ -42,8 +42,10 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from naive import Naive
-from timing import (
+from torch import Tensor
+
+from torchsoro.benchmark.naive import Naive
+from torchsoro.benchmark.timing import (
     EDGE,
     Case,
     Row,
@@ -58,7 +60,6 @@ from timing import (
     skipping,
     table,
 )
-from torch import Tensor
 
 PAPER_STEPS = 75_000
 SIZES = {"cpu": (2000, 4096, 8000, 16_384), "cuda": (16_384, 64_000, 216_000, 512_000, 2_000_376)}

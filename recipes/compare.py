@@ -5,8 +5,8 @@
     python recipes/compare.py walker --out runs/compare --only design half_cell
 
 A row for each check goes to ``compare.json``, and the motion of some to ``motion_<check>.npz``, from which
-``recipes/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a check of a
-design at the paper's size takes five to fifteen minutes, one at half the cell size hours.
+``recipes/validate/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a
+check of a design at the paper's size takes five to fifteen minutes, one at half the cell size hours.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from replay import find
 
-from torchsoro.archive import kept_iterations, load_design, load_shape, read_settings
+from torchsoro.command_line import plain_errors
+from torchsoro.design.objective import mean_stride
+from torchsoro.design.robot import Outcome, Robot, build
+from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
-from torchsoro.objective import mean_stride
-from torchsoro.robot import Outcome, Robot, build
-from torchsoro.settings import Settings, plain_errors
+from torchsoro.output.archive import find, kept_iterations, load_design, load_shape, read_settings
 from torchsoro.storage import atomic_write
 
 LONG = 2.0  # s of actuation, where a robot is watched for an extended time

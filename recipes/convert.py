@@ -15,9 +15,9 @@ from pathlib import Path
 
 import tyro
 
-from torchsoro.settings import plain_errors
-from torchsoro.sim2real.recording import AXES, write_table
-from torchsoro.sim2real.tracking import LIKELIHOOD, Frame, Tracked, read
+from torchsoro.command_line import plain_errors
+from torchsoro.sim2real.data.recording import AXES, write_table
+from torchsoro.sim2real.data.tracking import LIKELIHOOD, Frame, Tracked, read
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

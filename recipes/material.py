@@ -24,14 +24,14 @@ import numpy as np
 import tyro
 from matplotlib.figure import Figure
 
-from torchsoro.document import Document
-from torchsoro.materialfile import Material, write_material
+from torchsoro.command_line import plain_errors
+from torchsoro.output.document import Document
 from torchsoro.rheology.budget import Budget, budget, choose, substitutes
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep, read
 from torchsoro.rheology.plot import draw_budget
 from torchsoro.rheology.spectrum import Spectrum, fit
 from torchsoro.rheology.superposition import Shift, arrhenius, master, superpose, wlf
-from torchsoro.settings import plain_errors
+from torchsoro.simulation.material_file import Material, write_material
 from torchsoro.storage import atomic_write
 
 Curve = Sweep | Relaxation | Creep

@@ -12,7 +12,6 @@ Void is left out, which halves the time (``--void`` keeps it). The archived robo
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from pathlib import Path
 from typing import Literal
@@ -20,38 +19,12 @@ from typing import Literal
 import torch
 import tyro
 
-from torchsoro.archive import archive, load_design, read_settings
-from torchsoro.results import show
-from torchsoro.robot import build
-from torchsoro.settings import plain_errors
+from torchsoro.command_line import plain_errors
+from torchsoro.design.robot import build
+from torchsoro.output import archive
+from torchsoro.output.delivery import show
 
-DESIGNS = Path(__file__).resolve().parent / "designs"
 KEPT = (0, 5, 10, 20, 50, 100, 150, 200, 250, 300)  # iterations whose designs are archived
-
-
-def find(robot: str) -> Path:
-    """The folder of an archived robot or of a run.
-
-    Raises:
-        ValueError: if there is none.
-    """
-    for folder in (DESIGNS / robot, Path(robot)):
-        if (folder / "design.npz").is_file():
-            return folder
-    raise ValueError(
-        f"robot = {robot!r}: wanted {', '.join(names()) or 'an archived robot'}, or a finished run's folder"
-    )
-
-
-def read_result(folder: Path) -> dict[str, float | None]:
-    """What the design run measured; nothing if it was not written."""
-    path = folder / "result.json"
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
-def names() -> list[str]:
-    """The archived robots."""
-    return sorted(path.parent.name for path in DESIGNS.glob("*/design.npz"))
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -90,17 +63,17 @@ def main(options: Options) -> dict[str, float]:
     if options.archive is not None:
         if options.name in ("", "..") or Path(options.name).name != options.name:
             raise ValueError(f"name = {options.name!r}: wanted a plain name to keep {options.archive} under")
-        domain = build(read_settings(options.archive / "settings.json", device="cpu")).domain
-        archive(options.archive, DESIGNS / options.name, domain, KEPT)
-        print(f"kept as {DESIGNS / options.name}")
+        domain = build(archive.read_settings(options.archive / "settings.json", device="cpu")).domain
+        archive.archive(options.archive, archive.DESIGNS / options.name, domain, KEPT)
+        print(f"kept as {archive.DESIGNS / options.name}")
         return {}
     if not options.robot:
-        print("\n".join(names()))
+        print("\n".join(archive.names()))
         return {}
     begin = time.perf_counter()
-    folder = find(options.robot)
-    designed = read_result(folder)
-    base = read_settings(folder / "settings.json", device=options.device, frames=options.frames)
+    folder = archive.find(options.robot)
+    designed = archive.read_result(folder)
+    base = archive.read_settings(folder / "settings.json", device=options.device, frames=options.frames)
     duration = round(options.cycles / base.frequency / base.sample_every) * base.sample_every
     settle = options.settle if base.settle > 0 else 0.0
     robot = build(dataclasses.replace(base, duration=duration, settle=settle))
@@ -108,7 +81,7 @@ def main(options: Options) -> dict[str, float]:
     out.mkdir(parents=True, exist_ok=True)
     if robot.settings.target.type == "cpu":
         torch.set_num_threads(1)
-    gamma = load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
+    gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
     found, part = show(out, robot, gamma, name=folder.name, void=options.void)
     then = designed.get("stride")
     there = "" if then is None else f" (in the design run, over all its cycles and with void, {1e3 * then:.2f} mm)"

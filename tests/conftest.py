@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -23,6 +22,10 @@ from tiny import tiny
 os.environ["MPLBACKEND"] = "Agg"  # also for the processes that tests start
 matplotlib.use("Agg")
 torch.set_num_threads(1)  # the tensors are small: threads cost more than they give, and two cores are shared
+# Recipes are programs and no package: as modules they are found by name.
+RECIPES = Path(__file__).parents[1] / "recipes"
+sys.path += [str(RECIPES), str(RECIPES / "validate"), str(RECIPES / "baselines")]
+
 hypothesis.settings.register_profile("torchsoro", max_examples=25, deadline=None, derandomize=True, database=None)
 hypothesis.settings.load_profile("torchsoro")
 
@@ -52,17 +55,10 @@ def cuda() -> torch.device:
 
 
 @pytest.fixture(scope="session")
-def recipes() -> Iterator[dict[str, ModuleType]]:
+def recipes() -> dict[str, ModuleType]:
     """The recipes around a run, as modules."""
-    path = str(Path(__file__).parents[1] / "recipes")
-    sys.path.insert(0, path)
-    try:
-        yield {
-            name: importlib.import_module(name)
-            for name in ("walker", "climber", "replay", "compare", "material_checks")
-        }
-    finally:
-        sys.path.remove(path)
+    names = ("walker", "climber", "replay", "compare", "material_checks")
+    return {name: importlib.import_module(name) for name in names}
 
 
 @pytest.fixture(scope="session")

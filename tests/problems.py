@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fill
-from torchsoro.kernels import layout
-from torchsoro.ops.lattice import Lattice
-from torchsoro.ops.march import Inputs, Scene
-from torchsoro.ops.rollout import initial_state, rollout
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.rollout import initial_state, rollout
+from torchsoro.simulation.ops.segment import Inputs, Scene
 
 H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
 DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s
@@ -112,13 +112,13 @@ class Problem:
     def smooth(self, name: str, t: Tensor) -> Tensor:
         """A tensor in place of that name, but unchanged where a step to either side makes another problem.
 
-        Those are coefficients of zero, as of places without a particle, and fillers of one.
+        Those are coefficients of zero, as of places without a particle, and void fractions of one.
         """
         if name != "coefficients":
             return t
         given = self.tensors[name]
         free = given != 0
-        free[:, layout.FILLER] &= given[:, layout.FILLER] < 1
+        free[:, layout.VOID_FRACTION] &= given[:, layout.VOID_FRACTION] < 1
         return torch.where(free, t, given)
 
 
@@ -163,9 +163,9 @@ def problem(
     coefficients[:, layout.VISCOSITY] *= 0.05
     coefficients[:, layout.VOLUME_VISCOSITY] *= 0.05
     coefficients[:, layout.ANCHOR : layout.ANCHOR + 3] = x.transpose(1, 2) + 0.1
-    filler = rand(batch, count)
-    filler[:, ::4], filler[:, 1::7] = 0, 1
-    coefficients[:, layout.FILLER] = filler
+    void_fraction = rand(batch, count)
+    void_fraction[:, ::4], void_fraction[:, 1::7] = 0, 1
+    coefficients[:, layout.VOID_FRACTION] = void_fraction
     # The stretches here are small: numbers that they bring to bear.
     coefficients[:, layout.STIFFENING] *= 30
     coefficients[:, layout.STIFFENING + 1] *= 300

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from test_experiment import experiment
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Experiment, Trial, read_experiment
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.recording import Recording
-from torchsoro.sim2real.residual import Camera
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.residual import Camera
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.twin import Twin
 
 EDGE = 0.01
 SETUP = """

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.actuation import Waveform, read_pressure_csv, square_wave
+from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 
 torch.set_num_threads(1)
 

@@ -13,9 +13,9 @@ import pytest
 import torch
 from tiny import TINY
 
-from torchsoro.archive import archive, load_design, load_shape, read_settings, save_design
-from torchsoro.domain import Domain
-from torchsoro.settings import Settings
+from torchsoro.design.domain import Domain
+from torchsoro.design.settings import Settings
+from torchsoro.output.archive import archive, load_design, load_shape, read_settings, save_design
 from torchsoro.storage import plain_settings
 
 FILES = ("design.npz", "metrics.csv", "summary.png", "settings.json", "result.json")
@@ -174,7 +174,12 @@ def written(path: Path, settings: Settings, **more: Any) -> Path:
         {},
         {"friction": 0.5, "dt": "auto", "air_density": 2.5, "robot": "climber", "resume": True},
         {"friction": "stick", "dt": 1e-4, "air_density": "auto", "pressure_file": Path("measured/trace.csv")},
-        {"out": Path("/somewhere/else"), "size": (0.04, 0.05, 0.06), "particles": (8, 10, 12), "filler": (0.0, 0.5)},
+        {
+            "out": Path("/somewhere/else"),
+            "size": (0.04, 0.05, 0.06),
+            "particles": (8, 10, 12),
+            "void_range": (0.0, 0.5),
+        },
     ],
 )
 def test_settings_come_back_from_json_value_and_type(changes, tmp_path):

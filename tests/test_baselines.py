@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -15,11 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture(scope="module")
 def baselines() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(ROOT / "recipes")
-        import baselines
-
-        return baselines
+    return importlib.import_module("baselines")
 
 
 def test_terms_that_are_not_there_are_dropped(baselines):

@@ -5,9 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import json
-import sys
-from collections.abc import Iterator
-from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
@@ -15,28 +12,19 @@ import torch
 import tyro
 
 from torchsoro import Prony, Simulator, Solid, Waveform, fill, ground
+from torchsoro.benchmark import naive, timing
 
-RECIPES = Path(__file__).parents[1] / "recipes"
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def recipes() -> Iterator[SimpleNamespace]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield SimpleNamespace(**{n: importlib.import_module(n) for n in ("benchmark", "naive", "timing")})
-    finally:
-        sys.path.remove(str(RECIPES))
+def recipes() -> SimpleNamespace:
+    return SimpleNamespace(benchmark=importlib.import_module("benchmark"), naive=naive, timing=timing)
 
 
 @pytest.fixture(scope="module")
 def benchmark(recipes) -> ModuleType:
     return recipes.benchmark
-
-
-@pytest.fixture(scope="module")
-def timing(recipes) -> ModuleType:
-    return recipes.timing
 
 
 def small(benchmark, **changes):
@@ -48,27 +36,27 @@ def small(benchmark, **changes):
 
 
 @pytest.mark.parametrize("count", [512, 2000, 4096, 8000, 16_384, 64_000, 216_000, 512_000, 2_000_376])
-def test_body_has_about_the_particles_asked_for_and_a_chamber(timing, count):
+def test_body_has_about_the_particles_asked_for_and_a_chamber(count):
     domain = timing.walker(count)
     assert domain.count == pytest.approx(count, rel=0.05)
     assert domain.gas.any() and domain.wall.any() and domain.design.any()
 
 
-def test_paper_size_is_the_papers_walker(timing):
+def test_paper_size_is_the_papers_walker():
     case = timing.Case(count=64_000, formulation="updated", device=CPU, steps=75_000)
     assert case.domain.cell == pytest.approx(1.75e-3)
     assert (int(case.domain.gas.sum()), int(case.domain.wall.sum())) == (4096, 3904)
     assert case.substep == 1e-5
 
 
-def test_states_are_kept_for_as_many_steps_as_taichi_can_index(timing):
+def test_states_are_kept_for_as_many_steps_as_taichi_can_index():
     case = timing.Case(count=216_000, formulation="updated", device=CPU, steps=500)
     kept = case.kept()
     assert kept.steps * 42 * 216_000 < 2**31 and kept.steps * 4 * 42 * 216_000 < kept.budget
     assert case.recomputed().segment == min(250, kept.steps)
 
 
-def test_floor_of_the_papers_walker_is_its_state_there_and_back(timing):
+def test_floor_of_the_papers_walker_is_its_state_there_and_back():
     updated, total = (
         timing.least_bytes(timing.Case(count=64_000, formulation=f, device=CPU, steps=1)) for f in ("updated", "total")
     )
@@ -80,14 +68,12 @@ def test_floor_of_the_papers_walker_is_its_state_there_and_back(timing):
 
 
 def test_naive_step_falls_freely_and_keeps_its_momentum(recipes):
-    domain = recipes.timing.walker(512)
+    domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())
     dt, steps, cell = 2e-5, 20, domain.cell
-    naive = recipes.naive.Naive(
-        body, Prony.paper(3), cell=cell, dt=dt, low=(-2 * cell,) * 3, nodes=(8,) * 3, ground=False
-    )
+    stepper = naive.Naive(body, Prony.paper(3), cell=cell, dt=dt, low=(-2 * cell,) * 3, nodes=(8,) * 3, ground=False)
     for _ in range(steps):
-        naive.step()
+        stepper.step()
     speed = -9.81 * dt * steps
     torch.testing.assert_close(
         naive.velocity, torch.tensor([0.0, 0.0, speed]).expand(domain.count, 3), rtol=1e-4, atol=1e-8
@@ -100,7 +86,7 @@ def test_naive_step_falls_freely_and_keeps_its_momentum(recipes):
     naive.v.from_numpy(noise.numpy())
     before = (body.mass.double()[:, None] * noise.double()).sum(0)
     for _ in range(steps):
-        naive.step(20e3)
+        stepper.step(20e3)
     after = (body.mass.double()[:, None] * naive.velocity.double()).sum(0)
     gained = torch.tensor([0.0, 0.0, speed]).double() * body.mass.double().sum()
     scale = float((body.mass[:, None] * noise.abs()).sum())
@@ -109,14 +95,14 @@ def test_naive_step_falls_freely_and_keeps_its_momentum(recipes):
 
 
 def test_naive_step_is_the_simulators(recipes):
-    domain = recipes.timing.walker(512)
+    domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())
     generator = torch.Generator().manual_seed(0)
     body = dataclasses.replace(body, velocity=0.1 * torch.randn(domain.count, 3, generator=generator))
     dt, steps, cell, pressure = 2e-5, 40, domain.cell, 20e3
-    naive = recipes.naive.Naive(body, Prony.paper(3), cell=cell, dt=dt, low=(-4 * cell,) * 3, nodes=(16,) * 3)
+    stepper = naive.Naive(body, Prony.paper(3), cell=cell, dt=dt, low=(-4 * cell,) * 3, nodes=(16,) * 3)
     for _ in range(steps):
-        naive.step(pressure)
+        stepper.step(pressure)
     seen = Simulator(cell=cell, dt=dt, low=(-4 * cell,) * 3, high=(12 * cell,) * 3)(
         body,
         duration=steps * dt,
@@ -136,7 +122,7 @@ def test_naive_step_is_the_simulators(recipes):
 # The sections -----------------------------------------------------------------------------------------------------
 
 
-def test_measures_every_case(benchmark, timing):
+def test_measures_every_case(benchmark):
     case = timing.Case(count=512, formulation="updated", device=CPU, steps=4)
     row = benchmark.measure(case, repeats=1, bandwidth=1e10)
     assert (row["particles"], row["kept: steps"], row["kept [GB]"]) == (512, 4, None)
@@ -158,7 +144,7 @@ def test_prints_a_line_for_each_size_and_writes_all_numbers(benchmark, capsys, t
     assert json.loads(path.read_text()) == results
 
 
-def test_says_what_cannot_be_measured_and_goes_on(timing, capsys):
+def test_says_what_cannot_be_measured_and_goes_on(capsys):
     with timing.skipping("2,000 particles"):
         raise ValueError("memory_budget = 1 MiB: wanted at least 2 MiB")
     assert "2,000 particles: not measured: memory_budget" in capsys.readouterr().out
@@ -172,7 +158,7 @@ def test_finds_where_the_time_goes(benchmark):
     assert found["split"][0]["adjoint [us]"] > 0
 
 
-def test_names_the_loops_of_the_kernels(timing):
+def test_names_the_loops_of_the_kernels():
     tasks = {
         "substep_c80_0_kernel_0_serial": 1.0,
         "substep_c80_0_kernel_1_range_for": 10.0,
@@ -205,7 +191,7 @@ def test_paper_adds_what_is_required(benchmark):
     assert [row["updated"] for row in rows] == [None] * 6
 
 
-def test_prints_aligned_columns(timing, capsys):
+def test_prints_aligned_columns(capsys):
     rows = [{"step": "naive", "us": 12345.6, "n": None}, {"step": "b", "us": 0.12345, "n": 64_000}]
     timing.table("Title", rows)
     want = ["", "Title", "  step       us       n", "  naive  12,346       -", "  b      0.1235  64,000"]
@@ -220,7 +206,7 @@ def test_command_line_explains_every_option(benchmark, capsys):
         assert f"--{field.name.replace('_', '-')}" in out
 
 
-def test_measures_on_cuda(benchmark, timing, cuda):
+def test_measures_on_cuda(benchmark, cuda):
     case = timing.Case(count=512, formulation="updated", device=cuda, steps=4)
     assert benchmark.measure(case, repeats=1, bandwidth=1e12)["kept [GB]"] > 0
     steps = benchmark.naive_step(small(benchmark, device="cuda"))

@@ -14,11 +14,11 @@ import torch
 from test_experiment import experiment
 from test_twin import EDGE, hollow
 
-from torchsoro.sim2real.ensemble import SAMPLE, Ensemble
-from torchsoro.sim2real.experiment import Boundary, Load, Trial, read_experiment
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.scenario import Scenario
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import Boundary, Load, Trial, read_experiment
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.twin.ensemble import SAMPLE, Ensemble
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Twin
 
 
 def varied(trial: Trial, duration: float, edge: float, gap: float = 1e-4) -> list[tuple[Twin, list[Scenario]]]:

@@ -12,10 +12,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsoro.material import STABLE_COURANT, Body, Prony, Solid, courant, stable_step
 from torchsoro.rheology.budget import budget, choose, substitutes
 from torchsoro.rheology.plot import draw_budget
 from torchsoro.rheology.spectrum import Spectrum
+from torchsoro.simulation.material import Body, Prony, Solid
+from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
 
 CELL, STEP = 1.75e-3, 1e-5  # of the paper
 BAND = (2 * math.pi * 5, 2 * math.pi * 100)  # locomotion to impacts

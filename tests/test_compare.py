@@ -14,10 +14,10 @@ import pytest
 import torch
 from tiny import TINY
 
-from torchsoro.archive import load_design, load_shape
+from torchsoro.design.objective import center_of_gravity
+from torchsoro.design.robot import walker
 from torchsoro.errors import SimulationDiverged
-from torchsoro.objective import center_of_gravity
-from torchsoro.robot import walker
+from torchsoro.output.archive import load_design, load_shape
 
 CHOSEN = ("design", "double_modulus", "half_cell", "iteration_0")
 NUMBERS = {"L", "stride", "speed", "fall", "dt", "seconds"}

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from ringing import effect
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.numerics import measure
-from torchsoro.sim2real.recording import Recording
-from torchsoro.sim2real.search import search
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.inference.discretization import measure
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.search import search
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.twin import Twin
 
 
 def test_a_finer_twin_corrects_where_one_is(made):

@@ -97,14 +97,14 @@ def test_a_later_segment_counts_from_the_start_of_the_run(way):
 def test_a_chamber_that_is_turned_inside_out_is_reported_but_void_is_not(segment):
     _, body = block((4, 4, 4), air=True)
     body = replace(body, velocity=-2.0 / DT * (body.position - body.position.mean(0)))
-    void = replace(body, filler=torch.ones_like(body.mass), mass=body.mass.clone().requires_grad_())
+    void = replace(body, void_fraction=torch.ones_like(body.mass), mass=body.mass.clone().requires_grad_())
     sim = simulator(segment=segment, formulation="total")
     with pytest.raises(SimulationDiverged, match=r"the chamber is tangled inside \(J = -1\)") as told:
         sim(void, duration=20 * DT, gravity=FREE)
     assert told.value.step == 1
     assert told.value.particle is not None
     assert int(body.chamber[told.value.particle]) == 0
-    assert "a stiffer filler in the chamber" in told.value.remedy
+    assert "a larger fictitious shear modulus in the chamber" in told.value.remedy
     void = replace(void, chamber=torch.full_like(void.chamber, -1))
     run = sim(void, duration=20 * DT, gravity=FREE, sample_every=DT, probes=torch.arange(COUNT))
     torch.testing.assert_close(run.position[1] + run.position[0], 2 * run.center_of_gravity[0].expand(COUNT, 3))
@@ -116,7 +116,7 @@ def test_a_chamber_that_is_turned_inside_out_is_reported_but_void_is_not(segment
 def test_what_is_partly_void_may_be_turned_inside_out_but_a_solid_may_not():
     _, body = block()
     body = replace(body, velocity=-0.3 / DT * (body.position - body.position.mean(0)))
-    grey = replace(body, filler=torch.full_like(body.mass, 0.3))
+    grey = replace(body, void_fraction=torch.full_like(body.mass, 0.3))
     weight = torch.rand(21, COUNT, 3, generator=torch.Generator().manual_seed(1)).double()
     change = body.mass * torch.rand(COUNT, generator=torch.Generator().manual_seed(2)).double()
 
@@ -124,9 +124,9 @@ def test_what_is_partly_void_may_be_turned_inside_out_but_a_solid_may_not():
         settings = {"duration": 20 * DT, "gravity": FREE, "prony": Prony.paper(1), "sample_every": DT}
         return simulator(formulation="total")(body, probes=torch.arange(COUNT), **settings).position
 
-    for filler in (None, torch.zeros_like(body.mass)):
+    for void_fraction in (None, torch.zeros_like(body.mass)):
         with pytest.raises(SimulationDiverged, match=r"the volume ratio is not positive \(J = -"):
-            run(replace(body, filler=filler))
+            run(replace(body, void_fraction=void_fraction))
     mass = body.mass.clone().requires_grad_()
     position = run(replace(grey, mass=mass))
     corner = (position[:, 0] - position.mean(1)) @ (body.position[0] - body.position.mean(0))

@@ -8,7 +8,7 @@ from html.parser import HTMLParser
 import pytest
 from matplotlib.figure import Figure
 
-from torchsoro.document import Document
+from torchsoro.output.document import Document
 
 
 class Page(HTMLParser):

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.domain import Chamber, Domain, Region
+from torchsoro.design.domain import Chamber, Domain, Region
 
 torch.set_num_threads(1)
 

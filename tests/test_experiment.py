@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchsoro.sim2real.experiment import read_experiment
-from torchsoro.sim2real.recording import Recording, read_table
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.data.recording import Recording, read_table
 
 SETUP = """
 title = "bar"

@@ -5,8 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,22 +12,19 @@ import pytest
 import torch
 from ringing import EDGE, effect
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Boundary
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.heldout import predict
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.model import predict_trial, read_model
-from torchsoro.sim2real.numerics import WALLS, choose_twin, cost, finer, measure
-from torchsoro.sim2real.recording import Recording, read_table
-from torchsoro.sim2real.report import as_json, effect_rows
-from torchsoro.sim2real.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
-from torchsoro.sim2real.search import _simpler
-from torchsoro.sim2real.twin import Motion, Twin
-from torchsoro.sim2real.verdict import judge
-
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
-
+from torchsoro.sim2real.data.experiment import Boundary
+from torchsoro.sim2real.data.recording import Recording, read_table
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.discretization import WALLS, choose_twin, cost, finer, measure
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.model import predict_trial, read_model
+from torchsoro.sim2real.inference.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
+from torchsoro.sim2real.inference.search import _simpler
+from torchsoro.sim2real.inference.verdict import judge
+from torchsoro.sim2real.report.report import as_json, effect_rows
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.twin import Motion, Twin
 
 # Measurement ------------------------------------------------------------------------------------------------------
 
@@ -296,7 +291,7 @@ def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
 
 
 def test_what_cannot_be_asked_is_refused_before_any_work(made, tmp_path, monkeypatch):
-    import explain
+    from torchsoro.sim2real import pipeline as explain
 
     _, _, record = made
     recorded = record("drag", (800.0,))
@@ -304,14 +299,14 @@ def test_what_cannot_be_asked_is_refused_before_any_work(made, tmp_path, monkeyp
     monkeypatch.setattr(explain, "measure", None)
     asked = explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE)
     with pytest.raises(ValueError, match="effects = friction: wanted one that can act"):
-        explain.main(dataclasses.replace(asked, effects=("friction",)))
+        explain.explain(dataclasses.replace(asked, effects=("friction",)))
     blank = (*recorded.trials, dataclasses.replace(recorded.trials[0], name="c", recording=None))
     monkeypatch.setattr(explain, "read_experiment", lambda folder: dataclasses.replace(recorded, trials=blank))
     with pytest.raises(ValueError, match=r"trials/c: no markers\.csv, wanted one in each trial"):
-        explain.main(asked)
+        explain.explain(asked)
     asked.out.write_text("")
     with pytest.raises(ValueError, match=r"out = .*: a file, wanted a folder"):
-        explain.main(asked)
+        explain.explain(asked)
     with pytest.raises(ValueError, match=r"trial = .*: wanted a file named trial\.toml"):
         predict_trial(SimpleNamespace(), tmp_path / "trial.toml", tmp_path)
 
@@ -341,14 +336,14 @@ def test_planes_of_one_trial_alone_are_touched(made):
 
 
 def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
-    import explain
+    from torchsoro.sim2real import pipeline as explain
 
     _, _, record = made
     setup = record(None).setup
     recorded = record("drag", (800.0,), by=Ensemble(finer(Twin(setup, edge=EDGE, walls=WALLS), 2, 40.0)))
     monkeypatch.setattr(explain, "read_experiment", lambda folder: recorded)
-    monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (effect("drag"),))
-    told = explain.main(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
+    monkeypatch.setattr("torchsoro.sim2real.inference.verdict.library", lambda: (effect("drag"),))
+    told = explain.explain(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
     assert told is not None
     broken = dataclasses.replace(told.verdict.ranking[0], kept=np.inf)  # JSON knows no infinity
     verdict = dataclasses.replace(told.verdict, ranking=(broken,))
@@ -369,7 +364,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     folder.mkdir()
     (folder / "trial.toml").write_text("duration = 0.05\n[start]\nvelocity = [0.0, 0.0, 0.2]\n")
     model, markers = tmp_path / "out" / "model.toml", tmp_path / "markers.csv"
-    explain.main(explain.Options(predict=model, trial=folder / "trial.toml", out=markers))
+    explain.explain(explain.Options(predict=model, trial=folder / "trial.toml", out=markers))
     columns = read_table(markers)
     assert columns["time_s"][-1] == pytest.approx(0.05) and len(columns) == 7
     believed = dataclasses.replace(read_model(model), effects=(), ln_modulus=0.0)

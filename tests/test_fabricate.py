@@ -9,8 +9,8 @@ import pytest
 import torch
 import trimesh
 
-from torchsoro.domain import Chamber, Domain
-from torchsoro.fabricate import AirPort, Part, fabricate, surface
+from torchsoro.design.domain import Chamber, Domain
+from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
 
 DENSITY = 1070.0
 PORT = AirPort(direction=(-1.0, 0.0, 0.0), diameter=0.003)

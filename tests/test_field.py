@@ -7,8 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.domain import Chamber, Domain
-from torchsoro.field import DesignField
+from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.field import DesignField
 
 torch.set_num_threads(1)
 

@@ -1,7 +1,6 @@
 """The recipe of finite-strain fits, on the recordings of others and without them."""
 
 import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +12,7 @@ from torchsoro.rheology.finite import Experiment
 
 @pytest.fixture(scope="module")
 def checks():
-    path = str(Path(__file__).parents[1] / "recipes")
-    sys.path.insert(0, path)
-    try:
-        yield importlib.import_module("finite_checks")
-    finally:
-        sys.path.remove(path)
+    return importlib.import_module("finite_checks")
 
 
 def folder(checks, name):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,19 +11,18 @@ import torch
 from ringing import SETUP, two_trials
 from test_experiment import experiment
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import read_experiment
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.forcemap import force_map, patches
-from torchsoro.sim2real.heldout import predict
-from torchsoro.sim2real.outer_effects import GravityTilt
-from torchsoro.sim2real.phases import mismatches, phases
-from torchsoro.sim2real.recording import Recording
-from torchsoro.sim2real.residual import Camera
-from torchsoro.sim2real.scenario import Push
-from torchsoro.sim2real.twin import Motion, Twin
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.hypotheses.outer_effects import GravityTilt
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.force_map import force_map, patches
+from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.phases import mismatches, phases
+from torchsoro.sim2real.inference.residual import Camera
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.scenario import Push
+from torchsoro.sim2real.twin.twin import Motion, Twin
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 COUNT = 3  # patches
 
 
@@ -156,12 +153,12 @@ def test_a_load_and_swings_are_phases(tmp_path):
 
 
 def test_the_report_says_which_force_no_effect_stands_for(made, tmp_path, monkeypatch):
-    import explain
+    from torchsoro.sim2real import pipeline as explain
 
     problem = made(2, (0.0, 0.0, 0.05))
     monkeypatch.setattr(explain, "read_experiment", lambda folder: problem.experiment)
-    monkeypatch.setattr("torchsoro.sim2real.verdict.library", lambda: (GravityTilt(),))
-    explain.main(explain.Options(experiment=problem.experiment.folder, out=tmp_path / "out", edge=0.01))
+    monkeypatch.setattr("torchsoro.sim2real.inference.verdict.library", lambda: (GravityTilt(),))
+    explain.explain(explain.Options(experiment=problem.experiment.folder, out=tmp_path / "out", edge=0.01))
     answer = json.loads((tmp_path / "out" / "explanation.json").read_text())
     assert answer["verdict"] == "unknown_physics"
     needed = answer["force_map"]["needed"][0]

@@ -9,10 +9,10 @@ import json
 import numpy as np
 import pytest
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import read_experiment
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.twin import Twin
 
 
 @pytest.fixture(scope="module")

@@ -12,18 +12,18 @@ import torch
 from ringing import effect
 from scipy.integrate import solve_ivp
 
-from torchsoro.sim2real.body_effects import Density, Modulus
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.hypothesis import Hypothesis, Quantity
-from torchsoro.sim2real.isolability import isolability
-from torchsoro.sim2real.likelihood import Beliefs
-from torchsoro.sim2real.likeness import Response, cleared, compare, first_seen, imitation, settle
-from torchsoro.sim2real.next_experiment import REPEAT, Proposal, advice, next_experiment
-from torchsoro.sim2real.numerics import Numerics
-from torchsoro.sim2real.ranking import Candidate
-from torchsoro.sim2real.report import Explanation, as_json, draw_alike, lead
-from torchsoro.sim2real.scenario import Scenario
-from torchsoro.sim2real.verdict import Verdict
+from torchsoro.sim2real.hypotheses.body_effects import Density, Modulus
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
+from torchsoro.sim2real.inference.cosines import Response, cleared, compare, first_seen, imitation, settle
+from torchsoro.sim2real.inference.discretization import Numerics
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.isolability import isolability
+from torchsoro.sim2real.inference.likelihood import Beliefs
+from torchsoro.sim2real.inference.next_experiment import REPEAT, Proposal, advice, next_experiment
+from torchsoro.sim2real.inference.ranking import Candidate
+from torchsoro.sim2real.inference.verdict import Verdict
+from torchsoro.sim2real.report.report import Explanation, as_json, draw_alike, lead
+from torchsoro.sim2real.twin.scenario import Scenario
 
 # A chain: four masses between springs, from a wall on; two of them are seen. ----------------------------------------
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from problems import rotations
 
 import torchsoro
-from torchsoro.kernels import contact, spline, stress, tensor
+from torchsoro.simulation.kernels import contact, spline, stress, tensor
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -53,11 +53,11 @@ def run_tensor(a: Reals, b: Reals, cof: Reals, dev: Reals, dot: Reals, back: Rea
 
 
 @ti.kernel
-def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, filler: ti.f64, P: Reals, S: Reals, n: ti.i32):
+def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, void_fraction: ti.f64, P: Reals, S: Reals, n: ti.i32):
     for i in range(n):
-        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, 1, filler))
-        if filler < 1:
-            put(S, i, stress.pull_back(matrix(F, i), stress.least_ratio(filler)))
+        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, 1, void_fraction))
+        if void_fraction < 1:
+            put(S, i, stress.pull_back(matrix(F, i), stress.least_ratio(void_fraction)))
 
 
 @ti.kernel
@@ -73,14 +73,14 @@ def run_solid_adjoint(
     n: ti.i32,
 ):
     for i in range(n):
-        f, q, bulk, shear, _, filler = stress.piola_adjoint(
+        f, q, bulk, shear, _, void_fraction = stress.piola_adjoint(
             matrix(F, i), matrix(Q, i), moduli[3 * i], moduli[3 * i + 1], 1, moduli[3 * i + 2], matrix(bar, i)
         )
         put(F_bar, i, f)
         put(Q_bar, i, q)
         moduli_bar[3 * i] = bulk
         moduli_bar[3 * i + 1] = shear
-        moduli_bar[3 * i + 2] = filler
+        moduli_bar[3 * i + 2] = void_fraction
         put(S_bar, i, stress.pull_back_adjoint(matrix(F, i), stress.least_ratio(moduli[3 * i + 2]), matrix(bar, i)))
 
 
@@ -157,11 +157,11 @@ def symmetric(n=32, *, seed=1, size=0.3):
     return m + m.mT
 
 
-def first_piola(F, Q=None, *, bulk=2.3, shear=0.7, filler=0.0):
+def first_piola(F, Q=None, *, bulk=2.3, shear=0.7, void_fraction=0.0):
     """First Piola stress, and pull-back S."""
     P, S = out(*F.shape), out(*F.shape)
     Q = torch.zeros_like(F) if Q is None else Q
-    run_solid(flat(F), flat(Q), bulk, shear, filler, flat(P), flat(S), len(F))
+    run_solid(flat(F), flat(Q), bulk, shear, void_fraction, flat(P), flat(S), len(F))
     return P, S
 
 
@@ -272,15 +272,15 @@ def slope(function, x, direction, e=1e-6):
     return (function(x + e * direction) - function(x - e * direction)) / (2 * e)
 
 
-@pytest.mark.parametrize(("filler", "crushed"), [(0.0, False), (0.3, False), (0.3, True), (1.0, False)])
-def test_adjoints_of_the_solid(filler, crushed):
+@pytest.mark.parametrize(("void_fraction", "crushed"), [(0.0, False), (0.3, False), (0.3, True), (1.0, False)])
+def test_adjoints_of_the_solid(void_fraction, crushed):
     F, Q, bar = deformations(), symmetric(), deformations(seed=5, size=2.0)
     if crushed:
         ratio = torch.linspace(-1.0, 0.19, 32, dtype=torch.float64)
         F = F * ((ratio / torch.linalg.det(F)).abs().pow(1 / 3) * ratio.sign())[:, None, None]
     S_like = symmetric(seed=9)
     moduli = torch.rand(32, 3, generator=torch.Generator().manual_seed(6), dtype=torch.float64) + 0.5
-    moduli[:, 2] = filler
+    moduli[:, 2] = void_fraction
     found = [out(32, 3, 3), out(32, 3, 3), out(32, 3), out(32, 3, 3)]
     run_solid_adjoint(*(flat(t) for t in (F, Q, moduli, bar, *found)), 32)
     F_bar, Q_bar, moduli_bar, _ = found
@@ -288,7 +288,7 @@ def test_adjoints_of_the_solid(filler, crushed):
 
     def power(f=F, q=Q, m=moduli):
         rows = [
-            first_piola(f[i : i + 1], q[i : i + 1], bulk=b, shear=s, filler=v)[0]
+            first_piola(f[i : i + 1], q[i : i + 1], bulk=b, shear=s, void_fraction=v)[0]
             for i, (b, s, v) in enumerate(m.tolist())
         ]
         return (torch.cat(rows) * bar).sum((1, 2))
@@ -298,14 +298,15 @@ def test_adjoints_of_the_solid(filler, crushed):
 
     agree((F_bar * d).sum((1, 2)), slope(lambda f: power(f=f), F, d))
     agree((Q_bar * dQ).sum((1, 2)), slope(lambda q: power(q=q), Q, dQ))
-    for k in range(3 if 0 < filler < 1 else 2):
+    for k in range(3 if 0 < void_fraction < 1 else 2):
         one = torch.nn.functional.one_hot(torch.tensor(k), 3).expand(32, 3).double()
         agree(moduli_bar[:, k], slope(lambda m: power(m=m), moduli, one))
     # Of the pull-back, for a symmetric gradient.
     run_solid_adjoint(*(flat(t) for t in (F, Q, moduli, S_like, *found)), 32)
-    if filler < 1:
+    if void_fraction < 1:
         agree(
-            (found[3] * d).sum((1, 2)), slope(lambda f: (first_piola(f, filler=filler)[1] * S_like).sum((1, 2)), F, d)
+            (found[3] * d).sum((1, 2)),
+            slope(lambda f: (first_piola(f, void_fraction=void_fraction)[1] * S_like).sum((1, 2)), F, d),
         )
 
 
@@ -315,14 +316,14 @@ def test_a_partly_void_solid_bears_being_turned_inside_out_and_still_pushes_back
     for J in (0.5, 0.2, 0.01, -0.3, -0.5, -1.0, -2.0):
         F = torch.eye(3, dtype=torch.float64)[None].clone()
         F[0, 0, 0] = J
-        _, S = first_piola(F, filler=0.3)
-        P, _ = first_piola(F, elements * S, filler=0.3)
+        _, S = first_piola(F, void_fraction=0.3)
+        P, _ = first_piola(F, elements * S, void_fraction=0.3)
         assert bool(torch.isfinite(P).all() and torch.isfinite(S).all())
         push.append(float(P[0, 0, 0]))
     assert max(push) < -1.0
 
 
-def test_filler_is_a_law_of_its_own_with_an_energy_and_stands_being_turned_inside_out():
+def test_void_is_a_law_of_its_own_with_an_energy_and_stands_being_turned_inside_out():
     g = torch.Generator().manual_seed(3)
     F = (2 * torch.randn(64, 3, 3, generator=g, dtype=torch.float64)).requires_grad_()
     J = torch.linalg.det(F)
@@ -331,9 +332,9 @@ def test_filler_is_a_law_of_its_own_with_an_energy_and_stands_being_turned_insid
     volumetric = torch.where(J >= 1, torch.log(J.clamp(min=1)), (J - 1) - (J - 1) ** 2 / 2)
     energy = 0.7 * ((F * F).sum((1, 2)) / 2 - volumetric)
     (P,) = torch.autograd.grad(energy.sum(), F)
-    found, _ = first_piola(F.detach(), filler=1.0)
+    found, _ = first_piola(F.detach(), void_fraction=1.0)
     torch.testing.assert_close(found, P, rtol=1e-11, atol=1e-11)
-    rest, _ = first_piola(rotations(8), filler=1.0)
+    rest, _ = first_piola(rotations(8), void_fraction=1.0)
     assert float(rest.abs().max()) < 1e-14
 
 

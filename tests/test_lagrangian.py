@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.lagrangian import AugmentedLagrangian, Plateau
+from torchsoro.design.lagrangian import AugmentedLagrangian, Plateau
 
 torch.set_num_threads(1)
 

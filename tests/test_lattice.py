@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import DT, H, block, problem, rotations, simulator
 
-from torchsoro.kernels import layout
-from torchsoro.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers, spline
-from torchsoro.ops.march import Inputs
-from torchsoro.ops.total import TotalMarch
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers, spline
+from torchsoro.simulation.ops.segment import Inputs
+from torchsoro.simulation.ops.total import TotalMarch
 
 SHAPES = st.tuples(*[st.sampled_from([2, 4, 6, 8])] * 3)
 CELLS = st.floats(1e-3, 10.0)

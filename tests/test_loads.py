@@ -13,7 +13,7 @@ from problems import DT, WAYS, H, block, momenta, simulator, ways
 from torch import Tensor
 
 from torchsoro import Drag, Force, PointMass, Prony, Spring
-from torchsoro.loads import attach
+from torchsoro.simulation.loads import attach
 
 MASS = 1070 * (4 * H) ** 3  # of the block, kg
 EVERY = torch.arange(64)

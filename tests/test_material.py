@@ -12,9 +12,10 @@ from problems import DT, H, block, simulator
 
 import torchsoro
 from torchsoro import Body, Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
-from torchsoro.kernels import constitutive, layout
-from torchsoro.material import STABLE_COURANT, courant, without_void
-from torchsoro.ops.rollout import initial_state
+from torchsoro.design.density import without_void
+from torchsoro.simulation.kernels import constitutive, layout
+from torchsoro.simulation.ops.rollout import initial_state
+from torchsoro.simulation.stability import STABLE_COURANT, courant
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -159,7 +160,7 @@ def test_fill_puts_material_where_it_belongs():
     torch.testing.assert_close(body.bulk[~air], solid.bulk * scale)
     torch.testing.assert_close(body.mass[~air], solid.density * H**3 * scale)
     for value, wanted in (
-        (body.shear, Gas().filler),
+        (body.shear, Gas().shear),
         (body.bulk, 0.14e6),
         (body.mass, 100 * H**3),
         (body.volume, H**3),
@@ -196,7 +197,7 @@ def test_fill_is_differentiable():
 def test_without_void_every_other_particle_is_left_as_it_was():
     domain = chambers()
     gamma = torch.linspace(0, 0.4, domain.count, dtype=torch.float64)
-    whole = fill(domain, gamma, solid=Solid(), filler=(0.1, 0.3))
+    whole = fill(domain, gamma, solid=Solid(), void_range=(0.1, 0.3))
     body, keep = without_void(whole)
     assert torch.equal(keep, (gamma > 0.1) | (domain.region == Region.GAS))
     assert 0 < int(keep.sum()) < domain.count
@@ -205,7 +206,7 @@ def test_without_void_every_other_particle_is_left_as_it_was():
         assert (seen is None) == (value is None), field.name
         if value is not None:
             assert torch.equal(seen, value[keep]), field.name
-    assert body.filler is not None and bool((body.filler[body.chamber < 0] > 0).any())  # grey stays
+    assert body.void_fraction is not None and bool((body.void_fraction[body.chamber < 0] > 0).any())  # grey stays
     plain = fill(domain, gamma, solid=Solid())
     body, keep = without_void(plain)
     assert body is plain and bool(keep.all()) and len(keep) == domain.count
@@ -250,7 +251,7 @@ def test_waves_stay_bounded_up_to_the_stable_step(elements, factor, stable, monk
     noise = torch.randn(domain.count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     body, prony = replace(body, velocity=1e-3 * noise), Prony.paper(elements)
     dt = factor * stable_step(body, prony, cell=2 * H)
-    monkeypatch.setattr("torchsoro.simulator.STABLE_COURANT", 2.0)
+    monkeypatch.setattr("torchsoro.simulation.simulator.STABLE_COURANT", 2.0)
     sim = simulator(dt=dt, transfer="flip")
 
     def speed():
@@ -424,7 +425,7 @@ def test_no_lattice_is_unstable_below_a_total_courant_number_of_one(shape, poiss
 @pytest.mark.parametrize("viscosity", [None, 20.0])
 @pytest.mark.parametrize("elements", [0, 3, 5])
 def test_a_total_lagrangian_lattice_steps_stably_up_to_a_courant_number_of_one(elements, viscosity, monkeypatch):
-    monkeypatch.setattr("torchsoro.material.STABLE_COURANT", 1.0)
+    monkeypatch.setattr("torchsoro.simulation.stability.STABLE_COURANT", 1.0)
     prony, solid, cell = Prony.paper(elements), Solid(), 1.75e-3
     for shape in ((1, 1, 1), (3, 2, 2)):
         count = math.prod(shape)
@@ -454,9 +455,9 @@ def test_total_courant_number_names_what_sets_it():
     stiff = solid.shear * (1 + float(prony.step_moduli(dt).sum()))
     assert found(body, prony).number == pytest.approx(dt / cell * math.sqrt(9 / 4 * stiff / solid.density), rel=1e-9)
     assert found(body, prony).term.endswith("most by Maxwell element 4")
-    # Filler as stiff as the solid on a tenth of its mass; Maxwell elements are none of its business.
+    # A fictitious shear modulus as large as the solid's on a tenth of its mass; Maxwell elements have no part in it.
     filled = replace(body, shear=torch.where(body.chamber >= 0, solid.bulk, body.shear))
-    assert found(filled).term == "elastic waves in the filler of the chambers"
+    assert found(filled).term == "elastic waves of the chambers' fictitious shear modulus"
     assert found(filled).number == pytest.approx(dt / cell * math.sqrt(9 / 4 * solid.bulk / 100), rel=1e-9)
     thick = replace(body, viscosity=torch.full_like(body.mass, 50.0))
     both = solid.shear + 2 * 50.0 / dt

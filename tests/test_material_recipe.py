@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -14,9 +12,9 @@ import pytest
 import torch
 from tiny import TINY
 
-from torchsoro.material import Prony, Solid
-from torchsoro.materialfile import read_material
-from torchsoro.robot import walker
+from torchsoro.design.robot import walker
+from torchsoro.simulation.material import Prony, Solid
+from torchsoro.simulation.material_file import read_material
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 MODULUS = 0.44e6  # Pa
@@ -24,12 +22,8 @@ TEMPERATURES = (5.0, 20.0, 30.0, 40.0)
 
 
 @pytest.fixture(scope="module")
-def modules() -> Iterator[dict[str, ModuleType]]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield {name: importlib.import_module(name) for name in ("material", "shaker")}
-    finally:
-        sys.path.remove(str(RECIPES))
+def modules() -> dict[str, ModuleType]:
+    return {name: importlib.import_module(name) for name in ("material", "shaker")}
 
 
 def moduli(prony: Prony, omega: np.ndarray) -> np.ndarray:

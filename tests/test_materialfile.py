@@ -8,9 +8,9 @@ import pytest
 import torch
 from tiny import TINY
 
-from torchsoro.material import Prony, Solid
-from torchsoro.materialfile import Material, read_material, write_material
-from torchsoro.robot import walker
+from torchsoro.design.robot import walker
+from torchsoro.simulation.material import Prony, Solid
+from torchsoro.simulation.material_file import Material, read_material, write_material
 
 EXACT = torch.float64
 RUBBER = Material(

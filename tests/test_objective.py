@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.objective import center_of_gravity, intermediate_density, mean_stride, stride, total_mass, travel
+from torchsoro.design.objective import center_of_gravity, intermediate_density, mean_stride, stride, total_mass, travel
 
 torch.set_num_threads(1)
 

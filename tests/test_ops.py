@@ -14,9 +14,9 @@ import torch
 from problems import TENSORS, Problem, problem
 from torch import Tensor
 
-from torchsoro.kernels import backward, forward, layout, total, total_adjoint
-from torchsoro.ops.march import Inputs
-from torchsoro.ops.rollout import rollout
+from torchsoro.simulation.kernels import backward, forward, layout, total, total_adjoint
+from torchsoro.simulation.ops.rollout import rollout
+from torchsoro.simulation.ops.segment import Inputs
 
 HERE = Path(__file__).parent
 FORMS = {"apic": {"blend": 0.0}, "mixed": {"blend": 0.7}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}

@@ -8,7 +8,6 @@ import importlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -18,8 +17,8 @@ import torch
 from PIL import Image
 from tiny import TINY
 
-from torchsoro.archive import save_design
-from torchsoro.robot import Robot, build
+from torchsoro.design.robot import Robot, build
+from torchsoro.output.archive import save_design
 from torchsoro.storage import plain_settings
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -29,12 +28,8 @@ STEPS = (0, 1, 2)
 
 
 @pytest.fixture(scope="module")
-def pages() -> Iterator[ModuleType]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield importlib.import_module("pages")
-    finally:
-        sys.path.remove(str(RECIPES))
+def pages() -> ModuleType:
+    return importlib.import_module("pages")
 
 
 def finished(folder: Path) -> Robot:
@@ -177,7 +172,7 @@ def test_damaged_files_are_refused(pages, data, tmp_path):
 
 def test_command_line_ends_with_a_line(tmp_path):
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, str(RECIPES / "pages.py"), *arguments]
+        command = [sys.executable, str(RECIPES / "validate" / "pages.py"), *arguments]
         return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
     ended = run(str(tmp_path / "nothing"), "--out", str(tmp_path / "out"))

@@ -13,11 +13,11 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
-from torchsoro.domain import Chamber, Domain
-from torchsoro.fabricate import surface
-from torchsoro.page import history_panel, last_cycle, motion_of
-from torchsoro.picture import deform, movie, shape_image, summary
-from torchsoro.scene import Camera
+from torchsoro.design.domain import Chamber, Domain
+from torchsoro.output.fabricate import surface
+from torchsoro.output.page import history_panel, last_cycle, motion_of
+from torchsoro.output.picture import deform, movie, shape_image, summary
+from torchsoro.output.scene import Camera
 
 CHAMBER = Chamber(name="air", center=(0.118, 0.068, 0.018), size=(0.018, 0.018, 0.018), wall=0.003)
 DOMAIN = Domain(size=(0.036,) * 3, particles=(12,) * 3, origin=(0.1, 0.05, 0.0), chambers=(CHAMBER,))
@@ -138,7 +138,7 @@ def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "false")
     with pytest.raises(RuntimeError, match="ffmpeg could not write"):
         movie(tmp_path / "new.mp4", **arguments(2))
-    monkeypatch.setattr("torchsoro.picture._write_gif", fail)
+    monkeypatch.setattr("torchsoro.output.picture._write_gif", fail)
     with pytest.raises(OSError, match="disk full"):
         movie(old, **arguments(2))
     assert old.read_bytes() == b"old" and list(tmp_path.iterdir()) == [old]

@@ -12,10 +12,10 @@ from problems import DT, H, block, simulator, vector
 
 import torchsoro
 from torchsoro import Prony, Solid
-from torchsoro.kernels import constitutive, layout
-from torchsoro.ops.lattice import Lattice
-from torchsoro.ops.rollout import initial_state
 from torchsoro.rheology.pointwise import Law, equibiaxial, history, pull_back, simple_shear, stress, uniaxial
+from torchsoro.simulation.kernels import constitutive, layout
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.rollout import initial_state
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)

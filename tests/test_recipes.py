@@ -24,11 +24,14 @@ import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import TINY, tiny
 
-from torchsoro.archive import load_design, load_shape
+from torchsoro.design import loop
+from torchsoro.design.lagrangian import AugmentedLagrangian
+from torchsoro.design.presets import CLIMBER, WALKER
+from torchsoro.design.robot import climber, walker
+from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
-from torchsoro.lagrangian import AugmentedLagrangian
-from torchsoro.robot import climber, walker
-from torchsoro.settings import Settings
+from torchsoro.output import delivery
+from torchsoro.output.archive import load_design, load_shape
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 TAGS = (
@@ -218,7 +221,7 @@ def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_p
 def test_every_preset_fits_together(recipes):
     for name, make in (("walker", walker), ("climber", climber)):
         for preset in ("desk", "paper"):
-            settings = getattr(recipes[name], preset.upper())
+            settings = {"walker": WALKER, "climber": CLIMBER}[name][preset]
             assert settings.preset == preset
             assert settings.out == Path("runs") / name
             robot = make(dataclasses.replace(settings, device="cpu"))
@@ -281,7 +284,7 @@ class Shaky(torch.nn.Module):
 )
 def test_a_design_that_falls_over_or_breaks_down_goes_back_towards_the_last_good_one(recipes, limits, tried):
     robot, good = Shaky(**limits), torch.zeros(3)
-    gamma, outcome = recipes["walker"].simulate(robot, good, 0.5)
+    gamma, outcome = loop.simulate(robot, good, 0.5)
     assert robot.tried == tried
     assert outcome.tried == tried[-1]
     assert gamma.requires_grad
@@ -293,21 +296,21 @@ def test_a_design_that_falls_over_or_breaks_down_goes_back_towards_the_last_good
 def test_a_simulation_that_breaks_down_on_the_last_try_as_well_ends_the_run(recipes, falls):
     robot = Shaky(breaks=0.1, falls=falls)
     with pytest.raises(SimulationDiverged):
-        recipes["walker"].simulate(robot, torch.zeros(3), 0.5)
+        loop.simulate(robot, torch.zeros(3), 0.5)
     assert robot.tried == [1, 0.5, 0.25, 0.125]
 
 
 def test_a_robot_has_fallen_when_it_sank_by_more_than_a_tenth_of_its_height(recipes):
     for upright, fall, fell in ((1.0, 0.21, True), (1.0, 0.19, False), (0.01, 0.21, True), (0.0, 1.0, False)):
         outcome = SimpleNamespace(fall=torch.tensor(fall))
-        assert recipes["walker"].fell(Shaky(upright=upright), outcome) == fell
+        assert loop.fell(Shaky(upright=upright), outcome) == fell
 
 
 def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, monkeypatch):
     recipe = recipes["walker"]
-    monkeypatch.setattr(recipe, "fell", lambda robot, outcome: True)
-    monkeypatch.setattr(recipe, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field())))
-    monkeypatch.setattr(recipe, "deliver", lambda *_, **__: {})
+    monkeypatch.setattr(loop, "fell", lambda robot, outcome: True)
+    monkeypatch.setattr(loop, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field())))
+    monkeypatch.setattr(delivery, "deliver", lambda *_, **__: {})
     recipe.main(tiny(tmp_path / "run", iterations=2))
     start = walker(TINY).field.phi
     assert torch.equal(items(tmp_path / "run")["good"], start)
@@ -317,7 +320,7 @@ def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, 
 def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path, monkeypatch):
     recipe = recipes["walker"]
     delivered = []
-    monkeypatch.setattr(recipe, "deliver", lambda path, robot, gamma, *_, **__: delivered.append(gamma) or {})
+    monkeypatch.setattr(delivery, "deliver", lambda path, robot, gamma, *_, **__: delivered.append(gamma) or {})
     # Every design but the first is within the limit on C.
     settings = tiny(tmp_path / "run", c_max=0.249, gravity_steps=1, gravity_every=2, iterations=2)
     recipe.main(settings)
@@ -331,7 +334,7 @@ def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path,
 
 
 def test_a_design_is_better_within_the_limit_then_if_it_goes_farther_and_before_that_by_the_loss(recipes):
-    better = recipes["walker"].better
+    better = loop.better
     soft, hard = (AugmentedLagrangian(previous=0.24, penalty=price) for price in (1.0, 1e4))
     assert better(-1.0, 0.5, None, soft)
     within, beyond = {"worth": 1.0, "violation": -0.01}, {"worth": 1.0, "violation": 0.02}

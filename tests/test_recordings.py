@@ -1,25 +1,19 @@
 """The recipe that makes experiments of published recordings."""
 
 import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from published import RECORDINGS, recordings
 
-from torchsoro.sim2real.experiment import read_experiment
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.twin.twin import Twin
 
 
 @pytest.fixture(scope="module")
 def recipe():
-    path = str(Path(__file__).parents[1] / "recipes")
-    sys.path.insert(0, path)
-    try:
-        yield importlib.import_module("recordings")
-    finally:
-        sys.path.remove(path)
+    return importlib.import_module("recordings")
 
 
 def places(trial):

@@ -14,18 +14,17 @@ import torch
 import trimesh
 from tiny import TINY
 
-from torchsoro.archive import load_design, load_shape, read_settings
-from torchsoro.objective import intermediate_density
-from torchsoro.results import print_part
-from torchsoro.robot import Robot, build
-
-DESIGNS = Path(__file__).parents[1] / "recipes" / "designs"
+from torchsoro.design.objective import intermediate_density
+from torchsoro.design.robot import Robot, build
+from torchsoro.output import archive
+from torchsoro.output.archive import DESIGNS, load_design, load_shape, read_settings
+from torchsoro.output.delivery import print_part
 
 
 @pytest.fixture
 def replay(recipes, tmp_path, monkeypatch) -> ModuleType:
     """The recipe, with a folder of designs of its own, which is empty."""
-    monkeypatch.setattr(recipes["replay"], "DESIGNS", tmp_path / "designs")
+    monkeypatch.setattr(archive, "DESIGNS", tmp_path / "designs")
     return recipes["replay"]
 
 
@@ -52,7 +51,7 @@ def test_a_kept_run_is_found_by_its_name_and_walks_as_long_as_is_wanted(
     path, result = straight
     assert replay.main(replay.Options(archive=path, name="mine")) == {}
     folder = tmp_path / "designs" / "mine"
-    assert replay.find("mine") == folder
+    assert archive.find("mine") == folder
     capsys.readouterr()
     assert replay.main(replay.Options()) == {}
     assert capsys.readouterr().out == "mine\n"

@@ -12,9 +12,9 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import TINY
 
-from torchsoro.results import drawn_planes, print_part, show, show_shape
-from torchsoro.robot import climber, walker
-from torchsoro.training import RunFolder
+from torchsoro.design.robot import climber, walker
+from torchsoro.design.training import RunFolder
+from torchsoro.output.delivery import drawn_planes, print_part, show, show_shape
 
 
 def test_pictures_get_the_planes_of_the_robot():

@@ -10,10 +10,10 @@ import pytest
 import torch
 from tiny import TINY
 
-import torchsoro.robot
+import torchsoro.design.robot
 from torchsoro import SimulationDiverged, Simulator
-from torchsoro.robot import Outcome, Robot, build, climber, walker
-from torchsoro.settings import Settings
+from torchsoro.design.robot import Outcome, Robot, build, climber, walker
+from torchsoro.design.settings import Settings
 
 
 def tiny(**changes: Any) -> Settings:
@@ -157,7 +157,7 @@ class Fragile:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, failures: int) -> None:
         self.steps: list[float] = []
         self.failures = failures
-        monkeypatch.setattr(torchsoro.robot, "Simulator", self.make)
+        monkeypatch.setattr(torchsoro.design.robot, "Simulator", self.make)
 
     def make(self, **settings: Any) -> Any:
         simulator = Simulator(**settings)

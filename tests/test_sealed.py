@@ -10,7 +10,6 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 
 def test_sealed_cases_are_explained_in_a_copy_and_scored(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(RECIPES)
     monkeypatch.syspath_prepend(RECIPES / "judge")
     import explain
     import score

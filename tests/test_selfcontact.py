@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsoro import selfcontact
-from torchsoro.selfcontact import NEAR, overlapping
+from torchsoro.simulation import selfcontact
+from torchsoro.simulation.selfcontact import NEAR, overlapping
 
 H = 0.875e-3  # m
 

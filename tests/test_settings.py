@@ -12,7 +12,8 @@ import torch
 from tiny import TINY
 
 from torchsoro import SimulationDiverged
-from torchsoro.settings import Settings, from_command_line, plain_errors
+from torchsoro.command_line import plain_errors
+from torchsoro.design.settings import Settings, from_command_line
 
 PRESETS = {"desk": dataclasses.replace(TINY, device="auto"), "paper": Settings()}
 
@@ -44,7 +45,7 @@ def test_every_setting_can_be_overridden():
         "settle": ("0.25",),
         "duration": ("0.25",),
         "c_max": ("0.125",),
-        "filler": ("0.125", "0.25"),
+        "void_range": ("0.125", "0.25"),
         "air_density": ("2.5",),
     }
     hints = typing.get_type_hints(Settings)

@@ -13,9 +13,9 @@ from problems import DT, WAYS, H, block, constant, falling, momenta, simulator, 
 from torch import Tensor
 
 from torchsoro import Plane, Prony, Waveform, ground, stable_step
-from torchsoro.kernels import layout
-from torchsoro.ops import march as march_module
-from torchsoro.simulator import plan_checkpoints
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops import segment as march_module
+from torchsoro.simulation.simulator import plan_checkpoints
 
 FREE = (0.0, 0.0, 0.0)
 COUNT = 64

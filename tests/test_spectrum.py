@@ -13,10 +13,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsoro.material import Prony, Solid
 from torchsoro.rheology.creep import interconverted
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 from torchsoro.rheology.spectrum import Spectrum, error_norm, fit
+from torchsoro.simulation.material import Prony, Solid
 
 TABLE_S1 = Spectrum(
     equilibrium=0.44e6,

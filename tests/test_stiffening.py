@@ -12,14 +12,15 @@ from problems import DT, H, block, rotations, simulator, vector, ways
 
 import torchsoro
 from torchsoro import Chamber, Domain, Gas, Prony, Region, Solid, fill
-from torchsoro.kernels import stress, tensor
-from torchsoro.material import SOFTEST, courant
-from torchsoro.ops.lattice import Lattice
+from torchsoro.simulation.kernels import stress, tensor
+from torchsoro.simulation.material import SOFTEST
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.stability import courant
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
 
-BULK, SHEAR, LINEAR, SQUARE, FILLER = range(5)
+BULK, SHEAR, LINEAR, SQUARE, VOID_FRACTION = range(5)
 FREE = (0.0, 0.0, 0.0)
 LAW = (2.3, 0.7, 0.4, 0.9, 0.0)
 
@@ -33,9 +34,9 @@ def matrix(a: ti.template(), i):
 def run_solid(F: Reals, Q: Reals, law: Reals, P: Reals, S: Reals, n: ti.i32):
     for i in range(n):
         c, f = 5 * i, matrix(F, i)
-        least = stress.least_ratio(law[c + FILLER])
+        least = stress.least_ratio(law[c + VOID_FRACTION])
         factor = stress.stiffening(f, least, law[c + LINEAR], law[c + SQUARE])
-        p = stress.piola(f, matrix(Q, i), law[c + BULK], law[c + SHEAR], factor, law[c + FILLER])
+        p = stress.piola(f, matrix(Q, i), law[c + BULK], law[c + SHEAR], factor, law[c + VOID_FRACTION])
         tensor.store_matrix(P, 9 * i, 1, p)
         tensor.store_matrix(S, 9 * i, 1, factor * stress.pull_back(f, least))
 
@@ -44,16 +45,16 @@ def run_solid(F: Reals, Q: Reals, law: Reals, P: Reals, S: Reals, n: ti.i32):
 def run_adjoint(F: Reals, Q: Reals, law: Reals, P_bar: Reals, S_bar: Reals, F_bar: Reals, law_bar: Reals, n: ti.i32):
     for i in range(n):
         c, f = 5 * i, matrix(F, i)
-        least = stress.least_ratio(law[c + FILLER])
+        least = stress.least_ratio(law[c + VOID_FRACTION])
         factor = stress.stiffening(f, least, law[c + LINEAR], law[c + SQUARE])
-        by_F, _Q, bulk, shear, factor_bar, filler = stress.piola_adjoint(
-            f, matrix(Q, i), law[c + BULK], law[c + SHEAR], factor, law[c + FILLER], matrix(P_bar, i)
+        by_F, _Q, bulk, shear, factor_bar, void_fraction = stress.piola_adjoint(
+            f, matrix(Q, i), law[c + BULK], law[c + SHEAR], factor, law[c + VOID_FRACTION], matrix(P_bar, i)
         )
         by_F += stress.pull_back_adjoint(f, least, factor * matrix(S_bar, i))
         factor_bar += tensor.contract(matrix(S_bar, i), stress.pull_back(f, least))
         by_factor, linear, square = stress.stiffening_adjoint(f, least, law[c + LINEAR], law[c + SQUARE], factor_bar)
         tensor.store_matrix(F_bar, 9 * i, 1, by_F + by_factor)
-        law_bar[c + BULK], law_bar[c + SHEAR], law_bar[c + FILLER] = bulk, shear, filler
+        law_bar[c + BULK], law_bar[c + SHEAR], law_bar[c + VOID_FRACTION] = bulk, shear, void_fraction
         law_bar[c + LINEAR], law_bar[c + SQUARE] = linear, square
 
 
@@ -149,8 +150,8 @@ def test_frame_indifference(seed, size, a, b):
     assert float((same - S).abs().max()) <= 1e-10 * float(S.abs().max())
 
 
-@pytest.mark.parametrize(("filler", "crushed"), [(0.0, False), (0.3, False), (0.3, True)])
-def test_adjoints_of_the_stiffening_solid(filler, crushed):
+@pytest.mark.parametrize(("void_fraction", "crushed"), [(0.0, False), (0.3, False), (0.3, True)])
+def test_adjoints_of_the_stiffening_solid(void_fraction, crushed):
     g = torch.Generator().manual_seed(6)
 
     def noise(*shape):
@@ -162,7 +163,7 @@ def test_adjoints_of_the_stiffening_solid(filler, crushed):
         ratio = torch.linspace(-1.0, 0.19, 32, dtype=torch.float64)
         F = F * ((ratio / torch.linalg.det(F)).abs().pow(1 / 3) * ratio.sign())[:, None, None]
     law = torch.rand(32, 5, generator=g, dtype=torch.float64) + 0.5
-    law[:, FILLER] = filler
+    law[:, VOID_FRACTION] = void_fraction
     F_bar, law_bar = torch.zeros(32, 3, 3).double(), torch.zeros(32, 5).double()
     run_adjoint(*(t.contiguous().view(-1) for t in (F, Q, law, P_bar, S_bar, F_bar, law_bar)), 32)
 
@@ -173,7 +174,7 @@ def test_adjoints_of_the_stiffening_solid(filler, crushed):
     e = 1e-6
     slope = (power(F=F + e * d) - power(F=F - e * d)) / (2 * e)
     torch.testing.assert_close((F_bar * d).sum((1, 2)), slope, rtol=2e-6, atol=2e-6)
-    for k in range(5 if filler else 4):
+    for k in range(5 if void_fraction else 4):
         one = e * torch.nn.functional.one_hot(torch.tensor(k), 5).double()
         slope = (power(law=law + one) - power(law=law - one)) / (2 * e)
         torch.testing.assert_close(law_bar[:, k], slope, rtol=2e-6, atol=2e-6)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchsoro.sim2real.ensemble import SAFETY, Ensemble
-from torchsoro.sim2real.experiment import read_experiment
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.model import predict_trial, read_model, write_model
-from torchsoro.sim2real.surface import Surface, read_surface
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.data.surface import Surface, read_surface
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
+from torchsoro.sim2real.twin.ensemble import SAFETY, Ensemble
+from torchsoro.sim2real.twin.twin import Twin
 
 SETUP = """
 title = "bar"

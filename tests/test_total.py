@@ -11,7 +11,7 @@ from problems import DT, H, block, constant, momenta, simulator, vector
 from torch import Tensor
 
 from torchsoro import Body, Domain, Force, Gas, Plane, Prony, Solid, Spring, fill, ground
-from torchsoro.ops.lattice import Lattice
+from torchsoro.simulation.ops.lattice import Lattice
 
 FREE, G = (0.0, 0.0, 0.0), 9.81
 CELL = 2 * H
@@ -36,8 +36,8 @@ def viscous(body: Body, eta: float) -> Body:
 def test_momentum_and_angular_momentum_are_conserved():
     # With all that is inside of a body: a pressurised chamber, Maxwell elements, viscosity, void.
     _, body = block((4, 4, 6), air=True)
-    filler = torch.rand(96, generator=torch.Generator().manual_seed(4)).double() * 0.5
-    body = viscous(replace(body, velocity=0.3 * noise(96, 3), filler=filler), 1.0)
+    void_fraction = torch.rand(96, generator=torch.Generator().manual_seed(4)).double() * 0.5
+    body = viscous(replace(body, velocity=0.3 * noise(96, 3), void_fraction=void_fraction), 1.0)
     finals = [
         total()(body, duration=k * DT, gravity=FREE, prony=Prony.paper(2), pressure=constant(500.0)).final
         for k in (1, 200)
@@ -207,7 +207,7 @@ def test_two_walls_hold_a_block_between_them_at_any_distance(room):
 def test_a_body_does_not_stand_on_its_void(layers):
     domain = Domain(size=(4 * H, 4 * H, 8 * H), particles=(4, 4, 8))
     solid = domain.positions[:, 2] > layers * H
-    body = fill(domain, solid.double(), solid=Solid(), filler=(0.1, 0.3))
+    body = fill(domain, solid.double(), solid=Solid(), void_range=(0.1, 0.3))
     run = total()(body, duration=3600 * DT, prony=Prony.paper(3), planes=[ground()], probes=solid.nonzero().squeeze(1))
     lowest = run.position[..., 2].amin(1)
     assert float(lowest[0]) == pytest.approx((layers + 0.5) * H)

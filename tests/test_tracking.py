@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from torchsoro.sim2real.recording import Recording
-from torchsoro.sim2real.tracking import Frame, read, read_c3d, read_deeplabcut, read_tracker
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.data.tracking import Frame, read, read_c3d, read_deeplabcut, read_tracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 

@@ -17,7 +17,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchsoro.training import RunFolder
+from torchsoro.design.training import RunFolder
 
 SETTINGS = {"seed": 1, "chamber": {"wall": 0.00175, "size": (0.1, 0.2)}, "iterations": 6}
 
@@ -80,7 +80,7 @@ def test_a_run_killed_before_its_first_checkpoint_starts_again(tmp_path):
 KILLED = """
 import os, random, signal, sys, time
 import torch
-from torchsoro.training import RunFolder
+from torchsoro.design.training import RunFolder
 
 def work(path):
     run = RunFolder(path, {"seed": 1})

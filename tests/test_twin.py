@@ -16,14 +16,14 @@ from scipy.optimize import curve_fit
 from test_experiment import experiment
 
 from torchsoro import Body, Solid
-from torchsoro.actuation import Waveform
-from torchsoro.contact import Plane
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Boundary, Cavity, Load, read_experiment
-from torchsoro.sim2real.grid import Axis, divide
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.twin import Twin
-from torchsoro.simulator import Simulator
+from torchsoro.sim2real.data.experiment import Boundary, Cavity, Load, read_experiment
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.grid import Axis, divide
+from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.simulator import Simulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
 EDGE = 0.008

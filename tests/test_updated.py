@@ -11,9 +11,9 @@ import torch
 import trimesh
 from test_experiment import SETUP, experiment
 
-from torchsoro.sim2real.ensemble import Ensemble
-from torchsoro.sim2real.experiment import Boundary, Load, read_experiment
-from torchsoro.sim2real.twin import Twin
+from torchsoro.sim2real.data.experiment import Boundary, Load, read_experiment
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.twin import Twin
 
 LOADED = SETUP + "[[load]]\nbox = [[0.03, 0.0, 0.0], [0.04, 0.02, 0.02]]\nforce = [0.0, 0.05, 0.0]\nstart = 0.02\n"
 FREE = SETUP.replace("[[clamp]]\nbox = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]\n", "").replace(

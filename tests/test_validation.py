@@ -1,11 +1,9 @@
-"""The recipe ``validate.py`` on small settings: what it prints must agree with the closed forms."""
+"""The recipe ``simulator.py`` on small settings: what it prints must agree with the closed forms."""
 
 from __future__ import annotations
 
 import importlib
 import math
-import sys
-from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -17,12 +15,8 @@ RECIPES = Path(__file__).parents[1] / "recipes"
 
 
 @pytest.fixture(scope="module")
-def recipes() -> Iterator[tuple[ModuleType, ModuleType]]:
-    sys.path.insert(0, str(RECIPES))
-    try:
-        yield importlib.import_module("validate"), importlib.import_module("structures")
-    finally:
-        sys.path.remove(str(RECIPES))
+def recipes() -> tuple[ModuleType, ModuleType]:
+    return importlib.import_module("simulator"), importlib.import_module("structures")
 
 
 def test_timoshenko_tends_to_euler_and_bernoulli_for_a_slender_bar(recipes):

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from ringing import effect
 
-from torchsoro.sim2real.fit import Problem
-from torchsoro.sim2real.library import library
-from torchsoro.sim2real.ranking import Candidate, rank
-from torchsoro.sim2real.search import _freed
-from torchsoro.sim2real.verdict import Thresholds, decide
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.ranking import Candidate, rank
+from torchsoro.sim2real.inference.search import _freed
+from torchsoro.sim2real.inference.verdict import Thresholds, decide
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-from torchsoro.settings import Settings
+from torchsoro.design.settings import Settings
 
 TINY = Settings(
     preset="desk",

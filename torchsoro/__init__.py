@@ -1,16 +1,18 @@
 """torchsoro: pneumatic soft robots designed by gradient through a differentiable visco-hyperelastic MPM."""
 
-from torchsoro.actuation import Waveform, read_pressure_csv, square_wave
-from torchsoro.contact import Plane, ground
-from torchsoro.domain import Chamber, Domain, Region
+from torchsoro.design.density import fill, simp
+from torchsoro.design.domain import Chamber, Domain, Region
+from torchsoro.design.field import DesignField
+from torchsoro.design.lagrangian import AugmentedLagrangian, Plateau
+from torchsoro.design.objective import center_of_gravity, intermediate_density, stride, total_mass, travel
 from torchsoro.errors import SimulationDiverged
-from torchsoro.field import DesignField
-from torchsoro.lagrangian import AugmentedLagrangian, Plateau
-from torchsoro.loads import Drag, Force, PointMass, Spring
-from torchsoro.material import Body, Gas, Prony, Solid, fill, simp, stable_step
-from torchsoro.objective import center_of_gravity, intermediate_density, stride, total_mass, travel
-from torchsoro.runtime import init
-from torchsoro.simulator import Simulator, Trajectory
+from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
+from torchsoro.simulation.contact import Plane, ground
+from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
+from torchsoro.simulation.material import Body, Gas, Prony, Solid
+from torchsoro.simulation.runtime import init
+from torchsoro.simulation.simulator import Simulator, Trajectory
+from torchsoro.simulation.stability import stable_step
 
 __version__ = "0.1.0"
 

@@ -2,7 +2,7 @@
 
 Elements are numbered from the slowest, as in Table S1 of the paper. A fast element is stiff, and the stable step falls
 with stiffness; but with the exact-exponential update an element much faster than the step is felt with
-g b 2 / (1 + a), not with g (see :meth:`torchsoro.material.Prony.step_moduli`).
+g b 2 / (1 + a), not with g (see :meth:`torchsoro.simulation.material.Prony.step_moduli`).
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from typing import Literal
 import numpy as np
 import torch
 
-from torchsoro.material import STABLE_COURANT, Prony, Solid
 from torchsoro.rheology.leastsquares import Problem, free
 from torchsoro.rheology.measured import Sweep
 from torchsoro.rheology.residuals import relative_residuals
 from torchsoro.rheology.spectrum import Spectrum
 from torchsoro.rheology.stability import Formulation, courant_number, felt_share, largest_step, moduli_over
+from torchsoro.simulation.material import Prony, Solid
+from torchsoro.simulation.stability import STABLE_COURANT
 
 MOST = 5  # elements that the simulator takes
 _POINTS = 40  # to a decade of the band, on which losses are looked for
@@ -36,7 +37,7 @@ class Element:
         modulus: Over the equilibrium modulus.
         felt: What an oscillation that changes sign at every step feels of it, g b 2 / (1 + a).
         courant: Courant number of the step with this element and all slower ones.
-        stable: Whether that is within ``torchsoro.material.STABLE_COURANT``.
+        stable: Whether that is within ``torchsoro.simulation.material.STABLE_COURANT``.
         step: Largest stable step [s] with this element and all slower ones.
         cost: Number of steps at that step over the number at the step asked for; 1 or less if it is stable.
         storage_lost: Largest share of the storage modulus that the band loses without this and all faster ones.
@@ -171,7 +172,7 @@ def budget(
 ) -> Budget:
     """Tell for every Maxwell element whether a step is stable with it, what it costs, and what is lost without it.
 
-    Only the solid is looked at; chambers may ask for a smaller step (see ``torchsoro.material.courant``).
+    Only the solid is looked at; chambers may ask for a smaller step (see ``torchsoro.simulation.material.courant``).
 
     Args:
         material: Any number of elements.

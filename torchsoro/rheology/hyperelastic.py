@@ -18,9 +18,9 @@ from scipy.optimize import OptimizeResult, least_squares
 from scipy.stats import t as student
 from torch import Tensor
 
-from torchsoro.material import SOFTEST, Prony, Solid
 from torchsoro.rheology.finite import Experiment
 from torchsoro.rheology.pointwise import Law, equibiaxial, simple_shear, uniaxial
+from torchsoro.simulation.material import SOFTEST, Prony, Solid
 
 LEVEL = 0.90  # of the intervals
 _STEP = 1e-30  # of the complex step

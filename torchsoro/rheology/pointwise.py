@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchsoro.material import Prony, Solid
+from torchsoro.simulation.material import Prony, Solid
 
 _NEWTON = 60  # steps at most; four or five do, but for wild laws
 

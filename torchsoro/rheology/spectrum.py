@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from scipy.stats import f as fisher
 
-from torchsoro.material import Prony, Solid
 from torchsoro.rheology.creep import compliance, relaxing
 from torchsoro.rheology.leastsquares import Found, Problem, fixed, floor, free, inflation, profiles
 from torchsoro.rheology.measured import Creep, Deformation, Relaxation, Sweep
 from torchsoro.rheology.residuals import relative_residuals
+from torchsoro.simulation.material import Prony, Solid
 
 LEVEL = 0.95  # confidence of the intervals
 PENALTIES = (0.0, 1e-2, 1e-1, 1.0, 10.0)  # tried where regularization = "auto"

@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 import torch
 
-from torchsoro.material import STABLE_COURANT, Body, Solid, courant
+from torchsoro.simulation.material import Body, Solid
+from torchsoro.simulation.stability import STABLE_COURANT, courant
 
 Formulation = Literal["updated", "total"]
 
@@ -52,7 +53,7 @@ def largest_step(
     formulation: Formulation,
     viscosity: float = 0.0,
 ) -> float:
-    """Largest stable step [s], by bisection in log time; as ``torchsoro.material.stable_step``."""
+    """Largest stable step [s], by bisection in log time; as ``torchsoro.simulation.material.stable_step``."""
     low, high = math.log(1e-15), 0.0
     while high - low > 1e-5:
         dt = math.exp((low + high) / 2)

@@ -1,0 +1,404 @@
+"""What explain.py is compared with, on the same experiments and in the same words: what others do, and parts of it.
+
+    python recipes/baselines/baselines.py my-experiment --out runs/baseline --method all-parameters
+    python recipes/baselines/baselines.py --predict runs/baseline/model.toml --trial trial.toml --out markers.csv
+
+Writes explanation.json and, where there is one, model.toml.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+import tyro
+from scipy.interpolate import CubicSpline
+from scipy.signal import savgol_filter
+from torch import nn
+
+from torchsoro.command_line import plain_errors
+from torchsoro.output.archive import atomic_write
+from torchsoro.sim2real.data.experiment import Trial
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.fit import Fit, Problem
+from torchsoro.sim2real.inference.force_map import StepForce, force_map, patches
+from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.histories import Lines, simulate
+from torchsoro.sim2real.inference.likelihood import BREAKS, Effects
+from torchsoro.sim2real.inference.model import write_model
+from torchsoro.sim2real.inference.verdict import Thresholds, judge
+from torchsoro.sim2real.pipeline import Options as ExplainOptions
+from torchsoro.sim2real.pipeline import begun, predicted, prepared
+from torchsoro.sim2real.report.report import effect_rows
+from torchsoro.sim2real.twin.ensemble import Ensemble
+
+Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
+Ablation = Literal["without-numerics", "without-heldout", "one-trial", "force-map"]
+
+SURE = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
+PATCHES, WINDOWS = 4, 10  # that the force network acts on, in each trial
+SLICES = 8  # of the body, on which the force map puts its forces
+HIDDEN, EPOCHS, DECAY = 16, 1500, 1e-3  # of the force network
+HELPS = 0.85  # error on trials left out, over that without it, at which a network has found something
+SMOOTH = 9  # samples of the parabola that is differentiated twice for sparse regression
+SPARSE = 0.1  # of the largest normalised coefficient, below which a term is dropped
+PREDICTS = 0.1  # share of the residual accelerations of trials left out, at which terms are believed
+BROKEN = 1.0  # m, the error where a prediction breaks down
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to explain, and how."""
+
+    experiment: tyro.conf.Positional[Path | None] = None
+    """Folder of the experiment."""
+    out: Path
+    """Folder for explanation.json and model.toml; with --predict, the file of the markers."""
+    method: Baseline | Ablation = "modulus-and-damping"
+    """modulus-and-damping: both fitted. all-parameters: all of the library that need no place, fitted together.
+    white-noise: as explain.py, but with independent noise and without the simulation's own error. force-network: a
+    network of state and pressure, whose forces on the body explain the residual. sparse-regression: residual
+    accelerations of the markers from a list of terms. without-numerics: explain.py with a twin that is corrected, but
+    whose error is not part of the band; without-heldout: that believes an effect whatever it predicts; one-trial: that
+    sees the first trial only. force-map: where free forces on the body would explain what is left, without any effect
+    whose form is known."""
+    predict: Path | None = None
+    """A model.toml, to predict a trial with instead."""
+    trial: Path | None = None
+    """The trial.toml to predict."""
+    budget: float = 20.0
+    """As of explain.py [minutes], for a twin as fine."""
+    threads: int = 1
+    """That simulate side by side."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Answer:
+    """In the words of explanation.json.
+
+    Attributes:
+        verdict: Of the four.
+        effects: Rows.
+        names: That cannot be told apart.
+        heldout: Of trials that were left out, the error as believed and after [m].
+        fit: For model.toml, if there is one.
+    """
+
+    verdict: str
+    effects: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    names: list[str] = dataclasses.field(default_factory=list)
+    heldout: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    fit: Fit | None = None
+
+
+def fitted(problem: Problem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
+    """A fit.
+
+    Raises:
+        ValueError: if the simulation breaks down.
+    """
+    (found,) = problem.fit([(effects, start)], rounds=rounds)
+    if found is None:
+        raise ValueError(BREAKS)
+    return found
+
+
+def left_out(
+    problem: Problem, nothing: Fit, other: Callable[[int, Problem, Trial], float]
+) -> dict[str, tuple[float, float]]:
+    """The error of each trial as believed, and what a function of its number, the other trials and it gives."""
+    found = {}
+    for i, trial in enumerate(problem.trials):
+        where = problem.only([t for t in problem.trials if t is not trial])
+        (before,) = predict(where, problem.without(nothing, i), [trial], believed=True)
+        found[trial.name] = before.total, other(i, where, trial)
+    return found
+
+
+def parameters(problem: Problem, names: Sequence[str]) -> Answer:
+    """Least squares in some parameters at once; those far from what is believed are named."""
+    effects = tuple(problem.thought_of([e for e in library() if e.name in names]))
+    start = [np.zeros(len(problem.common))]
+    for effect in effects:
+        # The strength begins at nothing, what does not matter without it where a search would begin.
+        begin = np.zeros(len(effect.quantities)) if effect.joint else np.array(effect.starts[0], float)
+        begin[0] = 0.0
+        start.append(begin)
+    fit = fitted(problem, effects, np.concatenate(start), rounds=20)
+    spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
+    rows = {r["name"]: r for r in effect_rows(fit, 1.0, problem)}
+    sure = []
+    for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
+        strengths = len(effect.quantities) if effect.joint else 1
+        v, c = values[:strengths], covariance[:strengths, :strengths]
+        if v.any() and float(v @ np.linalg.pinv(c) @ v) > strengths * (SURE * spread) ** 2:
+            sure.append(effect.name)
+
+    def after(i: int, where: Problem, trial: Trial) -> float:
+        told = predict(where, problem.without(fit, i), [trial])
+        return told[0].total if told else BROKEN
+
+    kind = {0: "nothing_missing", 1: "explained"}.get(len(sure), "cannot_distinguish")
+    held = left_out(problem, fitted(problem), after)
+    return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
+
+
+def judged(problem: Problem, budget: float, **thresholds: float) -> Answer:
+    """The verdict of explain.py."""
+    verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
+    rows = effect_rows(verdict.chosen[0].fit, 1.0, verdict.problem) if verdict.chosen else []
+    return Answer(
+        verdict=verdict.kind,
+        effects=rows,
+        names=[c.fit.name for c in verdict.chosen],
+        heldout=verdict.heldout,
+        fit=verdict.chosen[0].fit if verdict.chosen else verdict.nothing,
+    )
+
+
+def without_band(problem: Problem) -> Problem:
+    """The same, as if the corrected twin made no error."""
+    return problem.only(problem.trials, numerics=[np.zeros_like(n) for n in problem.numerics])
+
+
+# A network of forces -----------------------------------------------------------------------------------------------
+
+
+def features(problem: Problem, fit: Fit) -> torch.Tensor:
+    """Of each patch and window [T, P, W, F], about one: place, motion of the marker next to it, pressures."""
+    places, _ = patches(problem.twin, PATCHES)
+    setup = problem.experiment.setup
+    longest = int(np.argmax(setup.size))
+    along = (places[:, longest] - setup.origin[longest]) / setup.size[longest]
+    nearest = np.linalg.norm(places[:, None] - np.array([m.at for m in setup.markers]), axis=-1).argmin(1)
+    moved, speeds, pressures = [], [], []
+    for motion, scenario in zip(fit.end.motions, problem.scenarios, strict=True):
+        middle = (np.arange(WINDOWS) + 0.5) / WINDOWS * scenario.duration
+        at = np.minimum(np.searchsorted(motion.time, middle), len(motion.time) - 1)
+        moved.append((motion.place - motion.place[:1])[at][:, nearest])
+        speeds.append(motion.velocity[at][:, nearest])
+        if scenario.pressure is not None:
+            p = scenario.pressure.at(torch.from_numpy(middle)).reshape(-1, WINDOWS).T.numpy()
+            pressures.append(np.broadcast_to(p[:, None], (WINDOWS, PATCHES, p.shape[1])))
+    parts = [np.broadcast_to(along[:, None], (len(moved), WINDOWS, PATCHES, 1))]
+    parts += [np.stack(part) / (np.abs(part).max() + 1e-12) for part in (moved, speeds, pressures) if part]
+    return torch.from_numpy(np.concatenate(parts, -1).swapaxes(1, 2))
+
+
+class ForceNetwork(nn.Module):
+    """Forces on patches from what happens there; none before it is trained.
+
+    Args:
+        inputs: Number of features.
+        unit: Size of a force.
+    """
+
+    def __init__(self, inputs: int, unit: float) -> None:
+        super().__init__()
+        self.unit, self.hidden, self.out = unit, nn.Linear(inputs, HIDDEN), nn.Linear(HIDDEN, 3)
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+        self.double()
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        """Forces [..., 3] of features [..., F]."""
+        return self.unit * self.out(torch.tanh(self.hidden(x)))
+
+
+def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
+    """The network whose forces leave least of a residual, by the linear response."""
+    torch.manual_seed(0)
+    G, d = torch.from_numpy(lines.histories.G.reshape(len(lines.histories.d), -1)), torch.from_numpy(lines.histories.d)
+    network = ForceNetwork(x.shape[-1], float(d.norm() * math.sqrt(G.shape[1]) / G.norm()))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=1e-2, weight_decay=DECAY)
+    for _ in range(EPOCHS):
+        optimizer.zero_grad()
+        left = d - G @ network(x).reshape(-1)
+        loss = (left @ left) / (d @ d)
+        loss.backward()
+        optimizer.step()
+    return network
+
+
+def force_network(problem: Problem) -> Answer:
+    """Forces by a network, learned from all trials but one."""
+    nothing = fitted(problem)
+    s = problem.experiment.setup
+    small = 1e-3 * s.youngs_modulus * min(s.size) ** 3 / max(s.size)
+    _, shares = patches(problem.twin, PATCHES)
+    steps = tuple(StepForce(share, k / WINDOWS, small) for share in shares for k in range(WINDOWS))
+    none = np.zeros((len(problem.trials), PATCHES, WINDOWS, 3))
+    motions = simulate(problem, steps, nothing.point[None], none[None], slopes=True)
+    x = features(problem, nothing)
+
+    def after(i: int, where: Problem, trial: Trial) -> float:
+        others = [k for k in range(len(problem.trials)) if k != i]
+        still = problem.without(nothing, i)
+        lines = Lines(where, still.errors, nothing.point, [motions[k] for k in others], none[others])
+        forces = trained(lines, x[others])(x[i]).detach().numpy()
+        jumps = np.diff(forces, axis=1, prepend=0.0).reshape(-1)
+        fit = dataclasses.replace(still, effects=steps, point=np.concatenate([still.point, jumps]))
+        # Without forces where the body does not bear them.
+        found = predict(where, fit, [trial]) or predict(where, still, [trial])
+        return found[0].total
+
+    held = left_out(problem, nothing, after)
+    (one, other) = (math.sqrt(sum(v[k] ** 2 for v in held.values())) for k in (0, 1))
+    return Answer(verdict="unknown_physics" if other < HELPS * one else "nothing_missing", heldout=held)
+
+
+def mapped(problem: Problem) -> Answer:
+    """The place of the largest force that a force map needs, where something is missing."""
+    nothing = fitted(problem)
+    if nothing.misfit < Thresholds().quiet * nothing.samples:
+        return Answer(verdict="nothing_missing", fit=nothing)
+    needed = force_map(problem, nothing, count=SLICES, windows=WINDOWS).needed
+    rows = [{"name": "force", "parameters": {}, "location_m": n.place.tolist()} for n in needed[:1]]
+    return Answer(verdict="unknown_physics", effects=rows, fit=nothing)
+
+
+# Sparse regression -------------------------------------------------------------------------------------------------
+
+
+def evenly(time: np.ndarray) -> np.ndarray:
+    """Times as far apart as most samples are."""
+    return np.arange(time[0], time[-1], float(np.median(np.diff(time))))
+
+
+def smoothed(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
+    """A derivative of a track, some of whose samples were lost, at even times."""
+    even, good = evenly(time), np.isfinite(track)
+    whole = CubicSpline(time[good], track[good])(even)
+    return np.asarray(savgol_filter(whole, SMOOTH, 3, deriv=order, delta=float(even[1] - even[0])))
+
+
+def terms(problem: Problem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
+    """Names of terms, and for each trial their values [N, K] and the residual accelerations [N], by the recordings."""
+    names = ["modulus", "stiffening", "viscoelastic", "drag", "friction", "density"]
+    names += ["gravity_tilt"] * len(problem.experiment.setup.axes)
+    pressed = problem.scenarios[0].pressure is not None
+    names += ["pressure_loss", "pressure_lag"] if pressed else []
+    values, targets = [], []
+    for trial, seen, scenario in zip(problem.trials, fit.seen, problem.scenarios, strict=True):
+        assert trial.recording is not None
+        t = trial.recording.time
+        even = evenly(t)
+        p = np.zeros(len(even))
+        if scenario.pressure is not None:
+            p = scenario.pressure.at(torch.from_numpy(even)).reshape(-1, len(even))[0].numpy()
+        rate = np.gradient(p, even)
+        rows, accelerations = [], []
+        for m, a in np.ndindex(*seen.shape[1:]):
+            left = trial.recording.place[:, m, a] - seen[:, m, a]
+            if np.isfinite(left).sum() < SMOOTH:
+                continue
+            u = smoothed(t, seen[:, m, a] - seen[0, m, a], 0)
+            v, b = (smoothed(t, seen[:, m, a], k) for k in (1, 2))
+            speed = float(np.abs(v).max()) or 1.0
+            constant = np.zeros((len(even), seen.shape[2]))
+            constant[:, a] = 1.0
+            columns = [u, u**3, v, v * np.abs(v), np.tanh(20 * v / speed), b, *constant.T]
+            if pressed:
+                way = float(u[int(np.abs(p).argmax())])
+                columns += [p * way, rate * way]
+            rows.append(np.stack(columns, -1))
+            accelerations.append(smoothed(t, left, 2))
+        values.append(np.concatenate(rows))
+        targets.append(np.concatenate(accelerations))
+    return names, values, targets
+
+
+def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Coefficients by least squares, small ones dropped until none is."""
+    scale = np.sqrt((A**2).mean(0)) + 1e-300
+    kept = np.ones(A.shape[1], bool)
+    x = np.zeros(A.shape[1])
+    while kept.any():
+        x[:] = 0.0
+        x[kept] = np.linalg.lstsq(A[:, kept] / scale[kept], y, rcond=1e-8)[0]
+        small = kept & (np.abs(x) < SPARSE * np.abs(x).max())
+        if not small.any():
+            break
+        kept &= ~small
+    return x / scale
+
+
+def sparse_regression(problem: Problem) -> Answer:
+    """Terms that the residual accelerations are made of."""
+    nothing = fitted(problem)
+    names, values, targets = terms(problem, nothing)
+    left = whole = 0.0
+    for i, (A, y) in enumerate(zip(values, targets, strict=True)):
+        others = [k for k in range(len(values)) if k != i]
+        x = thresholded(np.concatenate([values[k] for k in others]), np.concatenate([targets[k] for k in others]))
+        left, whole = left + float(((y - A @ x) ** 2).sum()), whole + float((y**2).sum())
+    if left > (1 - PREDICTS) * whole:
+        return Answer(verdict="nothing_missing")
+    A, y = np.concatenate(values), np.concatenate(targets)
+    x = thresholded(A, y)
+    sizes: dict[str, float] = {}
+    for name, size in zip(names, np.abs(x) * np.sqrt((A**2).mean(0)), strict=True):
+        sizes[name] = max(sizes.get(name, 0.0), float(size))
+    chosen = [n for n in sorted(sizes, key=lambda n: -sizes[n]) if sizes[n] > 0]
+    rows = [{"name": n, "parameters": {}, "confidence": 1.0, "location_m": None} for n in chosen]
+    return Answer(verdict="explained" if len(rows) == 1 else "cannot_distinguish", effects=rows, names=chosen)
+
+
+def main(options: Options) -> Answer | None:
+    """Explain an experiment as others would, or predict a trial.
+
+    Raises:
+        ValueError: for an experiment that cannot be read or simulated.
+    """
+    if options.predict is not None:
+        return predicted(ExplainOptions(predict=options.predict, trial=options.trial, out=options.out))
+    begin, seconds = time.perf_counter(), 60 * options.budget
+    whole = ExplainOptions(
+        experiment=options.experiment, out=options.out, budget=options.budget, threads=options.threads
+    )
+    if options.method in get_args(Ablation):
+        problem, _ = prepared(whole)
+    else:
+        experiment, trials, twin = begun(whole)
+        problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
+    everything = [e.name for e in library() if not e.local]
+    answer = {
+        "modulus-and-damping": lambda: parameters(problem, ["modulus", "viscoelastic"]),
+        "all-parameters": lambda: parameters(problem, everything),
+        "white-noise": lambda: judged(problem, seconds),
+        "force-network": lambda: force_network(problem),
+        "sparse-regression": lambda: sparse_regression(problem),
+        "without-numerics": lambda: judged(without_band(problem), seconds),
+        "without-heldout": lambda: judged(problem, seconds, lost=math.inf, worse=math.inf),
+        "one-trial": lambda: judged(problem.only(problem.trials[:1]), seconds),
+        "force-map": lambda: mapped(problem),
+    }[options.method]()
+    told = {
+        "verdict": answer.verdict,
+        "effects": [] if answer.verdict == "cannot_distinguish" else answer.effects,
+        "set": answer.names,
+        "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in answer.heldout.items()],
+        "cost": {
+            "simulations": problem.tally.simulations,
+            "seconds": time.perf_counter() - begin,
+        },
+    }
+    options.out.mkdir(parents=True, exist_ok=True)
+    with atomic_write(options.out / "explanation.json") as file:
+        file.write((json.dumps(told, indent=2) + "\n").encode())
+    if answer.fit is not None:
+        write_model(options.out / "model.toml", problem.experiment.folder / "setup.toml", answer.fit, problem.twin)
+    print(f"{options.method}: {answer.verdict} {', '.join(answer.names)}; {told['cost']['seconds']:.0f} s")
+    return answer
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__))

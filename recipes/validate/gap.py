@@ -1,0 +1,221 @@
+"""Put into an archived robot what its paper's simulation lacked, hide it, and make an experiment of what is seen.
+
+    python recipes/validate/gap.py walker --hide tube --out runs/gap
+    python recipes/explain.py runs/gap --out runs/gap-explained
+
+The robot is simulated as it was designed, by particles, in four trials with different pressures; eight points of one
+side are filmed, with noise. ``setup.toml`` holds what is believed, without what ``--hide`` names, and ``simulated.csv``
+of each trial where the same simulation has the points then:
+
+- tube: the supply's tube at the rear, a mass on a spring with a dashpot;
+- relaxation: the Maxwell elements, which the paper left out of simulations that took too long;
+- air: the chamber's air is believed to be a spring beside the pressure that holds it already: it counts twice;
+- asymmetry: one side softer than the other;
+- nothing: the twin's own error, to be seen before anything is believed of the others.
+
+What was hidden is in ``<out>-truth.json``, beside the experiment. A demonstration, not a proof: body and contact are
+simulated by another formulation than the twin's, but the effects have the forms that it knows. With ``--no-simulated``
+the twin has to do by itself.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+from experiment_files import Files, fresh, setup, write
+
+from torchsoro.command_line import plain_errors
+from torchsoro.design.density import without_void
+from torchsoro.design.robot import Robot, build
+from torchsoro.design.settings import Settings
+from torchsoro.output.archive import find, load_design, read_settings
+from torchsoro.output.fabricate import surface
+from torchsoro.simulation.loads import Drag, Load, PointMass, Spring
+from torchsoro.simulation.material import Body, Prony
+
+TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # of the pressure
+RATE, FINE = 200.0, 1000.0  # Hz, of the camera and of what is simulated
+MARKERS = 8
+TUBE = {"mass_kg": 2e-3, "stiffness_n_m": 10.0, "damping_n_s_m": 0.02}
+REACH = 4e-3  # m around the rearmost point, on which the tube hangs
+SOFT = 0.3  # of its modulus, that one side lacks
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Options:
+    """What to hide in what."""
+
+    robot: tyro.conf.Positional[str]
+    """Name of an archived robot, or a run's folder."""
+    out: Path
+    """Folder of the experiment."""
+    hide: Literal["nothing", "tube", "relaxation", "air", "asymmetry"] = "nothing"
+    """What the experiment lacks."""
+    strength: float = 1.0
+    """Of a tube or an asymmetry, times the usual."""
+    duration: float = 0.2
+    """Of a trial [s]."""
+    settle: float = 0.05
+    """Time before the actuation starts, to come to rest [s]."""
+    noise: float = 1e-4
+    """Standard deviation [m]."""
+    seed: int = 0
+    """Of the noise."""
+    simulated: bool = True
+    """Whether the experiment comes with the simulation of what is believed."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute."""
+
+
+def elements(robot: Robot) -> list[list[float]]:
+    """Pairs of modulus and time."""
+    return torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
+
+
+def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tuple[Body, list[Load], dict[str, Any]]:
+    """The body and what is attached to it, with what is hidden; the truth. Its air has this stiffness [Pa]."""
+    solid = body.chamber < 0
+    x = body.position
+    if options.hide == "tube":
+        rear = -(x @ x.new_tensor(robot.direction))
+        last = x[torch.where(solid, rear, -torch.inf).argmax()]
+        group = torch.nonzero(solid & ((x - last).norm(dim=-1) < REACH)).squeeze(-1)
+        told = {name: options.strength * value for name, value in TUBE.items()}
+        loads = [
+            PointMass(particles=group, mass=told["mass_kg"]),
+            Spring(particles=group, stiffness=told["stiffness_n_m"]),
+            Drag(particles=group, coefficient=told["damping_n_s_m"]),
+        ]
+        return body, loads, {"name": "tether", "parameters": told, "location_m": x[group].mean(0).tolist()}
+    if options.hide == "asymmetry":
+        softer = 1 - options.strength * SOFT * ((x[:, 1] > 0) & solid)
+        body = dataclasses.replace(body, bulk=body.bulk * softer, shear=body.shear * softer)
+        return body, [], {"name": "soft_side", "parameters": {"fraction": options.strength * SOFT}, "axis": "y"}
+    if options.hide == "relaxation":
+        return body, [], {"name": "viscoelastic", "parameters": {}, "prony": elements(robot)}
+    if options.hide == "air":
+        return body, [], {"name": "air_stiffness", "parameters": {"air_stiffness_pa": -stiffness}}
+    return body, [], {}
+
+
+def believed(options: Options, robot: Robot, stiffness: float) -> str:
+    """Tables of setup.toml but for markers and recording; air of this stiffness is believed [Pa]."""
+    s = robot.settings
+    known = [] if options.hide == "relaxation" else elements(robot)
+    tables = [
+        f'title = "{s.robot}"\ngravity = {list(robot.gravity)}\nduration = {options.settle + options.duration}\n',
+        '[body]\nshape = "mesh"\nfile = "body.stl"\n',
+        f"[material]\ndensity = {robot.solid.density}\nyoungs_modulus = {robot.solid.youngs_modulus}\n"
+        f"poisson_ratio = {robot.solid.poisson_ratio}\nprony = {known}\n",
+    ]
+    for chamber in robot.domain.chambers:
+        half = np.array(chamber.size) / 2 - chamber.wall
+        box = [(np.array(chamber.center) + side * half).tolist() for side in (-1, 1)]
+        tables.append(f'[[chamber]]\nname = "{chamber.name}"\nbox = {box}\nair_stiffness = {stiffness}\n')
+    for plane in robot.planes:
+        normal = [float(plane.side) * (a == plane.axis) for a in range(3)]
+        point = [float(plane.offset) * (a == plane.axis) for a in range(3)]
+        friction = '"stick"' if plane.sticks else plane.friction
+        tables.append(f"[[plane]]\npoint = {point}\nnormal = {normal}\nfriction = {friction}\n")
+    return "\n".join(tables)
+
+
+def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, rate: float) -> dict[str, np.ndarray]:
+    """Times [T] s and places of some particles [T, M, 3] m of a trial."""
+    told = robot.simulator()(
+        body,
+        duration=robot.settings.settle + robot.settings.duration,
+        prony=robot.prony,
+        pressure=robot.pressure,
+        gravity=robot.gravity,
+        planes=robot.planes,
+        loads=loads,
+        sample_every=1 / rate,
+        probes=probes,
+    )
+    return {"time": told.time.cpu().double().numpy(), "place": told.position.cpu().double().numpy()}
+
+
+def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: torch.Tensor) -> dict[str, np.ndarray]:
+    """As :func:`simulate`, of what is believed, by these settings."""
+    robot = build(settings)
+    if options.hide == "relaxation":
+        robot.prony = Prony.paper(0)
+    body, _ = without_void(robot.filled(gamma))
+    return simulate(robot, body, [], probes, FINE)
+
+
+def columns(track: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Of a table of markers."""
+    named = {
+        f"m{i}_{a}_m": track["place"][:, i, k] for i in range(track["place"].shape[1]) for k, a in enumerate("xyz")
+    }
+    return {"time_s": track["time"], **named}
+
+
+def spread(places: np.ndarray, count: int) -> list[int]:
+    """Numbers of places [N, 3] that lie far from each other."""
+    chosen = [0]
+    while len(chosen) < min(count, len(places)):
+        near = np.linalg.norm(places[:, None] - places[chosen], axis=-1).min(1)
+        chosen.append(int(near.argmax()))
+    return chosen
+
+
+def main(options: Options) -> dict[str, Any]:
+    """Simulate the robot and write the experiment.
+
+    Returns:
+        What was hidden.
+
+    Raises:
+        ValueError: for a robot that does not exist, or a folder that holds an experiment already.
+        SimulationDiverged: if the simulation breaks down.
+    """
+    fresh(options.out)
+    folder = find(options.robot)
+    base = read_settings(folder / "settings.json", device=options.device)
+    air = base.air_stiffness * (2 if options.hide == "air" else 1)
+    rng, trials, truth = np.random.default_rng(options.seed), {}, {}
+    for name, share in (TRIALS | KEPT).items():
+        timed = {"settle": options.settle, "duration": options.duration, "sample_every": 1 / RATE}
+        settings = dataclasses.replace(base, pressure=share * base.pressure, **timed)
+        robot = build(settings)
+        gamma = load_design(folder / "design.npz", robot.domain).to(settings.target)
+        body, _ = without_void(robot.filled(gamma))
+        body, loads, truth = hidden(options, robot, body, base.air_stiffness)
+        side = torch.nonzero((body.chamber < 0) & (body.position[:, 1] < robot.domain.origin[1] + robot.domain.spacing))
+        side = side.squeeze(-1)
+        probes = side[spread(body.position[side].cpu().numpy(), MARKERS)]
+        track = simulate(robot, body, loads, probes, RATE)
+        track["place"] += options.noise * rng.standard_normal(track["place"].shape)
+        time = torch.arange(0.0, float(track["time"][-1]) + 2e-3, 1e-3, dtype=torch.float64)
+        supply = robot.pressure.at(time).reshape(-1).double().numpy()
+        chamber = robot.domain.chambers[0].name
+        thought = dataclasses.replace(settings, air_stiffness=air)
+        trials[name] = Files(
+            kept=name in KEPT,
+            markers=columns(track),
+            pressure={"time_s": time.numpy(), f"{chamber}_pa": supply},
+            simulated=columns(nominal(options, thought, gamma, probes)) if options.simulated else None,
+        )
+        print(f"{name}: moved by {1e3 * np.abs(track['place'] - track['place'][0]).max():.1f} mm")
+    places = body.position[probes].cpu().numpy().tolist()
+    text = believed(options, robot, air)
+    write(options.out, setup(text, {f"m{i}": at for i, at in enumerate(places)}, options.noise), trials)
+    trimesh.Trimesh(*surface(robot.domain, gamma.cpu().numpy())).export(options.out / "body.stl")
+    (options.out.parent / f"{options.out.name}-truth.json").write_text(json.dumps(truth, indent=2) + "\n")
+    print(options.out)
+    return truth
+
+
+if __name__ == "__main__":
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__))

@@ -1,0 +1,1 @@
+"""Topology optimization: domain, density field, objective, constraint, robot, and the loop."""

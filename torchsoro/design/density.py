@@ -1,0 +1,126 @@
+"""From density to a body: interpolation between void and solid (Eq. 11), chambers filled with gas, void left out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from torchsoro.design.domain import Domain, Region
+from torchsoro.simulation.material import Body, Gas, Solid
+
+
+def simp(gamma: Tensor, *, epsilon: float = 1e-5, power: float = 3.0) -> Tensor:
+    """Interpolation between void and solid, (1 - epsilon) gamma^power + epsilon (Eq. 11).
+
+    Args:
+        gamma: Density field in [0, 1], any shape.
+        epsilon: What the void keeps, relative to the solid.
+        power: 3 in the paper, so that intermediate densities carry little.
+
+    Raises:
+        ValueError: if epsilon is not in (0, 1) or power not positive.
+    """
+    if not 0 < epsilon < 1:
+        raise ValueError(f"epsilon = {epsilon}: wanted more than 0 and less than 1")
+    if not (math.isfinite(power) and power > 0):
+        raise ValueError(f"power = {power}: wanted finite and positive")
+    return (1 - epsilon) * gamma**power + epsilon
+
+
+VOID_DRAG = 1e3  # drag over mass of void, and of the air in a chamber [1/s]
+# Density of air in the total-Lagrangian form [kg/m3]: small, yet large enough that waves of the chambers' fictitious
+# shear modulus are slower than the solid's.
+AIR = 3.0
+
+
+def fill(
+    domain: Domain,
+    gamma: Tensor,
+    *,
+    solid: Solid,
+    gas: Gas | None = None,
+    epsilon: float = 1e-5,
+    power: float = 3.0,
+    void_range: tuple[float, float] | None = None,
+) -> Body:
+    """Fill a domain with material: mass and moduli interpolated by density (Eq. 11), gas in the chambers.
+
+    Stiffening is relative to the modulus, and so does not change with the density.
+
+    Args:
+        domain: Lattice and regions.
+        gamma: Density of every particle [..., N]; differentiable. Gas particles ignore theirs.
+        solid: The printed material.
+        gas: The chambers' gas; the paper's if None.
+        epsilon: See :func:`simp`.
+        power: See :func:`simp`.
+        void_range: Densities between which the stress goes over, smoothly, from the law of void to that of the solid.
+            In a finite-strain law void of next to no stiffness is crushed and turned inside out; the law of void stands
+            that. Void and chambers are slowed down, too, at ``VOID_DRAG`` times the mass of void or of air of at most
+            ``AIR``, lest light outer ends crack like whips and the points of a chamber flutter. None for the solid's
+            law everywhere.
+
+    Returns:
+        A body on gamma's device and in its precision.
+
+    Raises:
+        ValueError: if gamma's last axis is not the particles, or ``void_range`` is not two increasing densities.
+    """
+    if void_range is not None and not 0 <= void_range[0] < void_range[1] <= 1:
+        raise ValueError(f"void_range = {void_range}: wanted two increasing densities from 0 to 1")
+    if gamma.shape[-1] != domain.count:
+        raise ValueError(
+            f"gamma: shape {tuple(gamma.shape)}, wanted [..., {domain.count}], one value for each particle"
+        )
+    gas = gas or Gas()
+    like = {"dtype": gamma.dtype, "device": gamma.device}
+    air = (domain.region == Region.GAS).to(gamma.device)
+    scale = simp(gamma, epsilon=epsilon, power=power)
+    zero = torch.zeros((), **like)
+    void = None if void_range is None else torch.where(air, zero, _void(gamma, *void_range))
+    numbers = torch.tensor([solid.linear_stiffening, solid.quadratic_stiffening], **like)
+    stiffening = torch.where(air[:, None], zero, numbers) if bool(numbers.any()) else None
+    mass = domain.volume * torch.where(air, torch.tensor(gas.density, **like), solid.density * scale)
+    return Body(
+        position=domain.positions.to(**like),
+        mass=mass,
+        volume=torch.full((domain.count,), domain.volume, **like),
+        bulk=torch.where(air, torch.tensor(gas.stiffness, **like), solid.bulk * scale),
+        shear=torch.where(air, torch.tensor(gas.shear, **like), solid.shear * scale),
+        chamber=domain.chamber.to(device=gamma.device, dtype=torch.int32),
+        viscosity=torch.where(air, torch.tensor(gas.viscosity, **like), zero),
+        volume_viscosity=torch.where(air, torch.tensor(gas.volume_viscosity, **like), zero),
+        void_fraction=void,
+        drag=None if void is None else VOID_DRAG * torch.where(air, domain.volume * min(gas.density, AIR), mass * void),
+        stiffening=stiffening,
+    )
+
+
+def without_void(body: Body) -> tuple[Body, Tensor]:
+    """Leave out the particles that follow the law of void alone: they carry next to nothing, but take as long.
+
+    Args:
+        body: As from :func:`fill` with ``void_range``, without a batch.
+
+    Returns:
+        The body of the others, and which those are, bool [N].
+    """
+    if body.void_fraction is None:
+        return body, torch.ones_like(body.chamber, dtype=torch.bool)
+    keep = body.void_fraction < 1
+    return part(body, keep), keep
+
+
+def part(body: Body, keep: Tensor) -> Body:
+    """The particles of a body, without a batch, that are to be kept, bool [N]."""
+    given = {field.name: value[keep] for field in fields(Body) if (value := getattr(body, field.name)) is not None}
+    return replace(body, **given)
+
+
+def _void(gamma: Tensor, low: float, high: float) -> Tensor:
+    """Smooth step from 1 at the lower density to 0 at the upper."""
+    x = ((gamma - low) / (high - low)).clamp(0, 1)
+    return 1 - x * x * (3 - 2 * x)

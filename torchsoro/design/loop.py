@@ -1,0 +1,174 @@
+"""The design loop: simulate, judge, step; Adam on the design field, an augmented Lagrangian for the limit on C."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from torchsoro.design.lagrangian import AugmentedLagrangian
+from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.training import RunFolder
+from torchsoro.errors import SimulationDiverged
+
+Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
+
+
+def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[torch.Tensor, Outcome]:
+    """Simulate the robot's design; where it breaks down or falls over, one nearer to the last that did not, ``good``.
+
+    Falling counts where it is punished: a fallen robot's gradient says nothing about how to stand. If the last of three
+    steps back still falls, that is what is returned.
+
+    Raises:
+        SimulationDiverged: if half, a quarter and an eighth of the way break down as well.
+    """
+    for left in (3, 2, 1, 0):
+        gamma = robot.field()
+        try:
+            outcome = robot(gamma, gravity_scale=gravity_scale)
+            if left == 0 or not fell(robot, outcome):
+                return gamma, outcome
+        except SimulationDiverged:
+            if left == 0:
+                raise
+        with torch.no_grad():
+            robot.field.phi.lerp_(good.to(robot.field.phi), 0.5)
+    raise AssertionError
+
+
+def fell(robot: Robot, outcome: Outcome) -> bool:
+    """Whether the centre of gravity sank by more than a tenth of the height beyond what is allowed."""
+    s = robot.settings
+    return s.upright > 0 and outcome.fall.item() > 0.1 * s.size[2]
+
+
+def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian) -> bool:
+    """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
+
+    As long as none is within the limit, what is gained and what is violated weigh as in the loss of now.
+    """
+    if best is None:
+        return True
+    if violation <= 0 or best["violation"] <= 0:
+        return (violation <= 0, worth) > (best["violation"] <= 0, best["worth"])
+    pairs = (worth, violation), (best["worth"], best["violation"])
+    new, old = (float(lagrangian(torch.tensor(w), torch.tensor(v))) for w, v in pairs)
+    return new < old
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Optimized:
+    """What a design run ends with.
+
+    Attributes:
+        gamma: Density of the best design [N] (see :func:`better`).
+        iteration: Iteration that it is of; None where no iteration had full gravity, and it is the last.
+        metrics: Everything logged, by column (see ``RunFolder.metrics``).
+    """
+
+    gamma: torch.Tensor
+    iteration: int | None
+    metrics: dict[str, list[float]]
+
+
+def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
+    """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
+
+    Travel is a rough function of the design, so that the last design is seldom the best. Designs count from the first
+    iteration with full gravity on.
+
+    Args:
+        robot: What to design.
+        observe: Called with the run folder, the robot, the density and the iteration, after each has been logged.
+
+    Raises:
+        ValueError: if the folder holds another run (see :class:`RunFolder`).
+        SimulationDiverged: if the simulation breaks down on a design and on those nearer to the last good one.
+    """
+    s, field = robot.settings, robot.field
+    if s.target.type == "cpu":
+        torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
+
+    def new_adam() -> torch.optim.Adam:
+        return torch.optim.Adam(field.parameters(), lr=s.learning_rate)
+
+    adam = new_adam()
+    lagrangian = AugmentedLagrangian(
+        previous=0.25 - s.c_max,
+        penalty=s.penalty,
+        window=s.window,
+        tolerance=s.tolerance,
+        growth=s.growth,
+        patience=s.patience,
+    )
+    stopped = False
+    good = field.phi.detach().clone()
+    best: dict[str, Any] | None = None
+    with RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, free=s.free, amend=s.amend) as run:
+        if state := run.load():
+            field.load_state_dict(state["field"])
+            adam.load_state_dict(state["adam"])
+            lagrangian.load_state_dict(state["lagrangian"])
+            stopped, best, good = state["stopped"], state["best"], state["good"]
+        for k in run.progress(run.start if stopped else s.iterations):
+            begin = time.perf_counter()
+            gamma, outcome = simulate(robot, good, s.gravity_scale(k))
+            violation = outcome.intermediate - s.c_max
+            # Adam wants gradients of order one: travel counts in grid cells.
+            worth = (outcome.travel - s.upright * outcome.fall) / robot.domain.cell
+            loss = lagrangian(worth, violation)
+            middle = time.perf_counter()
+            adam.zero_grad()
+            loss.backward()
+            if not fell(robot, outcome):
+                good = field.phi.detach().clone()
+            norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf, error_if_nonfinite=True)
+            if s.gravity_scale(k) == 1.0 and better(worth.item(), violation.item(), best, lagrangian):
+                best = {
+                    "iteration": k,
+                    "worth": worth.item(),
+                    "violation": violation.item(),
+                    "phi": field.phi.detach().clone(),
+                }
+            end = time.perf_counter()
+            adam.step()
+            field.clamp_()
+            event = lagrangian.update(loss.item(), violation.item())
+            if event is not None and event.reset_optimizer:
+                adam = new_adam()
+            stopped = event is not None and event.stop and s.gravity_scale(k) == 1.0
+            center = outcome.center.detach()
+            run.log(
+                k,
+                {
+                    "objective/L": outcome.travel.detach(),
+                    "constraint/C": outcome.intermediate.detach(),
+                    "objective/fall": outcome.fall.detach(),
+                    "mass": outcome.mass.detach(),
+                    **{f"cog/{axis}": center[i] for i, axis in enumerate("xyz")},
+                    "multiplier/C": lagrangian.multiplier,
+                    "penalty/C": lagrangian.penalty,
+                    "grad_norm/phi": norm,
+                    "field/gamma_mean": gamma.detach().mean(),
+                    "simulation/dt": outcome.dt,
+                    "time/forward": middle - begin,
+                    "time/backward": end - middle,
+                    "time/iteration": time.perf_counter() - begin,
+                },
+            )
+            if observe is not None:
+                observe(run, robot, gamma.detach(), k)
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good)
+            if stopped:
+                break
+        if best is not None:
+            with torch.no_grad():
+                field.phi.copy_(best["phi"])
+        chosen = None if best is None else best["iteration"]
+        return Optimized(gamma=field().detach(), iteration=chosen, metrics=run.metrics)

@@ -1,0 +1,236 @@
+"""A pneumatic robot on its ground or between walls: design field, material, actuation and simulator in one module."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from torchsoro.design.density import AIR, fill, without_void
+from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.field import DesignField
+from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
+from torchsoro.design.settings import Settings
+from torchsoro.errors import SimulationDiverged
+from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
+from torchsoro.simulation.contact import Plane, ground
+from torchsoro.simulation.material import Body, Gas, Prony, Solid
+from torchsoro.simulation.material_file import read_material
+from torchsoro.simulation.simulator import Simulator, Trajectory
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Outcome:
+    """What one simulation says of a design.
+
+    Attributes:
+        travel: L, Eq. 13 [m].
+        intermediate: C, Eq. 15.
+        mass: Of solid and chamber wall [kg].
+        fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
+        center: Centre of gravity of the undeformed design domain [3] m, Eq. 14.
+        trajectory: The motion.
+        dt: Substep that it took [s]: the settings' or, where that broke down, a half or a quarter of it.
+    """
+
+    travel: Tensor
+    intermediate: Tensor
+    mass: Tensor
+    fall: Tensor
+    center: Tensor
+    trajectory: Trajectory
+    dt: float
+
+
+class Robot(nn.Module):
+    """A cube with a gas chamber, to be designed; everything follows from the settings.
+
+    Args:
+        settings: See :class:`Settings`.
+        planes: What it moves on.
+        direction: Unit vector of the wanted travel.
+        symmetry: Axes along which left and right are alike.
+
+    Raises:
+        ValueError: for settings that do not fit together, before any simulation.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        planes: tuple[Plane, ...],
+        direction: tuple[float, float, float],
+        symmetry: tuple[str, ...],
+    ) -> None:
+        super().__init__()
+        s = self.settings = settings
+        self.planes, self.direction = planes, direction
+        half = (s.size[0] / 2, s.size[1] / 2)
+        center = (0.0, 0.0, s.size[2] / 2)
+        self.domain = Domain(
+            size=s.size,
+            particles=s.particles,
+            origin=(-half[0], -half[1], 0.0),
+            chambers=(Chamber(name="chamber", center=center, size=s.chamber, wall=s.wall),),
+        )
+        self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
+        self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
+        air = s.air_density
+        if air == "auto":
+            air = AIR if s.formulation == "total" else Gas().density
+        self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=air)
+        self.prony = Prony.paper(s.elements)
+        if s.material is not None:
+            found = read_material(s.material)
+            self.solid, self.prony = found.solid, found.prony
+        self.pressure = _pressure(s)
+        angle = math.atan(s.slope)
+        # Uphill along +x, with the ground kept level: gravity leans back instead.
+        self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
+        self.design = self.domain.design.to(s.target)
+        self.wall = self.domain.wall.to(s.target)
+        # Density scales mass and stiffness alike: the step is good for every design, or for none.
+        everywhere = self.filled(torch.ones(self.domain.count))
+        self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
+
+    def forward(
+        self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False, void: bool = True
+    ) -> Outcome:
+        """Simulate a design and judge it.
+
+        Args:
+            gamma: Density [N].
+            gravity_scale: Share of gravity.
+            everything: Record every particle (for pictures) and not only the centre of gravity.
+            void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
+                in what is recorded, void then moves with the centre of gravity.
+
+        Returns:
+            Travel, intermediate density, mass, centre of gravity, trajectory.
+
+        Raises:
+            SimulationDiverged: if the simulation breaks down.
+        """
+        s = self.settings
+        body = self.filled(gamma)
+        solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
+        weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void)
+        end = s.settle + s.duration
+        distance = travel(
+            trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
+        )
+        height = trajectory.center_of_gravity[:, 2]
+        return Outcome(
+            travel=distance,
+            intermediate=intermediate_density(gamma, self.design),
+            mass=total_mass(solid),
+            fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
+            center=center_of_gravity(body.position, weight),
+            trajectory=trajectory,
+            dt=trajectory.dt,
+        )
+
+    def filled(self, gamma: Tensor) -> Body:
+        """The domain filled with a density [N]."""
+        s = self.settings
+        return fill(
+            self.domain,
+            gamma,
+            solid=self.solid,
+            gas=self.gas,
+            epsilon=s.epsilon,
+            power=s.power,
+            void_range=s.void_range,
+        )
+
+    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool, void: bool) -> Trajectory:
+        """Simulate; a design on which the step is too long is simulated again with half the step."""
+        s = self.settings
+        rest, keep = body.position, torch.ones_like(self.design)
+        if not void:
+            body, keep = without_void(body)
+            weight = weight[keep]
+        for halving in range(s.halvings + 1):
+            try:
+                trajectory = self.simulator(2**halving)(
+                    body,
+                    duration=s.settle + s.duration,
+                    prony=self.prony,
+                    pressure=self.pressure,
+                    gravity=tuple(gravity_scale * g for g in self.gravity),
+                    planes=self.planes,
+                    sample_every=s.sample_every,
+                    weight=weight,
+                    probes=torch.arange(len(body.chamber)) if everything else None,
+                )
+                return self._with_void(trajectory, rest, keep) if everything and not void else trajectory
+            except SimulationDiverged:
+                if halving == s.halvings:
+                    raise
+        raise AssertionError
+
+    def _with_void(self, trajectory: Trajectory, rest: Tensor, keep: Tensor) -> Trajectory:
+        """Every particle's motion [S, N, 3]: of void, which was left out, that of the centre of gravity."""
+        moved = trajectory.center_of_gravity - trajectory.center_of_gravity[0]
+        position, velocity = rest + moved[:, None], torch.zeros_like(rest).expand(len(moved), -1, -1).clone()
+        position[:, keep], velocity[:, keep] = trajectory.position, trajectory.velocity
+        probes = torch.arange(len(rest), device=rest.device)
+        return replace(trajectory, position=position, velocity=velocity, probes=probes)
+
+    def simulator(self, parts: int = 1) -> Simulator:
+        """A simulator, in whose box it moves, that takes a part of the usual step."""
+        s = self.settings
+        half = (s.size[0] / 2, s.size[1] / 2)
+        return Simulator(
+            cell=self.domain.cell,
+            dt="auto" if s.dt == "auto" else s.dt / parts,
+            safety=0.9 / parts,
+            low=(-half[0] - s.room, -half[1] - s.room, -s.room),
+            high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
+            transfer=s.transfer,
+            formulation=s.formulation,
+            memory_budget=int(s.memory * 2**30) or None,
+        )
+
+
+def build(settings: Settings) -> Robot:
+    """The robot that the settings name."""
+    return {"walker": walker, "climber": climber}[settings.robot](settings)
+
+
+def walker(settings: Settings) -> Robot:
+    """A robot on the ground that is to travel along +x, symmetric left and right (y)."""
+    planes = (ground(0.0, friction=settings.friction),)
+    return Robot(settings, planes=planes, direction=(1.0, 0.0, 0.0), symmetry=("y",))
+
+
+def climber(settings: Settings) -> Robot:
+    """A robot between two walls, normal to x, that is to travel upward, symmetric about both vertical mid planes."""
+    half = settings.wall_distance / 2
+    if settings.wall_distance < settings.size[0]:
+        raise ValueError(f"wall_distance = {settings.wall_distance} m: wanted at least the body's {settings.size[0]} m")
+    planes = (
+        Plane(axis=0, offset=-half, side=1, friction=settings.friction),
+        Plane(axis=0, offset=half, side=-1, friction=settings.friction),
+    )
+    return Robot(settings, planes=planes, direction=(0.0, 0.0, 1.0), symmetry=("x", "y"))
+
+
+def _pressure(s: Settings) -> Waveform:
+    """Gauge pressure from the start of the simulation: at rest while it settles, then measured or modelled."""
+    if s.pressure_file is None:
+        return square_wave(
+            amplitude=s.pressure,
+            frequency=s.frequency,
+            duty=s.duty,
+            rise=s.rise,
+            fall=s.fall,
+            start=s.settle,
+            end=s.settle + s.duration,
+        )
+    measured = read_pressure_csv(s.pressure_file)
+    return Waveform(time=measured.time - measured.time[0] + s.settle, pressure=measured.pressure)

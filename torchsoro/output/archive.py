@@ -1,0 +1,207 @@
+"""Designs on disk: a density in a compact file, and a finished robot that can be taken up again from its folder."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import typing
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.design.domain import Domain
+from torchsoro.design.settings import Settings
+from torchsoro.storage import atomic_write
+
+DESIGNS = Path(__file__).resolve().parents[1] / "designs"  # robots that come with the package
+
+
+def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
+    """Write a density with its lattice.
+
+    Args:
+        path: An .npz file, written as a whole; its folder is made if it is missing.
+        domain: The lattice.
+        gamma: Density [N], 0 (void) to 1 (material).
+
+    Returns:
+        The density as it is stored, in float16, in the type and on the device it came in: what to judge and to show.
+
+    Raises:
+        ValueError: if the density is not one number for each particle.
+    """
+    if gamma.shape != (domain.count,):
+        raise ValueError(f"gamma: got shape {tuple(gamma.shape)}, wanted one density per particle, ({domain.count},)")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stored = gamma.detach().half()
+    with atomic_write(path) as file:
+        np.savez_compressed(
+            file,
+            gamma=stored.cpu().numpy(),
+            shape=np.array(domain.shape),
+            spacing=domain.spacing,
+            origin=np.array(domain.origin),
+        )
+    return stored.to(gamma)
+
+
+def load_design(path: Path, domain: Domain) -> Tensor:
+    """Read what :func:`save_design` wrote.
+
+    Args:
+        path: The file.
+        domain: The lattice that it has to be on.
+
+    Returns:
+        Density [N], float32.
+
+    Raises:
+        ValueError: if there is no such file, it is no design, or it is on another lattice.
+    """
+    if not path.is_file():
+        raise ValueError(f"path: there is no file {path}, wanted a design (.npz)")
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            gamma, shape = stored["gamma"], tuple(int(n) for n in stored["shape"])
+            spacing = float(stored["spacing"])
+        if gamma.shape != (math.prod(shape),):
+            raise ValueError(f"densities of shape {gamma.shape} for {shape} particles")
+    except Exception as error:  # a damaged archive can fail in any way
+        raise ValueError(
+            f"path: {path} is no design ({error}), wanted an .npz with gamma, shape and spacing"
+        ) from error
+    if shape != domain.shape or abs(spacing / domain.spacing - 1) > 1e-6:
+        raise ValueError(
+            f"path: {path} is on {shape} particles {spacing:g} m apart, wanted {domain.shape} at {domain.spacing:g} m"
+        )
+    return torch.from_numpy(gamma.astype(np.float32))
+
+
+def kept_iterations(folder: Path) -> list[int]:
+    """Iterations whose designs a run or an archived robot has kept."""
+    packed = folder / "shapes.npz"
+    if packed.is_file():
+        with np.load(packed, allow_pickle=False) as stored:
+            return stored["iteration"].tolist()
+    return sorted(int(path.stem) for path in (folder / "shapes").glob("*.npz") if path.stem.isdigit())
+
+
+def load_shape(folder: Path, domain: Domain, iteration: int) -> Tensor:
+    """Read the design of an iteration: from a run's ``shapes`` folder, or from an archived robot's ``shapes.npz``.
+
+    Args:
+        folder: Of the run or of the archived robot.
+        domain: The lattice.
+        iteration: One that was kept.
+
+    Returns:
+        Density [N], float32; of an archived robot to 1/255.
+
+    Raises:
+        ValueError: if the iteration was not kept (names those that were), or is on another lattice.
+    """
+    packed, kept = folder / "shapes.npz", kept_iterations(folder)
+    if iteration not in kept:
+        raise ValueError(f"iteration: got {iteration}, {folder} holds {', '.join(map(str, kept)) or 'none'}")
+    if not packed.is_file():
+        return load_design(folder / "shapes" / f"{iteration:05d}.npz", domain)
+    with np.load(packed, allow_pickle=False) as stored:
+        gamma = stored["gamma"]
+    found = torch.from_numpy(gamma[kept.index(iteration)].astype(np.float32) / 255)
+    if found.shape != (domain.count,):
+        raise ValueError(f"folder: {packed} holds {len(found)} particles, wanted {domain.count}")
+    return found
+
+
+def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) -> None:
+    """Copy what is worth keeping of a finished run: design, some early designs, settings, metrics, result, summary.
+
+    Args:
+        run: The run's folder.
+        folder: Where to; made if it is missing.
+        domain: The run's lattice.
+        iterations: Early designs to keep; those the run does not have are left out.
+
+    Raises:
+        ValueError: if the run is not finished (it has no design or no summary), or its pressure or material is in a
+            file elsewhere.
+    """
+    files = ("design.npz", "metrics.csv", "summary.png", "settings.json", "result.json")
+    if missing := [name for name in files if not (run / name).is_file()]:
+        raise ValueError(f"run: {run} has no {', '.join(missing)}, wanted a finished run")
+    held = read_settings(run / "settings.json")
+    if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
+        raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
+    folder.mkdir(parents=True, exist_ok=True)
+    files += ("amendments.json",) if (run / "amendments.json").is_file() else ()
+    for name in files:
+        with atomic_write(folder / name) as file:
+            file.write((run / name).read_bytes())
+    kept = [k for k in iterations if (run / "shapes" / f"{k:05d}.npz").is_file()]
+    early = [load_design(run / "shapes" / f"{k:05d}.npz", domain) for k in kept]
+    with atomic_write(folder / "shapes.npz") as file:
+        gamma = np.stack([(255 * g).round().to(torch.uint8).numpy() for g in early]) if early else np.zeros((0, 0))
+        np.savez_compressed(file, iteration=np.array(kept, dtype=np.int64), gamma=gamma)
+
+
+def read_settings(path: Path, **changes: object) -> Settings:
+    """Read the settings of a run.
+
+    Args:
+        path: Its ``settings.json``.
+        **changes: Settings to replace.
+
+    Returns:
+        The settings; names that the file does not have keep their defaults.
+
+    Raises:
+        ValueError: if there is no such file, it is damaged, or a name in it is none of the settings.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        assert isinstance(found, dict)
+    except (OSError, ValueError, AssertionError) as error:
+        raise ValueError(f"path: {path} holds no settings ({error}), wanted the settings.json of a run") from error
+    kinds = typing.get_type_hints(Settings)
+    unknown = sorted(set(found) - set(kinds))
+    if unknown:
+        raise ValueError(f"path: {path} has {', '.join(unknown)}, wanted names of the settings only")
+    values = {name: _typed(kinds[name], value) for name, value in found.items()}
+    return dataclasses.replace(Settings(), **{**values, **changes})
+
+
+def _typed(kind: object, value: object) -> object:
+    """What JSON keeps of a value, in its own type."""
+    if isinstance(value, list):
+        return tuple(value)
+    options = (kind, *typing.get_args(kind))
+    return Path(value) if isinstance(value, str) and Path in options else value
+
+
+def find(robot: str) -> Path:
+    """The folder of an archived robot or of a run.
+
+    Raises:
+        ValueError: if there is none.
+    """
+    for folder in (DESIGNS / robot, Path(robot)):
+        if (folder / "design.npz").is_file():
+            return folder
+    raise ValueError(
+        f"robot = {robot!r}: wanted {', '.join(names()) or 'an archived robot'}, or a finished run's folder"
+    )
+
+
+def read_result(folder: Path) -> dict[str, float | None]:
+    """What the design run measured; nothing if it was not written."""
+    path = folder / "result.json"
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def names() -> list[str]:
+    """The archived robots."""
+    return sorted(path.parent.name for path in DESIGNS.glob("*/design.npz"))

@@ -1,0 +1,205 @@
+"""What a finished run leaves for people: the design, a printable part, a movie of the gait, a page that sums it up."""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchsoro.design.loop import optimize
+from torchsoro.design.objective import mean_stride
+from torchsoro.design.robot import Robot
+from torchsoro.design.settings import Settings
+from torchsoro.design.training import RunFolder
+from torchsoro.output.archive import save_design
+from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
+from torchsoro.output.picture import movie, shape_image, summary
+from torchsoro.storage import atomic_write
+
+
+def design(robot: Robot, name: str) -> dict[str, float]:
+    """Run the design loop, with the shape in TensorBoard as it grows, and write what came out of it.
+
+    Args:
+        robot: What to design; ``robot.settings.out`` is the folder.
+        name: Names the movie and the summary.
+
+    Returns:
+        The final metrics (see :func:`show`), the number of iterations, and their time [s]: median of forward and
+        backward, and in all. Also written to ``result.json``.
+
+    Raises:
+        ValueError: see :func:`torchsoro.design.loop.optimize`; also if the design has no connected body to print.
+    """
+    out = robot.settings.out
+    optimized = optimize(robot, observe)
+    history = optimized.metrics
+    found = {
+        **deliver(out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
+        "iterations": len(history["iteration"]),
+        "forward": statistics.median(history["time/forward"]),
+        "backward": statistics.median(history["time/backward"]),
+        "seconds": sum(history["time/iteration"]),
+    }
+    with atomic_write(out / "result.json") as file:
+        plain = {name: None if math.isnan(value) else value for name, value in found.items()}
+        file.write((json.dumps(plain, indent=2) + "\n").encode())
+    return found
+
+
+def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
+    """Show the shape in TensorBoard, and keep the design, as often as the settings say."""
+    if iteration % robot.settings.picture_every == 0:
+        show_shape(run, robot, gamma, iteration)
+    if iteration % robot.settings.shape_every == 0:
+        save_design(run.path / "shapes" / f"{iteration:05d}.npz", robot.domain, gamma)
+
+
+def report(result: dict[str, float], settings: Settings) -> str:
+    """What :func:`design` returned, in one sentence."""
+    return (
+        f"L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
+        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g after {result['iterations']} iterations "
+        f"of {result['forward']:.1f} s forward and {result['backward']:.1f} s backward, "
+        f"{result['seconds']:.0f} s in all; everything is in {settings.out}"
+    )
+
+
+def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
+    """Put the present shape into TensorBoard, as a picture and as a mesh."""
+    density = gamma.detach().cpu().numpy()
+    vertices, faces = surface(robot.domain, density)
+    run.log_mesh("shape/mesh", vertices, faces, None, iteration)
+    title = f"iteration {iteration}"
+    picture = shape_image(domain=robot.domain, gamma=density, planes=drawn_planes(robot), title=title)
+    run.log_image("shape/picture", picture, iteration)
+
+
+def drawn_planes(robot: Robot) -> tuple[tuple[int, float, int], ...]:
+    """The robot's planes as pictures take them: axis, place, free side."""
+    return tuple((plane.axis, float(plane.offset), plane.side) for plane in robot.planes)
+
+
+def deliver(
+    path: Path,
+    robot: Robot,
+    gamma: torch.Tensor,
+    history: Mapping[str, Sequence[float]],
+    *,
+    name: str,
+    chosen: int | None = None,
+) -> dict[str, float]:
+    """Write the design of a finished run into its folder, as ``design.npz``, and show it there: see :func:`show`.
+
+    Args:
+        path: The folder.
+        robot: The robot.
+        gamma: Its density [N]; judged as it is stored, with three decimals.
+        history: Metrics of the run, for the summary.
+        name: Of the robot: names the movie and the page.
+        chosen: Iteration that the design is of; the last if None.
+
+    Returns:
+        What :func:`show` measured.
+
+    Raises:
+        ValueError: if the design has no connected body to print; the design and the movie are written before.
+    """
+    gamma = save_design(path / "design.npz", robot.domain, gamma)
+    return show(path, robot, gamma, history=history, chosen=chosen, name=name)[0]
+
+
+@torch.no_grad()
+def show(
+    path: Path,
+    robot: Robot,
+    gamma: torch.Tensor,
+    *,
+    name: str,
+    history: Mapping[str, Sequence[float]] | None = None,
+    chosen: int | None = None,
+    void: bool = True,
+) -> tuple[dict[str, float], Part]:
+    """Simulate a gait with every particle recorded, and write what people look at and print.
+
+    Files: ``<name>.mp4``, with a history ``summary.png``, and ``shape.stl`` with ``shape.json`` (what the part weighs
+    and how thin it gets).
+
+    Args:
+        path: Folder to write to.
+        robot: The robot.
+        gamma: Its density [N].
+        name: Of the robot: names the movie and the page.
+        history: Metrics of its run.
+        chosen: Iteration of that run that the design is of; the last if None.
+        void: Simulate void, too.
+
+    Returns:
+        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg]; and the printable part.
+
+    Raises:
+        ValueError: if the design has no connected body to print; the movie is written before.
+    """
+    s = robot.settings
+    outcome = robot(gamma, everything=True, void=void)
+    density = gamma.cpu().numpy()
+    trajectory = outcome.trajectory
+    frames = trajectory.position.cpu().numpy()
+    time = trajectory.time.cpu().double().numpy()
+    way = trajectory.center_of_gravity.cpu().double().numpy() @ np.array(robot.direction)
+    drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
+    supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
+    shown = {
+        "domain": robot.domain,
+        "gamma": density,
+        "planes": drawn_planes(robot),
+        "direction": robot.direction,
+        "tilt": math.degrees(math.atan(s.slope)),
+    }
+    movie(
+        path / f"{name}.mp4",
+        **shown,
+        frames=frames[drawn],
+        time=time[drawn],
+        pressure=supply[drawn],
+        fps=20,
+        title=f"{name}, {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
+    )
+    if history is not None:
+        summary(
+            path / "summary.png",
+            **shown,
+            frames=frames,
+            time=time,
+            pressure=supply,
+            history=history,
+            chosen=chosen,
+            limit=s.c_max,
+            period=1 / s.frequency,
+            title=f"{name} ({s.preset}): L = {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
+        )
+    part = print_part(robot, density)
+    part.save(path / "shape.stl")
+    with atomic_write(path / "shape.json") as file:
+        file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
+    found = {
+        "L": float(outcome.travel),
+        "stride": mean_stride(way, time, start=s.settle, period=1 / s.frequency),
+        "C": float(outcome.intermediate),
+        "mass": float(outcome.mass),
+    }
+    return found, part
+
+
+def print_part(robot: Robot, density: np.ndarray) -> Part:
+    """The printable part, with an air port at the rear: against the travel, or downward for a climber."""
+    s = robot.settings
+    rear = tuple(-d for d in robot.direction)
+    cavity = min(c - 2 * s.wall for c in s.chamber)
+    port = AirPort(direction=(rear[0], rear[1], rear[2]), diameter=s.port or 0.4 * cavity)
+    return fabricate(robot.domain, density, density=s.density, offset=s.offset, port=port)

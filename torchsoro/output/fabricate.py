@@ -1,0 +1,379 @@
+"""From the optimised density to a part for the printer.
+
+The density on the particle lattice becomes one level-set function on a finer grid. Chamber wall, cavity, air port and
+thickness offset are set operations on that function, and the surface is extracted once at the end. No triangle mesh is
+ever cut by another one, so the result cannot leak.
+
+The density between the particles is the quadratic B-spline of their values, the one that the simulator transfers with.
+It keeps flat faces and sheets one particle thick at their true thickness. Wall and cavity are taken from the nearest
+particle, so their planes lie exactly on the region boundaries, and the outside of the body lies on the box, half a
+spacing outside of the outermost particle centres.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from scipy import ndimage
+
+from torchsoro.output import levelset
+from torchsoro.output.levelset import as_array
+from torchsoro.storage import atomic_write
+
+if TYPE_CHECKING:
+    from torchsoro.design.domain import Chamber, Domain
+
+_SUFFIXES = (".stl", ".ply", ".obj")
+_AXES = "x, y, z of the simulation; z up"
+
+
+@dataclass(frozen=True, kw_only=True)
+class AirPort:
+    """A straight round hole from the middle of each chamber to the outside.
+
+    Attributes:
+        direction: unit vector along a coordinate axis, from the chamber outwards; (-1, 0, 0) is the rear of the walker.
+        diameter: of the hole [m].
+    """
+
+    direction: tuple[float, float, float] = (-1.0, 0.0, 0.0)
+    diameter: float
+
+    def __post_init__(self) -> None:
+        """Refuse what is not an axis or not a hole."""
+        if sorted(abs(float(c)) for c in self.direction) != [0.0, 0.0, 1.0]:
+            raise ValueError(f"direction: got {self.direction}, want a unit vector along an axis, such as (-1, 0, 0)")
+        if not (math.isfinite(self.diameter) and self.diameter > 0):
+            raise ValueError(f"diameter: got {self.diameter} m, want a positive length")
+
+    @property
+    def axis(self) -> int:
+        """The coordinate axis of the hole (0, 1 or 2)."""
+        return int(np.argmax(np.abs(self.direction)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartReport:
+    """What the printer's operator wants to know about a part.
+
+    Attributes:
+        mass_g: volume times density [g].
+        volume_mm3: volume of the material [mm^3].
+        size_mm: edge lengths of the bounding box [mm].
+        cavity_volume_mm3: volume of the chambers' cavities at rest, without the port [mm^3].
+        port_open: whether air can flow from every cavity to the outside.
+        islands_removed: volumes of the isolated pieces that were left out, largest first [mm^3].
+        enclosed_voids: volumes of other hollows without an opening, which would trap resin, largest first [mm^3].
+        thinnest_wall_mm: the thinnest wall by ray casting [mm]: from each surface triangle straight inwards to the
+            next surface. Only
+            pairs of surfaces within 45 degrees of parallel count (a sharp rim is not a wall), and the thinnest 0.1 %
+            of the area are left out as noise of the triangulation. NaN if nothing counts.
+        thickness_percentiles_mm: the same thickness by surface area: percent to mm.
+        watertight: every edge has two triangles.
+        manifold: watertight, consistently wound and with positive volume.
+        bodies: number of separate solid pieces.
+        euler_number: of the surface; 2 for a body that is a ball or a bottle, 2 more for each closed hollow, 2 less
+            for each handle.
+        voxel_mm: edge length of the grid that the surface was extracted on [mm].
+        units: of the mesh.
+        axes: of the mesh.
+    """
+
+    mass_g: float
+    volume_mm3: float
+    size_mm: tuple[float, float, float]
+    cavity_volume_mm3: float
+    port_open: bool
+    islands_removed: tuple[float, ...]
+    enclosed_voids: tuple[float, ...]
+    thinnest_wall_mm: float
+    thickness_percentiles_mm: dict[int, float]
+    watertight: bool
+    manifold: bool
+    bodies: int
+    euler_number: int
+    voxel_mm: float
+    units: str = "mm"
+    axes: str = _AXES
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, for a JSON file."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        """A few lines for the terminal."""
+        islands = ", ".join(f"{v:.3g}" for v in self.islands_removed) or "none"
+        lines = [
+            f"{' x '.join(f'{s:.2f}' for s in self.size_mm)} {self.units} ({self.axes})",
+            f"mass {self.mass_g:.2f} g, material {self.volume_mm3:.0f} mm3, cavity {self.cavity_volume_mm3:.0f} mm3",
+            f"thinnest wall {self.thinnest_wall_mm:.2f} mm (ray casting)",
+            f"isolated pieces removed [mm3]: {islands}",
+            f"watertight: {self.watertight}, manifold: {self.manifold}, bodies: {self.bodies}, "
+            f"air port open: {self.port_open}",
+        ]
+        if self.enclosed_voids:
+            lines.append(f"closed hollows that trap resin [mm3]: {', '.join(f'{v:.3g}' for v in self.enclosed_voids)}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Part:
+    """A printable part.
+
+    Attributes:
+        mesh: closed surface in mm, z up, in the coordinates of the simulation.
+        report: mass, thickness and what was checked.
+    """
+
+    mesh: trimesh.Trimesh = field(repr=False)
+    report: PartReport
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the mesh as .stl (binary, units in the header), .ply or .obj; the file is there whole or not at all.
+
+        Raises:
+            ValueError: for another suffix or a folder that does not exist.
+        """
+        path = Path(path)
+        if path.suffix.lower() not in _SUFFIXES:
+            raise ValueError(f"path: got {str(path)!r}, want a suffix among {', '.join(_SUFFIXES)}")
+        if not path.parent.is_dir():
+            raise ValueError(f"path: got {str(path)!r}, want a folder that exists")
+        data: Any = (
+            _stl(self.mesh) if path.suffix.lower() == ".stl" else self.mesh.export(file_type=path.suffix[1:].lower())
+        )
+        data = data.encode() if isinstance(data, str) else data
+        with atomic_write(path) as file:
+            file.write(data)
+        return path
+
+
+def fabricate(
+    domain: Domain,
+    gamma: Any,
+    *,
+    density: float,
+    level: float = 0.5,
+    offset: float = 0.0,
+    port: AirPort | None = None,
+    minimum_thickness: float | None = None,
+    refine: int | None = None,
+) -> Part:
+    """Turn a density field into one closed, printable body.
+
+    The chamber wall is always solid and the cavity always hollow, whatever ``gamma`` says there. Pieces that are not
+    connected to the
+    chamber wall are removed and reported (the paper removed one by hand). The offset grows the outer surface along
+    its normal, as the paper did for the climber by 0.4375 mm; the cavity keeps its size.
+
+    Args:
+        domain: the lattice, with wall and gas.
+        gamma: density per particle, 0 (void) to 1 (material), shape [N].
+        density: of the material [kg/m^3].
+        level: density at the surface; the paper uses 0.5.
+        offset: how far the outer surface is moved outwards [m].
+        port: the air port; None leaves the cavity closed.
+        minimum_thickness: the thinnest wall that the printer can make [m]; None only reports it.
+        refine: grid points per particle and axis; None takes about 60 along the longest side, and at least 2.
+
+    Returns:
+        The part, in mm.
+
+    Raises:
+        ValueError: for arguments out of range, for a design without a connected body on the chamber wall, for a port
+            that does not fit, and for a wall below ``minimum_thickness``.
+    """
+    values = _density(domain, gamma)
+    _positive("density", density, "kg/m3")
+    _check_level(level)
+    if not (math.isfinite(offset) and offset >= 0):
+        raise ValueError(f"offset: got {offset} m, want 0 or a positive length")
+    if minimum_thickness is not None:
+        _positive("minimum_thickness", minimum_thickness, "m")
+    if refine is not None and not (isinstance(refine, int) and 2 <= refine <= 32):
+        raise ValueError(f"refine: got {refine}, want a whole number from 2 to 32")
+    if port is not None:
+        _check_port(domain, port)
+    spacing = float(domain.spacing)
+    if refine is None:
+        refine = max(2, math.ceil(60 / max(domain.particles)))
+        if port is not None:  # at least four grid points across the hole
+            refine = min(32, max(refine, math.ceil(4 * spacing / port.diameter)))
+    step = spacing / refine
+    if port is not None and port.diameter < 2 * step:
+        raise ValueError(
+            f"port.diameter: got {port.diameter} m, want at least {2 * step:.3g} m, two points of the grid"
+        )
+
+    pad = 2 + math.ceil(offset / step)
+    body, gas = levelset.body_function(domain, values, level, refine, pad)
+    start = np.asarray(domain.origin, dtype=float) - (pad - 0.5) * step  # position of grid point (0, 0, 0)
+    fine = levelset.nearest(domain, as_array(domain.wall), refine, pad)
+    body, islands = levelset.keep_connected(body, fine, step)
+    _check_design(domain, values, level, body, refine, pad)
+    if offset > 0:
+        body = levelset.grow(body, offset, step)
+    # Equal and opposite on both sides of the cavity's planes, so that the surface lies on them.
+    rim = ndimage.binary_dilation(gas, np.ones((3, 3, 3), dtype=bool)) & ~gas
+    shape = np.where(gas, -step / 2, np.where(rim, np.minimum(body, step / 2), body))
+    if port is not None:
+        shape = np.minimum(shape, _port(domain, port, shape.shape, start, step))
+        shape, cut = levelset.keep_connected(shape, fine & ~(shape < 0), step)  # the hole may have cut off a rim
+        islands = islands + cut
+
+    mesh = levelset.march(shape, start, step)
+    empty, _ = levelset.pieces(shape <= 0)
+    is_open = bool(gas.any() and (empty[gas] == empty[0, 0, 0]).all())
+    if port is not None and not is_open:
+        raise ValueError(f"port: got {port}, want one that opens every cavity to the outside")
+    hollows = np.bincount(empty.ravel())
+    known = {0, int(empty[0, 0, 0]), *np.unique(empty[gas]).tolist()}
+    thickness, area = levelset.thickness_by_rays(mesh, shape, start, step)
+    thinnest = levelset.quantile(thickness, area, 0.001)
+    if minimum_thickness is not None and thinnest < minimum_thickness * 1e3 * (1 - 1e-6):
+        raise ValueError(
+            f"minimum_thickness: got a thinnest wall of {thinnest * 1e-3:.3g} m, "
+            f"want at least {minimum_thickness:.3g} m; "
+            f"an offset of {offset + minimum_thickness - thinnest * 1e-3:.3g} m would make it so"
+        )
+    shells = mesh.split(only_watertight=False)
+    volume = float(mesh.volume)
+    watertight = bool(mesh.is_watertight)
+    report = PartReport(
+        mass_g=volume * 1e-9 * density * 1e3,
+        volume_mm3=volume,
+        size_mm=(float(mesh.extents[0]), float(mesh.extents[1]), float(mesh.extents[2])),
+        cavity_volume_mm3=float(as_array(domain.gas).sum()) * (spacing * 1e3) ** 3,
+        port_open=is_open,
+        islands_removed=tuple(sorted(islands, reverse=True)),
+        enclosed_voids=tuple(
+            sorted((float(n) * (step * 1e3) ** 3 for i, n in enumerate(hollows) if i not in known), reverse=True)
+        ),
+        thinnest_wall_mm=thinnest,
+        thickness_percentiles_mm={p: levelset.quantile(thickness, area, p / 100) for p in (1, 5, 25, 50, 75, 95)},
+        watertight=watertight,
+        manifold=watertight and bool(mesh.is_winding_consistent) and volume > 0,
+        bodies=sum(1 for shell in shells if shell.volume > 0),
+        euler_number=int(mesh.euler_number),
+        voxel_mm=step * 1e3,
+    )
+    if not report.manifold or report.bodies != 1:
+        raise RuntimeError(f"the surface is not one closed body; please report this with the density field:\n{report}")
+    return Part(mesh=mesh, report=report)
+
+
+def surface(
+    domain: Domain, gamma: Any, level: float = 0.5, *, refine: int | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """The outer surface of a design at rest, for pictures: no port, no check, islands kept, cavity left out.
+
+    Args:
+        domain: the lattice.
+        gamma: density per particle, shape [N].
+        level: density at the surface.
+        refine: grid points per particle and axis; None takes 2 for a coarse lattice and 1 for a fine one.
+
+    Returns:
+        Vertices [V, 3] in m, in the coordinates of the simulation, and triangles [F, 3], counter-clockwise seen from
+        outside.
+
+    Raises:
+        ValueError: for a density of the wrong shape, or not finite, and for a level outside (0, 1).
+    """
+    values = _density(domain, gamma)
+    _check_level(level)
+    refine = refine or (2 if max(domain.particles) <= 24 else 1)
+    body, _ = levelset.body_function(domain, values, level, refine, 2)
+    if not (body > 0).any():
+        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    step = float(domain.spacing) / refine
+    mesh = levelset.march(body, np.asarray(domain.origin, dtype=float) - 1.5 * step, step)
+    return np.asarray(mesh.vertices) * 1e-3, np.asarray(mesh.faces)
+
+
+def _positive(name: str, value: float, unit: str) -> None:
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name}: got {value} {unit}, want a positive number")
+
+
+def _check_level(level: float) -> None:
+    if not 0 < level < 1:
+        raise ValueError(f"level: got {level}, want a number between 0 and 1")
+
+
+def _density(domain: Domain, gamma: Any) -> np.ndarray:
+    values = as_array(gamma).astype(np.float64)
+    if values.shape != (domain.count,):
+        raise ValueError(f"gamma: got shape {values.shape}, want one density per particle, ({domain.count},)")
+    if not np.isfinite(values).all():
+        raise ValueError(f"gamma: got {int((~np.isfinite(values)).sum())} numbers that are not finite, want 0 to 1")
+    if values.min() < -1e-3 or values.max() > 1 + 1e-3:
+        raise ValueError(f"gamma: got {values.min():.4g} to {values.max():.4g}, want 0 to 1")
+    return values
+
+
+def _check_port(domain: Domain, port: AirPort) -> None:
+    if not domain.chambers:
+        raise ValueError("port: got one for a domain without a chamber, want None")
+    across = [a for a in range(3) if a != port.axis]
+    for chamber in domain.chambers:
+        room = min(chamber.size[a] for a in across) - 2 * chamber.wall
+        if port.diameter > room:
+            raise ValueError(
+                f"port.diameter: got {port.diameter} m, want at most {room:.4g} m, the cavity of {chamber.name!r}"
+            )
+        for other in domain.chambers:
+            if other is not chamber and _runs_into(chamber, other, port):
+                raise ValueError(
+                    f"port.direction: got {port.direction}, by which the port of {chamber.name!r} "
+                    f"runs into chamber {other.name!r}"
+                )
+
+
+def _runs_into(chamber: Chamber, other: Chamber, port: AirPort) -> bool:
+    apart = [abs(other.center[a] - chamber.center[a]) for a in range(3)]
+    beside = any(apart[a] > (other.size[a] + port.diameter) / 2 for a in range(3) if a != port.axis)
+    return not beside and (other.center[port.axis] - chamber.center[port.axis]) * port.direction[port.axis] > 0
+
+
+def _check_design(domain: Domain, values: np.ndarray, level: float, body: np.ndarray, refine: int, pad: int) -> None:
+    """Refuse a design of which nothing hangs on the chamber wall (or, without a chamber, a design that is nothing)."""
+    design = as_array(domain.design)
+    if not design.any():
+        return
+    inner = body[pad:-pad, pad:-pad, pad:-pad] > 0
+    nx, ny, nz = domain.particles
+    kept = inner.reshape(nx, refine, ny, refine, nz, refine).any(axis=(1, 3, 5)).ravel()
+    if not (kept & design & (values >= level)).any():
+        place = "is connected to the chamber wall" if domain.chambers else "is there"
+        raise ValueError(
+            f"gamma: got no connected body: of {int((design & (values >= level)).sum())} design particles at or above "
+            f"level {level} none {place}, want a design that hangs together (more iterations, or a lower level)"
+        )
+
+
+def _port(domain: Domain, port: AirPort, shape: tuple[int, ...], start: np.ndarray, step: float) -> np.ndarray:
+    """Distance to the ports, positive outside of them [m]."""
+    result = np.full(shape, np.inf)
+    axes = [start[a] + step * np.arange(shape[a]) for a in range(3)]
+    for chamber in domain.chambers:
+        x = np.meshgrid(*[axes[a] - chamber.center[a] for a in range(3)], indexing="ij", sparse=True)
+        radial = np.sqrt(sum(x[a] ** 2 for a in range(3) if a != port.axis)) - port.diameter / 2
+        ahead = x[port.axis] * port.direction[port.axis] >= 0
+        result = np.minimum(result, np.where(ahead, radial, np.inf))
+    return result
+
+
+def _stl(mesh: trimesh.Trimesh) -> bytes:
+    """Binary STL with units and axes in its header."""
+    record = np.zeros(len(mesh.faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    record["normal"] = mesh.face_normals
+    record["corners"] = mesh.triangles
+    header = f"torchsoro; units mm; axes {_AXES}".encode("ascii").ljust(80)
+    return header + np.uint32(len(record)).astype("<u4").tobytes() + record.tobytes()

@@ -1,0 +1,1 @@
+"""Experiments on disk: the setup that is believed, and recorded marker positions."""

@@ -1,0 +1,219 @@
+"""What may have been left out of the body: stiffness, viscosity, mass, and what hangs on it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
+from torchsoro.sim2real.twin.scenario import Scenario, Tie
+from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.simulation.material import Prony
+
+
+class Modulus(Hypothesis):
+    """The solid is stiffer or softer than believed."""
+
+    name, seam = "modulus", "Young's modulus"
+    quantities = (Quantity("ln_factor", "1", 0.1, -12.0, 12.0),)
+    starts = ((1.0,), (-1.0,), (2.5,), (-2.5,), (5.0,), (-5.0,))
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """The factor."""
+        return {"factor": (math.exp(values[0]), "1")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """E exp(a)."""
+        return scenario.replace(stiffness=scenario.stiffness * values[:, :1].exp())
+
+
+class Viscoelastic(Hypothesis):
+    """A Maxwell element is missing."""
+
+    name, seam, form = "viscoelastic", "Prony series", LAW
+    quantities = (
+        Quantity("modulus_over_equilibrium", "1", 0.2, 0.0, 100.0),
+        Quantity("ln_time", "ln s", 1.0, -9.0, 1.5),
+    )
+    starts = tuple((g, tau) for g in (1.0, 4.0) for tau in (-6.5, -5.0, -3.5, -1.5))
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """The element, and its viscosity."""
+        g, tau = float(values[0]), math.exp(values[1])
+        nu = float(scenario.poisson_ratio.reshape(-1)[0])
+        mu = float(scenario.stiffness.max()) / (2 * (1 + nu))
+        return {"modulus_over_equilibrium": (g, "1"), "time_s": (tau, "s"), "viscosity_pa_s": (mu * g * tau, "Pa s")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """One more element."""
+        g, tau = values[:, :1], values[:, 1:2].exp()
+        known = scenario.prony
+        if known is not None:
+            lead = (len(values),)
+            g = torch.cat([known.moduli.expand(*lead, known.elements), g], -1)
+            tau = torch.cat([known.times.expand(*lead, known.elements), tau], -1)
+        return scenario.replace(prony=Prony(moduli=g, times=tau))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """As long as there is room for one."""
+        return scenario.prony is None or scenario.prony.elements < 5
+
+
+class Stiffening(Hypothesis):
+    """The solid stiffens with stretch: mu (1 + a x + a^2 x^2), x = I1b - 3, the first terms of Gent's 1 / (1 - a x)."""
+
+    name, seam, form = "stiffening", "stress at large strain", LAW
+    quantities = (Quantity("coefficient", "1", 0.3, 0.0, 10.0),)
+    starts = ((1.0,), (3.0,))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """With both terms."""
+        return scenario.replace(stiffening=scenario.stiffening + torch.cat([values, values**2], -1))
+
+
+class Softening(Hypothesis):
+    """Stress is lower below the largest stretch so far (Mullins)."""
+
+    name, seam, form = "softening", "stress below the largest stretch so far", LAW
+    quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))
+    starts = tuple((d, r) for d in (1.0, 3.0) for r in (-7.0, -5.0, -3.0))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Depth and range."""
+        return scenario.replace(softening=torch.stack([values[:, 0], values[:, 1].exp()], -1))
+
+
+class Density(Hypothesis):
+    """The solid is heavier or lighter than believed."""
+
+    name, seam, form = "density", "density", 0.2
+    quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
+    starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """The factor."""
+        return {"factor": (math.exp(values[0]), "1")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Density times exp(a)."""
+        return scenario.replace(density=scenario.density * values[:, :1].exp())
+
+
+class SoftSide(Hypothesis):
+    """Young's modulus grows evenly across the body, along x, y and z."""
+
+    name, seam, form = "soft_side", "Young's modulus over the body", LAW
+    quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """The slopes, and what a soft half has less than the other, which looks alike: 1 - exp(-2/3 of the slope)."""
+        lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
+        return {**super().told(values, scenario), "fraction": (lost, "1")}
+
+    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
+        """Middle of the soft half."""
+        steepest = int(np.abs(values[:3]).argmax())
+        middle = np.array(twin.setup.center)
+        middle[steepest] -= np.sign(values[steepest]) * 0.27 * twin.setup.size[steepest]
+        return middle
+
+    def varies(self, values: np.ndarray) -> float:
+        """At the stiffest corner."""
+        return 0.5 * float(np.abs(values[:3]).sum())
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """E exp(a . xi), xi from -1/2 to 1/2 over the body's box."""
+        low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
+        xi = (twin.positions - low) / size - 0.5
+        return scenario.replace(stiffness=scenario.stiffness * (values @ xi.T).exp())
+
+
+class PrintOffset(Hypothesis):
+    """The chamber lies off its place across the body: walls on one side are thicker, on the other thinner."""
+
+    name, seam = "print_offset", "thickness of the walls"
+    quantities = tuple(Quantity(f"offset_{i}_m", "m", 3e-4, -10.0, 10.0) for i in ("first", "second"))
+    starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Stiffness and mass of walls grow with their thickness, the shape stays."""
+        s, x = twin.setup, twin.positions
+        longest = int(np.argmax(s.size))
+        factor = torch.ones(len(values), twin.count, dtype=torch.float64)
+        for k, axis in enumerate(a for a in range(3) if a != longest):
+            low = min(c.box[0][axis] for c in s.cavities)
+            high = max(c.box[1][axis] for c in s.cavities)
+            begin, end = low - s.origin[axis], s.origin[axis] + s.size[axis] - high
+            shift = values[:, k : k + 1]
+            below, above = (x[:, axis] < low).double(), (x[:, axis] > high).double()
+            factor = factor * (1 + below * shift / begin - above * shift / end).clamp(min=0.1)
+        return scenario.replace(stiffness=scenario.stiffness * factor, density=scenario.density * factor)
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a chamber."""
+        return scenario.pressure is not None
+
+
+class AttachedMass(Hypothesis):
+    """A point mass, with its weight, somewhere on the body."""
+
+    name, seam, local, mass = "attached_mass", "mass at a place", True, 0
+    quantities = (Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),)
+    starts = ((2.0,), (6.0,))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Mass at the place."""
+        return scenario.replace(mass=scenario.mass + values[:, :1] * twin.at(values[:, 1:]))
+
+
+class LoadInertia(Hypothesis):
+    """A load that was taken for a dead force is a mass: it has inertia, too."""
+
+    name, seam = "load_inertia", "mass under a load"
+    quantities = (Quantity("share", "1", 0.2, 0.0, 7.5),)
+    starts = ((1.0,), (2.5,), (5.0,))
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """A share of the force becomes the weight of a mass."""
+        mass, pushes = scenario.mass, []
+        size = scenario.gravity.norm(dim=-1).amax()
+        for push in scenario.pushes:
+            mass = mass + values * push.force.norm(dim=-1).amax() / size * push.share
+            pushes.append(dataclasses.replace(push, force=push.force * (1 - values)))
+        return scenario.replace(mass=mass, pushes=tuple(pushes))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With loads that are there from the start and point down, as weights do."""
+        g = scenario.gravity.reshape(-1, 3)[0]
+        down = [float(p.force @ g) > 0.99 * float(p.force.norm() * g.norm()) for p in scenario.pushes]
+        return bool(down) and all(down) and all(p.start == 0 for p in scenario.pushes)
+
+
+class Tether(Hypothesis):
+    """A spring, a dashpot and a mass at a place of the body, as a tube is."""
+
+    name, seam, local, mass, form = "tether", "spring, drag and mass at a place", True, 2, LAW
+    quantities = (
+        Quantity("stiffness_n_m", "N/m", 2.0, 0.0, 1000.0),
+        Quantity("damping_n_s_m", "N s/m", 0.05, 0.0, 1000.0),
+        Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),
+    )
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
+        """Without spring and dashpot, a mass."""
+        slack = all(v < 0.01 * q.scale for v, q in zip(values[:2], self.quantities, strict=False))
+        return ("attached_mass", values[2:]) if slack else None
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """The spring is at rest in the undeformed body."""
+        share = twin.at(values[:, 3:])
+        spring = Tie(share=share, stiffness=values[:, 0])
+        drag = scenario.drag + values[:, 1:2] * share
+        mass = scenario.mass + values[:, 2:3] * share
+        return scenario.replace(springs=(*scenario.springs, spring), drag=drag, mass=mass)

@@ -1,0 +1,43 @@
+"""All effects that can be named."""
+
+from __future__ import annotations
+
+from torchsoro.sim2real.hypotheses.body_effects import (
+    AttachedMass,
+    Density,
+    LoadInertia,
+    Modulus,
+    PrintOffset,
+    Softening,
+    SoftSide,
+    Stiffening,
+    Tether,
+    Viscoelastic,
+)
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.outer_effects import (
+    Adhesion,
+    AirStiffness,
+    AirTwice,
+    FluidDrag,
+    Friction,
+    GravityTilt,
+    InitialMotion,
+    InitialSpin,
+    InitialTilt,
+    Leak,
+    PressureGain,
+    PressureLag,
+    Slip,
+    WallOffset,
+)
+
+
+def library() -> tuple[Hypothesis, ...]:
+    """All effects that can be named."""
+    kinds = (
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
+        *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness, AirTwice),
+        *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
+    )
+    return tuple(kind() for kind in kinds)

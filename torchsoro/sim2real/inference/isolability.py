@@ -1,0 +1,200 @@
+"""Which effects an experiment can tell apart, before any place is recorded: times, markers, noise and numerics do.
+
+Everything is simulated at what is believed, weakly, and counts per strength; see
+:mod:`torchsoro.sim2real.inference.cosines`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.cosines import SCORE, Belief, Response, cleared, compare
+from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.likelihood import BREAKS
+from torchsoro.sim2real.inference.residual import Band, Camera
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Motion
+
+SAME = 0.97  # of a change that another effect imitates, above which the two are not told apart
+SMALL = 0.1  # of the least strength that is looked at, at which changes are still proportional to it
+NOTHING = 0.05  # length of a change below which single precision may have made it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Isolability:
+    """What an experiment can tell.
+
+    Attributes:
+        effects: Names of E effects.
+        quantities: First quantity of each, and its unit.
+        detectable: Strength at which each stands out, in that unit [E]; infinite if never.
+        alike: How much of effect i's change, where it first stands out, effect j can imitate [E, E].
+    """
+
+    effects: tuple[str, ...]
+    quantities: tuple[tuple[str, str], ...]
+    detectable: np.ndarray
+    alike: np.ndarray
+
+    def confused(self, threshold: float = SAME) -> list[tuple[str, str]]:
+        """Pairs of effects, the second of which can pass for the first: this experiment cannot tell them apart."""
+        pairs = np.argwhere(self.alike - np.eye(len(self.effects)) > threshold)
+        return [(self.effects[i], self.effects[j]) for i, j in pairs]
+
+    def as_json(self) -> dict[str, Any]:
+        """For explanation.json; null is what is never seen."""
+        return {
+            "effects": list(self.effects),
+            "detectable": [
+                {"quantity": name, "unit": unit, "value": float(value) if math.isfinite(value) else None}
+                for (name, unit), value in zip(self.quantities, self.detectable, strict=True)
+            ],
+            "alike": np.round(self.alike, 4).tolist(),
+            "score": SCORE,
+        }
+
+
+def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *, score: float = SCORE) -> Isolability:
+    """Which effects an experiment would see, and tell apart, by one simulation of each of their looks.
+
+    Args:
+        problem: Recordings, of which only the times count, and twin.
+        effects: What is thought of; of the library what applies, if None.
+        score: Squared length of a whitened change at which it stands out.
+
+    Raises:
+        ValueError: if what is believed breaks down.
+    """
+    effects = problem.thought_of(library() if effects is None else effects)
+    n = len(problem.common)
+    # Effects that are fitted always need no simulation of their own.
+    fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
+    others = [e for e in effects if type(e) not in fitted]
+    looks = [_looks(effect, problem) for effect in others]
+    still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
+    asked = [((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, looks, strict=True)]
+    problem = problem.only(problem.trials)
+    problem.ensemble = Even(problem.twin, problem.ensemble.threads, problem.ensemble.device)
+    base, *found = problem.simulate([((), still), *asked])
+    if not all(m.sound.all() for m in base):
+        raise ValueError(BREAKS)
+    believed = [m.alone(0) for m in base]
+    blocks = [changes(problem.camera, problem.bands, believed, motions) for motions in (base, *found)]
+    blocks[0] = blocks[0][:, 1:] / SMALL
+    by = errors_of(problem.camera, problem.bands, believed)
+    common, *rest = np.split(shortened(blocks, by, problem.camera), np.cumsum([b.shape[1] for b in blocks])[:-1], 1)
+    known = {
+        id(effect): _response(effect, mine, block, np.all([m.sound for m in motions], axis=0))
+        for effect, mine, block, motions in zip(others, looks, rest, found, strict=True)
+    }
+    for effect in effects:
+        if type(effect) in fitted:
+            k = fitted[type(effect)]
+            column = common[:, k : k + 1] * effect.quantities[0].scale / problem.common[k][1]
+            free = np.ones(1, bool)
+            known[id(effect)] = Response(paths=((np.ones(1), column),), cones=((column, free),), either=True)
+    responses = [known[id(effect)] for effect in effects]
+    detectable, alike = compare(responses, common, belief_of(problem), score)
+    first = [e.quantities[0] for e in effects]
+    return Isolability(
+        effects=tuple(e.name for e in effects),
+        quantities=tuple((q.name, q.unit) for q in first),
+        detectable=detectable * np.array([q.scale for q in first]),
+        alike=alike,
+    )
+
+
+class Even(Ensemble):
+    """Simulates all variations with the same time step, so that its error cancels in their differences."""
+
+    def __call__(self, scenarios: Sequence[Scenario]) -> list[Motion]:
+        """Simulate, as :class:`Ensemble` does."""
+        self.step = min(float(super(Even, self).stable(s).min()) for s in scenarios)
+        return super().__call__(scenarios)
+
+    def stable(self, s: Scenario) -> np.ndarray:
+        """The step of all [B] s."""
+        return np.full(s.batch, self.step)
+
+
+def belief_of(problem: Problem) -> Belief:
+    """What values of modulus and pressure cost, in tolerances."""
+    return lambda x: problem.belief(x, np.zeros(len(x), bool))[0]
+
+
+def changes(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion], motions: Sequence[Motion]) -> np.ndarray:
+    """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]; 0 for broken ones."""
+    sound = np.all([m.sound for m in motions], axis=0)
+    still = np.zeros(len(camera.deviations))
+    parts = []
+    for i, (band, base, motion) in enumerate(zip(bands, believed, motions, strict=True)):
+        seen = camera.see(base, i, still)
+        each = [camera.see(motion.alone(k), i, still) - seen if good else 0 * seen for k, good in enumerate(sound)]
+        parts.append(band.whiten(np.stack(each, -1)))
+    return np.concatenate(parts)
+
+
+def errors_of(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion]) -> np.ndarray:
+    """Whitened change by each measurement error [N, L]."""
+    still = np.zeros(len(camera.deviations))
+    slopes = [camera.linearise(motion, i, still)[1] for i, motion in enumerate(believed)]
+    return np.concatenate([band.whiten(by) for band, by in zip(bands, slopes, strict=True)])
+
+
+def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, camera: Camera) -> np.ndarray:
+    """Changes without what measurement errors take up, in as few rows as keep all lengths and angles."""
+    left = cleared(np.concatenate(blocks, 1), by, 1 / camera.deviations)
+    return np.asarray(np.linalg.qr(left, mode="r"))
+
+
+def _looks(effect: Hypothesis, problem: Problem) -> list[np.ndarray]:
+    """What to simulate of an effect: alternatives, each with directions [D, K] in scales, weak ones first.
+
+    An effect that grows from nothing is known by a weak one. One that begins at some strength, as sliding on a plane
+    does, is looked at there, too.
+    """
+    weak = effect.weak(problem.twin, SMALL)
+    if effect.joint:  # of many places, every other
+        return weak[:: -2 if effect.local else 1]
+    if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].grounds:
+        return weak
+    known = sorted(effect.looks(problem.twin), key=lambda d: abs(d[0, 0]))
+    return [*weak, known[0], known[-1]]
+
+
+def _response(effect: Hypothesis, looks: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
+    """An effect's changes [N, K] by look; what breaks down is left out."""
+    kinds = len(effect.quantities)
+    backwards = np.array([q.least < 0 for q in effect.quantities])
+    numbers = np.split(np.arange(len(sound)), np.cumsum([len(d) for d in looks])[:-1])
+    kept = [(d, columns[:, k]) for d, k in zip(looks, numbers, strict=True) if sound[k].all()]
+    paths, cones = [], []
+    if effect.joint:
+        for directions, mine in kept:
+            cones.append((mine, backwards[np.abs(directions[:, :kinds]).argmax(1)]))
+            # Strengths are in the first quantity's unit: directions in that unit count, the most visible of them.
+            alike = [q.unit == effect.quantities[0].unit for q in effect.quantities]
+            some = mine[:, directions[:, :kinds][:, alike].any(1)]
+            turn = np.linalg.svd(some, full_matrices=False)[2][:1]
+            paths.append((np.array([SMALL]), some @ turn.T * (1 if turn.sum() > 0 else -1)))
+        return Response(paths=tuple(paths), cones=tuple(cones), either=bool(backwards[0]))
+    if kinds == 1 and not effect.local and kept and np.linalg.norm(kept[0][1]) < NOTHING:
+        # It begins at some strength.
+        strong = [(d[0, 0], mine) for d, mine in kept if d[0, 0] * kept[-1][0][0, 0] > 0]
+        course = np.concatenate([mine for _, mine in strong], 1)
+        paths = [(np.abs([d for d, _ in strong]), course)]
+        pairs = [course[:, max(k - 1, 0) : k + 1] for k in range(len(strong))]
+        cones = [(pair, np.zeros(pair.shape[1], bool)) for pair in pairs]
+    else:
+        weak = kept[:1] if kinds == 1 and not effect.local else kept
+        paths = [(np.abs(d[0, :1]), mine) for d, mine in weak]
+        cones = [(mine, np.zeros(1, bool)) for _, mine in weak]
+    return Response(paths=tuple(paths), cones=tuple(cones), either=bool(backwards[0]))

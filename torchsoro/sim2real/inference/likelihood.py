@@ -1,0 +1,304 @@
+"""Recordings, a twin and its error: simulating with effects, and how far that is from what was recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+import torch
+
+from torchsoro.sim2real.data.experiment import Experiment, Trial
+from torchsoro.sim2real.hypotheses.body_effects import Modulus
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
+from torchsoro.sim2real.inference.residual import LASTING, Band, Camera, Priors, Slip, estimate_noise
+from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Motion, Twin
+
+EDGE = 0.15  # of a belief's tolerance, over which it ends
+FEWEST = 8  # samples of a trial's beginning
+WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
+
+BREAKS = "setup: its simulation breaks down, wanted a body that bears what acts on it"
+
+Effects = tuple[Hypothesis, ...]
+Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Beliefs:
+    """What a setup's numbers are good for: tolerances of ln of the modulus and of the pressure."""
+
+    modulus: float = 0.1
+    pressure: float = 0.05
+
+
+@dataclass
+class Tally:
+    """What was spent on simulating."""
+
+    simulations: int = 0
+
+
+class Likelihood:
+    """Recordings, a twin and its error: what a motion is worth.
+
+    Args:
+        experiment: What to explain.
+        twin: Its body.
+        trials: To fit, with a recording each; those of the experiment if None.
+        numerics: The twin's own error for each trial [M, A] m; none if None.
+        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
+        correction: By trial, what a finer twin then adds to motions [S, M, ...].
+        own: By effects, the same with them, where it is known.
+        beliefs: See there.
+        priors: Of measurement errors.
+        noise: [m]; that of the setup, or estimated, if None.
+        lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
+        slips: Markers that have slipped.
+        ensemble: Of the twin, if there is one already.
+        fine: Of a finer twin, for :meth:`corrected`.
+        report: Called with a line after each batch of simulations.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        twin: Twin,
+        *,
+        trials: Sequence[Trial] | None = None,
+        numerics: Sequence[np.ndarray] | None = None,
+        shift: Sequence[float] = (),
+        correction: Mapping[str, Motion] | None = None,
+        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
+        beliefs: Beliefs | None = None,
+        priors: Priors | None = None,
+        noise: float | None = None,
+        lasting: float = LASTING,
+        slips: Sequence[Slip] = (),
+        ensemble: Ensemble | None = None,
+        fine: Ensemble | None = None,
+        report: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self.experiment, self.twin, self.report = experiment, twin, report
+        self.ensemble, self.fine = ensemble or Ensemble(twin), fine
+        self.trials = tuple(experiment.trials if trials is None else trials)
+        recordings = [t.recording for t in self.trials if t.recording is not None]
+        self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
+        shape = recordings[0].place.shape[1:]
+        self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
+        self.correction, self.own = correction or {}, own or {}
+        self.priors, self.slips, self.lasting = priors, tuple(slips), lasting
+        self.camera = Camera(experiment.setup, self.trials, priors, slips)
+        self.bands = [Band(r, self.noise, n, lasting) for r, n in zip(recordings, self.numerics, strict=True)]
+        self.samples = sum(b.count for b in self.bands)
+        self.scenarios = [twin.scenario(t).replace(until=self.camera.until(i)) for i, t in enumerate(self.trials)]
+        self.beliefs = beliefs or Beliefs()
+        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.beliefs.modulus)]
+        if experiment.setup.cavities:
+            self.common.append((PressureGain(), self.beliefs.pressure))
+        self.shift = np.array(shift if len(shift) else [0.0] * len(self.common))
+        self.tally = Tally()
+
+    def only(
+        self,
+        trials: Sequence[Trial],
+        *,
+        slips: Sequence[Slip] | None = None,
+        numerics: Sequence[np.ndarray] | None = None,
+        correction: Mapping[str, Motion] | None = None,
+        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
+    ) -> Self:
+        """The same of other trials, with other slips, or another error or correction of the twin."""
+        known = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
+        common = np.asarray(np.mean(self.numerics, axis=0))
+        there = type(self)(
+            self.experiment,
+            self.twin,
+            trials=trials,
+            numerics=numerics or [known.get(t.name, common) for t in trials],
+            shift=tuple(self.shift),
+            correction=self.correction if correction is None else correction,
+            own=self.own if own is None else own,
+            beliefs=self.beliefs,
+            priors=self.priors,
+            noise=self.noise,
+            lasting=self.lasting,
+            slips=self.slips if slips is None else slips,
+            ensemble=self.ensemble,
+            fine=self.fine,
+            report=self.report,
+        )
+        there.tally = self.tally
+        return there
+
+    def corrected(self, at: np.ndarray) -> Self:
+        """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales.
+
+        A simulation of one's own is of what is believed, and stays what it is.
+        """
+        (found,) = self._finer(self.trials, [((), at[None])])
+        return self.only(self.trials, correction={**self.correction, **found})
+
+    def corrected_each(self, points: Sequence[Request]) -> Self:
+        """The same, but effects are corrected by the finer twin where each of them is now, at one point."""
+        kept = [t for t in self.experiment.heldout if t.recording is not None]
+        found = self._finer([*self.trials, *kept], points)
+        own = {e: {**self.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
+        return self.only(self.trials, own={**self.own, **own})
+
+    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, Motion]]:
+        """What the finer twin adds at points, by trial; nothing to those with a simulation of one's own."""
+        trials = [t for t in trials if t.name not in self.stated]
+        if self.fine is None or not trials:
+            return [{} for _ in points]
+        there = type(self)(self.experiment, self.fine.twin, trials=trials, noise=self.noise, ensemble=self.fine)
+        coarse = self.only(trials, correction={}, own={}).simulate(points)
+        return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
+
+    @property
+    def stated(self) -> dict[str, Motion]:
+        """Of the corrections, those by a simulation of one's own."""
+        trials = (*self.experiment.trials, *self.experiment.heldout)
+        return {t.name: self.correction[t.name] for t in trials if t.simulated and t.name in self.correction}
+
+    def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Those of the effects for which there is something in a trial that they change."""
+        return [e for e in effects if any(e.applies(scenario, self.twin) for scenario in self.scenarios)]
+
+    def early(self, share: float) -> Self | None:
+        """The same of the beginning of the trials, where a wrong frequency has not become a wrong phase.
+
+        None where a trial has too few samples then.
+        """
+        cut = []
+        for t in self.trials:
+            assert t.recording is not None
+            begin = max(float(t.recording.time[0]), 0.0)
+            end = begin + share * (t.setup.duration - begin)
+            if np.count_nonzero(t.recording.time <= end) < FEWEST:
+                return None
+            setup = dataclasses.replace(t.setup, duration=end)
+            cut.append(dataclasses.replace(t, setup=setup, recording=t.recording.until(end)))
+        return self.only(cut)
+
+    # Simulating -------------------------------------------------------------------------------------------------
+
+    def scales(self, effects: Effects) -> np.ndarray:
+        """Of all that is fitted by simulating: modulus, pressure, the effects, places."""
+        found = [tolerance for _, tolerance in self.common]
+        for effect in effects:
+            found += [q.scale for q in effect.quantities]
+            found += [0.1 * s for s in self.twin.setup.size] if effect.local else []
+        return np.array(found)
+
+    def bounds(self, effects: Effects) -> tuple[np.ndarray, np.ndarray]:
+        """Of the unknowns, in scales."""
+        low, high = [-6.0] * len(self.common), [6.0] * len(self.common)
+        for effect in effects:
+            low += [q.least for q in effect.quantities]
+            high += [q.most for q in effect.quantities]
+            if effect.local:
+                s = self.twin.setup
+                low += [10 * o / z for o, z in zip(s.origin, s.size, strict=True)]
+                high += [10 * o / z + 10 for o, z in zip(s.origin, s.size, strict=True)]
+        return np.array(low), np.array(high)
+
+    def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:
+        """A scenario at points [B, K], in scales."""
+        values = torch.from_numpy(points * self.scales(effects))
+        values[:, : len(self.shift)] += torch.from_numpy(self.shift)
+        at = 0
+        for effect, _ in self.common:
+            scenario = effect(scenario, values[:, at : at + 1], self.twin)
+            at += 1
+        for effect in effects:
+            count = len(effect.quantities) + 3 * effect.local
+            part = values[:, at : at + count]
+            at += count
+            if effect.applies(scenario, self.twin) and bool((part[:, : len(effect.quantities)] != 0).any()):
+                scenario = effect(scenario, part, self.twin)
+        return scenario
+
+    def simulate(self, requests: Sequence[Request]) -> list[list[Motion]]:
+        """For each request, the motions of all trials, each with a leading batch; all at once."""
+        begin = time.perf_counter()
+        varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
+        count = len(self.scenarios)
+        found = []
+        for k, motion in enumerate(self.ensemble(varied)):
+            known, name = self.own.get(requests[k // count][0], self.correction), self.trials[k % count].name
+            found.append(motion.plus(known[name]) if name in known else motion)
+        spent = time.perf_counter() - begin
+        simulations = count * sum(len(points) for _, points in requests)
+        self.tally.simulations += simulations
+        self.report(f"{simulations} simulations, {spent:.1f} s")
+        return [found[k : k + count] for k in range(0, len(found), count)]
+
+    # Residuals --------------------------------------------------------------------------------------------------
+
+    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> np.ndarray:
+        """Whitened residual of all trials."""
+        left = []
+        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+            assert trial.recording is not None
+            left.append(band.whiten(trial.recording.place - self.camera.see(motion, i, errors)))
+        return np.concatenate(left)
+
+    def linear(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`residual`, and its slopes by the measurement errors."""
+        left, slopes = [], []
+        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+            assert trial.recording is not None
+            seen, by = self.camera.linearise(motion, i, errors)
+            left.append(band.whiten(trial.recording.place - seen))
+            slopes.append(band.whiten(by))
+        return np.concatenate(left), np.concatenate(slopes)
+
+    def measure(
+        self, motions: Sequence[Motion], errors: np.ndarray
+    ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+        """The best measurement errors for motions: misfit with their priors, errors, residual, slopes."""
+        weight = 1 / self.camera.deviations
+        best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
+        for _ in range(6):
+            r, J = self.linear(motions, errors)
+            misfit = float(r @ r + ((errors * weight) ** 2).sum())
+            if misfit < best[0]:
+                gained = best[0] - misfit
+                best = (misfit, errors, r, J)
+                if gained < 0.05 + 1e-4 * misfit:
+                    break
+            else:  # too far
+                errors = (errors + best[1]) / 2
+                continue
+            H = J.T @ J + np.diag(weight**2)
+            errors = errors + np.linalg.solve(H, J.T @ r - weight**2 * errors)
+        return best
+
+    def belief(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals of the beliefs at a point, and their slopes; none where ``held``.
+
+        Within its tolerance a number is nearly as good as another, beyond it is soon hard to believe.
+        """
+        n = len(self.common)
+        out = np.maximum(np.abs(at[:n]) - 1, 0) / EDGE
+        r, slope = np.zeros(len(at)), np.zeros(len(at))
+        r[:n] = np.sign(at[:n]) * np.hypot(WITHIN * at[:n], out)
+        slope[:n] = np.where(out > 0, 1 / EDGE, WITHIN)
+        return np.where(held, 0.0, r), np.where(held, 0.0, slope)
+
+
+def added(trials: Sequence[Trial], coarse: Sequence[Motion], fine: Sequence[Motion]) -> dict[str, Motion]:
+    """By trial, what a finer twin adds to motions [S, M, ...]; nothing where one of them broke down."""
+    return {
+        t.name: b.alone().plus(a.alone(), -1.0)
+        for t, a, b in zip(trials, coarse, fine, strict=True)
+        if a.sound.all() and b.sound.all()
+    }

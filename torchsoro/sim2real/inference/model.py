@@ -1,0 +1,164 @@
+"""A model on disk, ``model.toml``: a setup with what was found to be missing from it, and what it predicts."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from torchsoro.sim2real.data.experiment import Setup, Trial, read_tables, read_trial, setup_of
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.hypotheses.body_effects import Modulus
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
+from torchsoro.sim2real.inference.fit import Fit
+from torchsoro.sim2real.twin.ensemble import THREADS, Ensemble
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.storage import atomic_write
+
+_HEAD = "# A setup with what was found to be missing: [model] and [[effect]]; the rest is as believed.\n"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Model:
+    """What a file holds.
+
+    Attributes:
+        tables: Of the setup, as believed.
+        setup: The same, read.
+        edge: Of the twin's cells [m].
+        walls: Of them through each wall, at least.
+        across: Of them across a body without a chamber, at least.
+        ln_modulus: What the modulus is off.
+        ln_pressure: What the pressure is off.
+        effects: What was missing, with its values [K], places included.
+    """
+
+    tables: dict[str, Any]
+    setup: Setup
+    edge: float
+    walls: int
+    across: int
+    ln_modulus: float
+    ln_pressure: float
+    effects: tuple[tuple[Hypothesis, np.ndarray], ...]
+
+    def apply(self, scenario: Scenario, twin: Twin) -> Scenario:
+        """A scenario with all that was found."""
+        values = torch.tensor([[self.ln_modulus, self.ln_pressure]], dtype=torch.float64)
+        scenario = Modulus()(scenario, values[:, :1], twin)
+        if scenario.pressure is not None:
+            scenario = PressureGain()(scenario, values[:, 1:], twin)
+        for effect, found in self.effects:
+            scenario = effect(scenario, torch.from_numpy(found)[None], twin)
+        return scenario
+
+
+def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
+    """Write a setup with a fit's findings.
+
+    Args:
+        path: Of the model; its folder exists.
+        setup: The setup.toml that was believed, which is copied, as is the body's mesh beside it.
+        fit: What was found.
+        twin: To predict with; one as fine as that which corrected the fit's.
+    """
+    belief = [*fit.belief.tolist(), 0.0][:2]
+    lines = [
+        _HEAD,
+        setup.read_text(encoding="utf-8").rstrip(),
+        "",
+        "[model]",
+        f"edge = {twin.edge!r}",
+        f"walls = {twin.walls}",
+        f"across = {twin.across}",
+    ]
+    lines += [f"ln_modulus = {belief[0]!r}", f"ln_pressure = {belief[1]!r}"]
+    for effect, values in zip(fit.effects, fit.values, strict=True):
+        lines += ["", "[[effect]]", f"name = {json.dumps(effect.name)}"]
+        count = len(effect.quantities)
+        for quantity, value in zip(effect.quantities, values[:count].tolist(), strict=True):
+            lines.append(f"{quantity.name} = {value!r} # {quantity.unit}")
+        if effect.local:
+            lines.append(f"at = {values[count:].tolist()!r} # m")
+    mesh = read_tables(setup)["body"].get("file")
+    if mesh is not None and not Path(mesh).is_absolute():
+        source, copy = setup.parent.resolve() / mesh, path.parent.resolve() / mesh
+        if source != copy:
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(source, copy)
+    with atomic_write(path) as file:
+        file.write(("\n".join(lines) + "\n").encode())
+
+
+def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model:
+    """Read a model.
+
+    Args:
+        path: Of the file.
+        effects: Those that may be in it; the library if None.
+
+    Raises:
+        ValueError: if the file cannot be read, or an effect or a parameter of it is missing or unknown.
+    """
+    tables = read_tables(path)
+    numbers, rows = tables.pop("model", None), tables.pop("effect", [])
+    wanted = {"edge", "walls", "across", "ln_modulus", "ln_pressure"}
+    if not isinstance(numbers, dict) or set(numbers) != wanted:
+        raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
+    known: dict[str, list[Hypothesis]] = {}
+    for effect in library() if effects is None else effects:
+        known.setdefault(effect.name, []).append(effect)
+    found = []
+    for row in rows:
+        alike = known.get(row.get("name"), [])
+        if not alike:
+            raise ValueError(f"{path}: [[effect]] name = {row.get('name')!r}, wanted one of {', '.join(known)}")
+        # Some share a name, as friction of planes that were thought to stick and of others.
+        wants = [[*(q.name for q in e.quantities), *(["at"] if e.local else [])] for e in alike]
+        fits = [e for e, names in zip(alike, wants, strict=True) if set(row) - {"name"} == set(names)]
+        if not fits:
+            wanted = " or ".join(", ".join(names) for names in wants)
+            raise ValueError(f"{path}: [[effect]] {row['name']} has {', '.join(row)}, wanted {wanted}")
+        names = [q.name for q in fits[0].quantities]
+        found.append((fits[0], np.array([*(row[name] for name in names), *row.get("at", [])], dtype=float)))
+    return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **numbers)
+
+
+def predict_trial(
+    model: Model, trial: Path, source: Path, threads: int = THREADS, device: str = "auto"
+) -> dict[str, np.ndarray]:
+    """Markers in a trial that nobody has recorded yet, by the finer twin alone: no ``simulated.csv`` counts here.
+
+    Args:
+        model: What is known.
+        trial: Its trial.toml; a pressure.csv stands beside it where the body has a chamber.
+        source: Where the model comes from, for messages.
+        threads: That simulate.
+        device: See :class:`Ensemble`.
+
+    Returns:
+        Columns of a markers.csv.
+
+    Raises:
+        ValueError: if the trial cannot be read, or the simulation breaks down.
+    """
+    if trial.name != "trial.toml" or not trial.is_file():
+        raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
+    told: Trial = read_trial(trial.parent, model.tables, source)
+    twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
+    motion = Ensemble(twin, threads, device)([model.apply(twin.scenario(told), twin)])[0].alone()
+    if not motion.sound:
+        raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
+    axes = told.setup.axes
+    return Recording(time=motion.time, place=motion.place[..., list(axes)], axes=axes).columns(
+        [m.name for m in told.setup.markers]
+    )

@@ -1,0 +1,250 @@
+"""From recordings to a verdict: what fits best, whether it predicts trials that were left out, what can be said."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from torchsoro.sim2real.data.experiment import Trial
+from torchsoro.sim2real.hypotheses.body_effects import Modulus
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.fit import Fit, Problem
+from torchsoro.sim2real.inference.heldout import predict_all
+from torchsoro.sim2real.inference.ranking import BELIEVED, FAINT, Candidate, rank, varied
+from torchsoro.sim2real.inference.search import priced, search, within
+
+FOLDS = 4  # trials that are left out, one after the other
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thresholds:
+    """What decides; from a batch of cases with known answers that was made for this.
+
+    Attributes:
+        alarm: Score and gain below which nothing is missing.
+        margin: Of the score, within which two effects are not told apart: odds of twenty to one.
+        rough: The same as a share of the score where bodies slide and bounce: there the misfit has many dents, and in
+            which of them a search ends is chance.
+        halves: The same between a modulus and a soft side, which differ in what a whole and a half do otherwise.
+        covered: Times what noise and numerics explain, as believed, below which nothing is missing: all is within them.
+        quiet: The same, without an effect, below which nothing is missing if none is believed.
+        some: The same, above which an effect must take away ``part`` of it.
+        part: The least share of the misfit.
+        beyond: As ``quiet``, with the best effect, above which it leaves something.
+        share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
+        lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
+        noisy: The same where noise and numerics explain most, or noise most of what is left of the trials left out
+            without an effect, and the gain is above ``sure``.
+        faint: Square of the error on trials left out without an effect, over that of the noise, below which it is
+            mostly noise.
+        sure: Such a gain; without anything missing it has never been found.
+        worse: Times the error on trials left out of the effect that predicts them best, at which another is.
+        near: By how much it may be larger in any case, even than ``lost``, over the error without an effect.
+        left: Of the misfit, above which what the best effect leaves is due to its form, which is never just nature's.
+        form: Times what the best then leaves, up to which another is not told apart from it.
+    """
+
+    alarm: float = 40.0
+    margin: float = 3.0
+    rough: float = 0.45
+    halves: float = 10.0
+    covered: float = 0.8
+    quiet: float = 1.7
+    some: float = 1.3
+    part: float = 0.5
+    beyond: float = 2.0
+    share: float = 0.9
+    lost: float = 0.85
+    noisy: float = 0.95
+    faint: float = 2.0
+    sure: float = 200.0
+    worse: float = 1.3
+    near: float = 0.02
+    left: float = 0.05
+    form: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Verdict:
+    """What can be said.
+
+    Attributes:
+        kind: "explained", "nothing_missing", "unknown_physics" or "cannot_distinguish".
+        problem: With the slips of markers that were found.
+        nothing: The fit without any effect.
+        ranking: The effects that were fitted, best first.
+        chosen: The effects that explain the difference: one, or several that cannot be told apart.
+        excess: What is left over what noise and numerics explain, for the best effect: 1 if nothing is left.
+        heldout: Of trials that were left out, the error as believed and with the best effect [m].
+    """
+
+    kind: str
+    problem: Problem
+    nothing: Fit
+    ranking: tuple[Candidate, ...]
+    chosen: tuple[Candidate, ...] = field(default=())
+    excess: float = 1.0
+    heldout: dict[str, tuple[float, float]] = field(default_factory=dict)
+
+
+def judge(
+    problem: Problem,
+    effects: Sequence[Hypothesis] | None = None,
+    *,
+    kept: Sequence[Trial] = (),
+    thresholds: Thresholds | None = None,
+    budget: float = 600.0,
+    report: Callable[[str], None] = print,
+) -> Verdict:
+    """Find what was left out.
+
+    Args:
+        problem: Recordings and twin.
+        effects: What is thought of; the library if None.
+        kept: Trials that are only predicted. Without any, each of three or more is predicted from the others.
+        thresholds: What decides.
+        budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
+        report: Called with a line for each effect.
+    """
+    effects = problem.thought_of(library() if effects is None else effects)
+    problem, nothing, best = search(problem, effects, budget, report)
+    believed = within(problem, nothing)
+    plain = rank(best, nothing, believed, problem.camera.deviations)
+    start, plainly = nothing.misfit / nothing.samples, believed / nothing.samples
+    excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
+    own = problem
+    problem, nothing, fits = priced(problem, nothing, best, report)
+    believed = believed if problem is own else within(problem, nothing)
+    # What is explained, and what is left, is told by noise and the twin's own error alone.
+    explained = {c.fit.name: c.explained for c in plain}
+    found = [
+        dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0))
+        for c in rank(fits, nothing, believed, problem.camera.deviations)
+    ]
+    found, heldout, faint = _proved(problem, nothing, found, kept)
+    for c in found:
+        report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
+    t = thresholds or Thresholds()
+    verdict = decide(problem, nothing, found, excess, t, start=start, plainly=plainly, faint=faint)
+    shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
+    return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
+
+
+def number(value: float, unit: str) -> str:
+    """A value with its unit."""
+    return f"{value:.3g}" if unit == "1" else f"{value:.3g} {unit}"
+
+
+def tell(fit: Fit) -> str:
+    """Parameters in one line."""
+    parts = []
+    for effect, values in zip(fit.effects, fit.values, strict=True):
+        parts += [f"{q.name} = {number(v, q.unit)}" for q, v in zip(effect.quantities, values, strict=False)]
+        if effect.local:
+            parts.append("at " + ", ".join(f"{1e3 * v:.1f}" for v in values[len(effect.quantities) :]) + " mm")
+    return ", ".join(parts)
+
+
+def _proved(
+    problem: Problem, nothing: Fit, found: list[Candidate], kept: Sequence[Trial]
+) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]], float]:
+    """The candidates near the best with their error on trials left out; by name, errors as believed and with it.
+
+    Last the square of the error without an effect, over that of the noise.
+    """
+    near = [c for c in found if c.gain > FAINT and c.score > 0.5 * found[0].score][:3]
+    fits = [nothing, *(c.fit for c in near)]
+    if kept:
+        folds = [(problem, fits, list(kept))]
+    elif len(problem.trials) < 3 or not near:
+        return found, {}, math.inf
+    else:
+        folds = []
+        for i, trial in enumerate(problem.trials[:FOLDS]):
+            where = problem.only([t for t in problem.trials if t is not trial])
+            folds.append((where, [problem.without(fit, i) for fit in fits], [trial]))
+    squares = np.zeros(len(fits))
+    heldout: dict[str, dict[str, tuple[float, float]]] = {fit.name: {} for fit in fits}
+    for where, (still, *others), trials in folds:
+        # Nothing is what is within beliefs.
+        mine = [dataclasses.replace(still, point=np.clip(still.point, -BELIEVED, BELIEVED)), *others]
+        told = predict_all(where, mine, trials)
+        believed = predict_all(where, mine[:1], trials, believed=True)[0]
+        if not told[0] or not believed:
+            return found, {}, math.inf
+        for k, (fit, row) in enumerate(zip(mine, told, strict=True)):
+            squares[k] += sum(p.total**2 for p in row) if row else math.inf
+            heldout[fit.name] |= {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
+    ratios = np.sqrt(squares / squares[0])
+    proved = {id(c): float(ratio) for c, ratio in zip(near, ratios[1:], strict=True)}
+    noise = len(heldout[nothing.name]) * len(problem.experiment.setup.axes) * problem.noise**2
+    found = [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found]
+    return found, heldout, float(squares[0]) / noise
+
+
+def _halves(one: Fit, other: Fit) -> bool:
+    """Whether one is the modulus, and the other how that varies over the body."""
+    plain = [any(isinstance(e, Modulus) for e in f.effects) for f in (one, other)]
+    uneven = [varied(f) > 0 for f in (one, other)]
+    return (plain[0] and uneven[1]) or (plain[1] and uneven[0])
+
+
+def decide(
+    problem: Problem,
+    nothing: Fit,
+    found: Sequence[Candidate],
+    excess: float,
+    t: Thresholds,
+    *,
+    start: float,
+    plainly: float = math.inf,
+    faint: float = math.inf,
+) -> Verdict:
+    """The verdict on a ranking.
+
+    Args:
+        problem: That was fitted.
+        nothing: Without an effect.
+        found: Effects, best first.
+        excess: Times what noise and numerics explain that the best leaves.
+        t: What decides.
+        start: As ``excess``, without an effect.
+        plainly: The same, with modulus and pressure as believed.
+        faint: Square of the error on trials left out without an effect, over that of the noise.
+    """
+    believed = [c for c in found if c.gain > t.alarm]
+    if not all(math.isnan(c.kept) for c in found):
+        # Where most of an error is noise, even the truth takes little of it away.
+        most = [t.noisy if (start < t.some or faint < t.faint) and c.gain > t.sure else t.lost for c in believed]
+        least = min((c.kept for c, lost in zip(believed, most, strict=True) if c.kept <= lost), default=-math.inf)
+        believed = [
+            c
+            for c, lost in zip(believed, most, strict=True)
+            if c.kept <= max(min(lost, t.worse * least), least + t.near)
+        ]
+    best = believed[0] if believed else None
+    common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
+    little = best is not None and start > t.some and best.explained < t.part
+    if best is None or best.score < t.alarm or little or plainly < t.covered:
+        return Verdict(kind="nothing_missing" if start < t.quiet else "unknown_physics", **common)
+    if excess > t.beyond and best.explained < t.share:
+        return Verdict(kind="unknown_physics", **common)
+    margin, others = t.margin, [c for c in believed if c is not best]
+    if problem.experiment.setup.planes:
+        margin = max(margin, t.rough * best.score)
+        # A fit without a trial may end in another dent: that it predicts hardly better than nothing tells little.
+        others += [c for c in found if c not in believed and c.gain > t.alarm and c.kept > t.lost]
+    formed = t.form * (1 - best.explained) if 1 - best.explained > t.left else 0.0
+
+    def alike(c: Candidate) -> bool:
+        less = max(margin, t.halves) if _halves(best.fit, c.fit) else margin
+        return c.score > best.score - less or 1 - c.explained < formed
+
+    close = (best, *filter(alike, others))
+    kind = "explained" if len(close) == 1 else "cannot_distinguish"
+    return Verdict(kind=kind, chosen=close, **common)

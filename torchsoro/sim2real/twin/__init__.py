@@ -1,0 +1,1 @@
+"""The simulated twin of an experiment's body, many variations at a time."""

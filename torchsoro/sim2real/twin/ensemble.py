@@ -1,0 +1,331 @@
+"""Scenarios of a body, many variations at once: sixteen to a group and a group to a thread, or all of them on a GPU."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.sim2real.twin.grid import Grid
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.kernels import cuda_ensemble
+from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
+from torchsoro.simulation.material import Prony
+
+SAMPLE = 2.5e-3  # s between two samples, between which motion is a cubic
+SAFETY = 1.4  # of the largest step that is surely stable near rest; free blocks and bars are stable up to 1.6
+CUT = 1.0  # the same where cells are body in part only, and nodes may have next to no mass
+THREADS = os.cpu_count() or 1
+
+Lane = tuple[int, int]  # number of the scenario, and of its variation
+
+
+def safety(grid: Grid) -> float:
+    """By how much a step may be longer than what is surely stable."""
+    return CUT if grid.cut else SAFETY
+
+
+class Ensemble:
+    """Simulates variations of scenarios of one body.
+
+    Args:
+        twin: The body.
+        threads: That work side by side.
+        device: "cpu", "cuda", or "auto" for a GPU where there is one.
+
+    Attributes:
+        room: Variations that take no longer than one.
+
+    Raises:
+        ValueError: for "cuda" without a GPU that Numba can use.
+    """
+
+    def __init__(self, twin: Twin, threads: int = THREADS, device: str = "auto") -> None:
+        there = device != "cpu" and cuda_ensemble.available()
+        if device == "cuda" and not there:
+            raise ValueError("device = 'cuda': no GPU with CUDA that numba-cuda can use; wanted 'cpu', 'auto', or one")
+        self.twin, self.threads, self.device = twin, threads, device
+        self.mesh = mesh_of(twin)
+        self.body = cuda_ensemble.body_of(self.mesh) if there else None
+        self.room = cuda_ensemble.ROOM if there else LANES * threads
+        grid = twin.grid
+        _, _, places, axes, areas, chambers = grid.walls
+        shape = np.zeros(len(twin.setup.cavities))
+        np.add.at(shape, chambers, areas * places[np.arange(len(axes)), axes] / 3)
+        self.volumes = shape
+        self.steep = max(a.steep for a in grid.axes)
+        self.safety = safety(grid)
+
+    def __call__(self, scenarios: Sequence[Scenario]) -> list[Motion]:
+        """Simulate.
+
+        Args:
+            scenarios: Each with a batch of variations [B], or none.
+
+        Returns:
+            For each, its motions [B, ...]; those that broke down are not ``sound``.
+        """
+        lanes = [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
+        steps = {i: self.stable(s) for i, s in enumerate(scenarios)}
+        alike: dict[object, list[Lane]] = {}
+        for lane in lanes:
+            alike.setdefault(_common(scenarios[lane[0]]), []).append(lane)
+        kinds = []
+        for members in alike.values():
+            members.sort(key=lambda lane: steps[lane[0]][lane[1]])
+            kinds.append([members[k : k + LANES] for k in range(0, len(members), LANES)])
+        markers = len(self.twin.setup.markers)
+        longest = max(s.until for s in scenarios)
+        samples = math.ceil(longest / SAMPLE - 1e-9) + 1
+        seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
+
+        def prepared(group: list[Lane]) -> Case:
+            dt = min(steps[i][b] for i, b in group)
+            every = math.ceil(SAMPLE / dt)
+            return self.case(scenarios, group, SAMPLE / every, every, samples)
+
+        def run(group: list[Lane]) -> float:
+            case = prepared(group)
+            out = np.zeros((samples, MARKED * markers), np.float32)
+            march(self.mesh, case, out)
+            found = out.reshape(samples, markers, 5, 3, LANES)
+            for k, (i, b) in enumerate(group):
+                seen[i][b] = found[..., k]
+            return case.dt
+
+        def run_there(kind: list[list[Lane]]) -> float:
+            assert self.body is not None
+            cases = [prepared(group) for group in kind]
+            found = cuda_ensemble.march_all(self.body, cases, [len(group) for group in kind], samples)
+            for (i, b), one in zip(itertools.chain(*kind), found, strict=True):
+                seen[i][b] = one
+            return max(case.dt for case in cases)
+
+        if self.body is None:
+            with ThreadPoolExecutor(self.threads) as pool:
+                largest = max(pool.map(run, itertools.chain(*kinds)))
+        else:
+            largest = max(run_there(kind) for kind in kinds)
+        at = np.array([m.at for m in self.twin.setup.markers], float)
+        time = np.arange(samples) * SAMPLE
+        return [
+            Motion(
+                time=time,
+                place=at + x[:, :, :, 0],
+                velocity=x[:, :, :, 1],
+                gradient=np.eye(3) + np.swapaxes(x[:, :, :, 2:], -1, -2),
+                dt=largest,
+            )
+            for x in seen
+        ]
+
+    def stable(self, s: Scenario) -> np.ndarray:
+        """Largest stable step of each variation [B] s; an element counts with what the fastest oscillation feels."""
+        nu = s.poisson_ratio.unsqueeze(-1)
+        bulk, shear = s.stiffness / (3 * (1 - 2 * nu)), s.stiffness / (2 * (1 + nu))
+        bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch).numpy() for m in (bulk, shear))
+        dt = np.full(s.batch, 1.0)
+        for _ in range(40):
+            factor = np.ones(s.batch)
+            if s.prony is not None:
+                tau, g = (t.expand(s.batch, s.prony.elements).numpy() for t in (s.prony.times, s.prony.moduli))
+                ratio = dt[:, None] / tau
+                a, b = np.exp(-ratio), -np.expm1(-ratio) / ratio
+                factor = 1 + (g * b * 2 / (1 + a)).sum(-1)
+            speed = np.maximum(math.sqrt(3) * bulk, np.sqrt(2 * factor) * shear)
+            dt = np.sqrt(dt * self.safety * 2 / (speed * math.sqrt(self.steep)))
+        return np.minimum(dt, SAMPLE)
+
+    def case(self, scenarios: Sequence[Scenario], group: list[Lane], dt: float, every: int, samples: int) -> Case:
+        """Numbers of up to sixteen variations; empty lanes repeat the first."""
+        full = [*group, *[group[0]] * (LANES - len(group))]
+        told = [scenarios[i] for i, _ in full]
+
+        def lanes(get, rank: int) -> np.ndarray:
+            rows = []
+            for (_, b), s in zip(full, told, strict=True):
+                t = torch.as_tensor(get(s), dtype=torch.float64)
+                rows.append(t[b if t.shape[0] > 1 else 0] if t.ndim > rank else t)
+            return np.ascontiguousarray(torch.stack(rows, -1).numpy(), dtype=np.float32)
+
+        steps = every * (samples - 1)
+        volume = self.twin.volumes
+
+        def modulus(s: Scenario, kind: str) -> Tensor:
+            nu = s.poisson_ratio.unsqueeze(-1)
+            return volume * s.stiffness / (3 * (1 - 2 * nu) if kind == "bulk" else 2 * (1 + nu))
+
+        known: dict[int, Tensor] = {}
+
+        def mass(s: Scenario) -> Tensor:
+            if id(s) not in known:
+                known[id(s)] = self.twin.nodal(s.density * volume) + s.mass
+            return known[id(s)]
+
+        weight = lanes(lambda s: torch.where(mass(s) > 0, 1 / mass(s).clamp(min=1e-30), 0.0), 1)
+        left = lanes(lambda s: mass(s) / (mass(s) + dt * s.drag).clamp(min=1e-30), 1)
+        first = told[0]
+        elements = 0 if first.prony is None else first.prony.elements
+        maxwell = np.zeros((elements, 4, LANES), np.float32)
+        for e in range(elements):
+            maxwell[e] = lanes(lambda s, e=e: _series(s.prony, dt, e), 1)
+        chambers = len(self.twin.setup.cavities)
+        supply = np.zeros((steps if chambers else 1, chambers, LANES), np.float32)
+        if chambers:
+            times = torch.arange(steps, dtype=torch.float64) * dt
+            for k, ((_, b), s) in enumerate(zip(full, told, strict=True)):
+                supply[:, :, k] = _pressure(s.pressure, b).at(times).T.numpy()
+        pushes = _pushes(full, told, dt)
+        springs = [lanes(lambda s, i=i: s.springs[i].share, 1) for i in range(len(first.springs))]
+        where = [np.flatnonzero(share.any(-1)) for share in springs]
+        empty = np.zeros(0, np.int64)
+        grounds = range(len(first.grounds))
+        law = lanes(lambda s: torch.cat(torch.broadcast_tensors(s.stiffening, s.softening), -1), 1)
+        moduli = np.stack([lanes(lambda s, k=k: modulus(s, k), 1) for k in ("shear", "bulk")], 1)
+        normals = np.array([g.normal.numpy() for g in first.grounds]).reshape(-1, 3)
+        return Case(
+            dt=dt,
+            steps=steps,
+            every=every,
+            own=np.concatenate([moduli, np.zeros_like(moduli[:, :1])], 1).reshape(-1),
+            series=maxwell.reshape(-1),
+            law=law.reshape(-1),
+            stiffens=bool(law[:2].any()),
+            softens=bool(law[2].any()),
+            weight=weight,
+            left=left,
+            gravity=lanes(lambda s: s.gravity, 1),
+            fluid=lanes(lambda s: s.fluid / 2, 0),
+            place=lanes(lambda s: s.displacement, 2),
+            velocity=lanes(lambda s: s.velocity, 2),
+            supply=supply,
+            air=lanes(lambda s: s.air_stiffness, 1),
+            volume=self.volumes.astype(np.float32),
+            **pushes,
+            spring_node=np.concatenate([empty, *where]),
+            spring_share=np.concatenate(
+                [np.zeros((0, LANES), np.float32), *(w[n] for w, n in zip(springs, where, strict=True))]
+            ),
+            spring_number=np.concatenate([empty, *(np.full(len(n), i) for i, n in enumerate(where))]),
+            springs=np.stack(
+                [
+                    np.zeros(LANES, np.float32),
+                    *(lanes(lambda s, i=i: s.springs[i].stiffness, 0) for i in range(len(springs))),
+                ]
+            )[1:],
+            normals=normals.astype(np.float32),
+            stick=np.array([g.friction is None for g in first.grounds], bool),
+            offset=_rows(lanes, grounds, "offset"),
+            friction=_rows(lanes, grounds, "friction"),
+            adhesion=_rows(lanes, grounds, "adhesion"),
+            reach=_rows(lanes, grounds, "reach"),
+            area=np.array([self.twin.grid.facing(n) for n in normals], np.float32).reshape(
+                len(normals), self.twin.grid.nodes
+            ),
+        )
+
+
+def _common(s: Scenario) -> object:
+    """What the lanes of a group have in common."""
+    elements = 0 if s.prony is None else s.prony.elements
+    planes = tuple((tuple(g.normal.tolist()), g.friction is None) for g in s.grounds)
+    return elements, planes, len(s.springs)
+
+
+def _rows(lanes, grounds: range, name: str) -> np.ndarray:
+    """A number of each plane [A, 16]."""
+
+    def get(s: Scenario, i: int):
+        value = getattr(s.grounds[i], name)
+        return torch.zeros(()) if value is None else value
+
+    rows = [lanes(lambda s, i=i: get(s, i), 0) for i in grounds]
+    return np.array(rows, np.float32).reshape(len(rows), LANES)
+
+
+def _series(prony: Prony | None, dt: float, element: int) -> Tensor:
+    """Numbers of one element [..., 4]."""
+    assert prony is not None
+    a, b, g = prony.discrete(dt)[..., element, :].unbind(-1)
+    return torch.stack([g, g * b, a, b * (1 - a)], -1)
+
+
+def _pressure(supply: Waveform | None, number: int) -> Waveform:
+    """Of one variation [chambers, S]."""
+    assert supply is not None
+    p = supply.pressure if supply.pressure.ndim > 1 else supply.pressure.unsqueeze(0)
+    if p.ndim > 2:
+        p = p[number if p.shape[0] > 1 else 0]
+    return Waveform(time=supply.time.double(), pressure=p.double())
+
+
+def _pushes(full: Sequence[Lane], told: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
+    """Forces of each scenario in its own lanes."""
+    begin, nodes, shares, forces, starts = [0], [], [], [], []
+    for number in dict.fromkeys(i for i, _ in full):
+        mine = [k for k, (i, _) in enumerate(full) if i == number]
+        for push in told[mine[0]].pushes:
+            on = np.flatnonzero(push.share.numpy())
+            nodes.append(on)
+            shares.append(push.share.numpy()[on])
+            begin.append(begin[-1] + len(on))
+            force = np.zeros((3, LANES), np.float32)
+            for k in mine:
+                f = push.force
+                force[:, k] = f[full[k][1] if f.shape[0] > 1 else 0].numpy() if f.ndim > 1 else f.numpy()
+            forces.append(force)
+            # One that begins at a step does, however that is rounded.
+            starts.append(math.ceil(push.start / dt - 1e-3))
+    none = np.zeros(0)
+    return {
+        "push_begin": np.array(begin),
+        "push_node": np.concatenate([none, *nodes]).astype(np.int64),
+        "push_share": np.concatenate([none, *shares]).astype(np.float32),
+        "push": np.array(forces, np.float32).reshape(-1, 3, LANES),
+        "push_start": np.array(starts, np.int64),
+    }
+
+
+def mesh_of(twin: Twin) -> Mesh:
+    """The body for the kernels."""
+    grid = twin.grid
+    f32, whole = np.float32, np.int64
+    most = max(a.cells for a in grid.axes)
+    weights, slopes = np.zeros((2, 3, most, 2, 3), f32)
+    for i, axis in enumerate(grid.axes):
+        weights[i, : axis.cells], slopes[i, : axis.cells] = axis.table
+    wall_node, wall_value, places, axes, areas, chambers = grid.walls
+    there = np.abs(wall_value[..., 0]) > 1e-12
+    mark_node, mark_value = twin.marks()
+    sx, sy = grid.strides
+    weight = grid.collect(grid.volumes)
+    return Mesh(
+        corners=grid.corner(grid.cells).astype(whole),
+        cells=grid.cells.astype(whole),
+        weights=weights,
+        slopes=slopes,
+        stride_x=int(sx),
+        stride_y=int(sy),
+        held=twin.held | (weight == 0),
+        places=grid.places.astype(f32),
+        surface=grid.rim.astype(whole),
+        front=grid.front.astype(f32),
+        wall_begin=np.concatenate([[0], np.cumsum(there.sum(-1))]).astype(whole),
+        wall_node=wall_node[there].astype(whole),
+        wall_value=wall_value[there].astype(f32),
+        wall_place=places.astype(f32),
+        wall_axis=axes.astype(whole),
+        wall_area=areas.astype(f32),
+        wall_chamber=chambers.astype(whole),
+        mark_begin=np.arange(len(mark_node) + 1) * 27,
+        mark_node=mark_node.reshape(-1).astype(whole),
+        mark_value=mark_value.reshape(-1, 4).astype(f32),
+    )

@@ -1,0 +1,126 @@
+"""All that one simulation is told; hypotheses change it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.material import Prony
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """A plane that the body cannot pass.
+
+    Attributes:
+        normal: Unit normal to the body's side [3].
+        offset: Of the plane along it [...] m.
+        friction: Coulomb coefficient [...]; None if it holds what is pressed on it.
+        adhesion: Traction that pulls towards it, and presses on for friction [...] Pa.
+        reach: So far from it [...] m.
+    """
+
+    normal: Tensor
+    offset: Tensor
+    friction: Tensor | None
+    adhesion: Tensor
+    reach: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Push:
+    """A dead force.
+
+    Attributes:
+        share: Of each node [n], sum 1.
+        force: [..., 3] N.
+        start: When it begins [s].
+    """
+
+    share: Tensor
+    force: Tensor
+    start: float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tie:
+    """A spring from the mean place of some nodes to where that was in the undeformed body.
+
+    Attributes:
+        share: Of each node [..., n], sum 1.
+        stiffness: [...] N/m.
+    """
+
+    share: Tensor
+    stiffness: Tensor
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Scenario:
+    """All that a simulation is told; leading axes [...] are a batch of variations; float64.
+
+    Attributes:
+        stiffness: Young's modulus at each point of the body [..., P] Pa.
+        poisson_ratio: [...].
+        density: At each point [..., P] kg/m3.
+        prony: Maxwell elements.
+        stiffening: Coefficients a, b of x and x^2 in mu (1 + a x + b x^2), x = I1b - 3 [..., 2].
+        softening: Depth and range of softening below the largest x so far [..., 2].
+        air_stiffness: Pressure that a chamber loses as its volume doubles [..., chambers] Pa.
+        pressure: Supply [..., chambers, S] Pa; None without a chamber.
+        gravity: [..., 3] m/s2.
+        displacement: Of the nodes at the start [..., n, 3] m.
+        velocity: The same [..., n, 3] m/s.
+        mass: Attached to nodes [..., n] kg.
+        drag: Of nodes [..., n] N s/m.
+        fluid: Density of what surrounds the body times its drag coefficient [...] kg/m3.
+        grounds: Planes.
+        pushes: Dead forces.
+        springs: What else holds the body.
+        duration: Of the trial [s].
+        until: To be simulated until then [s]: a recording whose clock is behind goes on after the trial.
+    """
+
+    stiffness: Tensor
+    poisson_ratio: Tensor
+    density: Tensor
+    prony: Prony | None
+    stiffening: Tensor
+    softening: Tensor
+    air_stiffness: Tensor
+    pressure: Waveform | None
+    gravity: Tensor
+    displacement: Tensor
+    velocity: Tensor
+    mass: Tensor
+    drag: Tensor
+    fluid: Tensor
+    grounds: tuple[Ground, ...]
+    pushes: tuple[Push, ...]
+    springs: tuple[Tie, ...]
+    duration: float
+    until: float
+
+    def replace(self, **changes) -> Scenario:
+        """A scenario with other values."""
+        return dataclasses.replace(self, **changes)
+
+    @cached_property
+    def batch(self) -> int:
+        """Number of variations."""
+        ranks = [(self.stiffness, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
+        ranks += [(self.air_stiffness, 1), (self.gravity, 1), (self.mass, 1), (self.drag, 1)]
+        ranks += [(self.softening, 1), (self.fluid, 0), (self.displacement, 2), (self.velocity, 2)]
+        ranks += [(t, 0) for g in self.grounds for t in (g.offset, g.adhesion, g.reach, g.friction) if t is not None]
+        ranks += [(p.force, 1) for p in self.pushes] + [(s.stiffness, 0) for s in self.springs]
+        if self.prony is not None:
+            ranks.append((self.prony.moduli, 1))
+        if self.pressure is not None:
+            ranks.append((self.pressure.pressure, 2))
+        lead = torch.broadcast_shapes(*(t.shape[: t.ndim - rank] for t, rank in ranks))
+        return lead[0] if lead else 1

@@ -1,0 +1,227 @@
+"""The twin: a setup's body on a grid that fits it, and what acts on it, as one scenario that hypotheses may change."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.sim2real.data.experiment import Boundary, Box, Load, Setup, Trial
+from torchsoro.sim2real.twin.grid import Axis, Grid, divide
+from torchsoro.sim2real.twin.scenario import Ground, Push, Scenario
+from torchsoro.simulation.material import Prony
+
+STEPS = 16  # in which a force grows
+NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Motion:
+    """How markers moved; float64.
+
+    Attributes:
+        time: [S] s, evenly spaced.
+        place: [..., S, M, 3] m.
+        velocity: [..., S, M, 3] m/s.
+        gradient: Deformation gradient at the markers [..., S, M, 3, 3].
+        dt: Largest substep [s].
+    """
+
+    time: np.ndarray
+    place: np.ndarray
+    velocity: np.ndarray
+    gradient: np.ndarray
+    dt: float
+
+    def alone(self, number: int = 0) -> Motion:
+        """One of a batch."""
+        if self.place.ndim == 3:
+            return self
+        return dataclasses.replace(
+            self, place=self.place[number], velocity=self.velocity[number], gradient=self.gradient[number]
+        )
+
+    def plus(self, other: Motion, share: float = 1.0) -> Motion:
+        """With a share of another motion [S', M, ...] added, whose last values last."""
+        at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
+        return dataclasses.replace(
+            self,
+            place=self.place + share * other.place[at],
+            velocity=self.velocity + share * other.velocity[at],
+            gradient=self.gradient + share * other.gradient[at],
+        )
+
+    @property
+    def sound(self) -> np.ndarray:
+        """Which of a batch did not break down, bool [...]."""
+        return np.asarray((np.isfinite(self.place) & (np.abs(self.place) < 1e3)).all((-3, -2, -1)))
+
+
+class Twin:
+    """A body on a grid, clamped, with chambers, and markers that move with it.
+
+    Args:
+        setup: What is believed.
+        edge: Of a cell, about [m]; walls around chambers, and chambers, have more cells if they need them.
+        walls: Cells through each wall around a chamber, at least.
+        across: Cells across a body without a chamber, at least.
+
+    Raises:
+        ValueError: for a clamp that holds no part of a face, or a chamber that does not lie inside the body.
+    """
+
+    def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
+        surface = setup.surface
+        self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
+        axes = []
+        for axis in range(3):
+            begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
+            inner = sorted({c.box[side][axis] for c in setup.cavities for side in (0, 1)})
+            if inner and not begin < inner[0] < inner[-1] < end:
+                raise ValueError(
+                    f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
+                    f"{end:g} m, within the body"
+                )
+            faces = [] if surface is None else surface.faces[axis]
+            near = NEAR * setup.size[axis]
+            inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
+            breaks = [begin, *inner, end]
+            least = [walls if setup.cavities else 1] * (len(breaks) - 1)
+            # Where every interval has one cell, what is quadratic along two axes has no strain at the points.
+            widest = int(np.diff(breaks).argmax())
+            least[widest] = max(least[widest], 2, 0 if setup.cavities else across - len(inner))
+            # Two walls that share a node would pull at each other across the chamber.
+            axes.append(Axis(divide(breaks, least, edge), inner))
+        x, y, z = axes
+        self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
+        if self.grid.open:
+            raise ValueError("chamber: opens to the outside of the mesh, wanted walls all around")
+        self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]
+        self.held = np.zeros(self.grid.nodes, bool)
+        tiny = 1e-9
+        for low, high in setup.clamps:
+            on = ((self.grid.places > np.array(low) - tiny) & (self.grid.places < np.array(high) + tiny)).all(-1)
+            self.held |= on
+            if not on.any():
+                raise ValueError(f"clamp: box {low}, {high}, wanted one that holds a part of the body, in metres")
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self.grid.points)
+
+    @property
+    def positions(self) -> Tensor:
+        """Points of the body [P, 3] m."""
+        return torch.from_numpy(self.grid.points)
+
+    @property
+    def volumes(self) -> Tensor:
+        """Of the points [P] m3."""
+        return torch.from_numpy(self.grid.volumes)
+
+    @property
+    def places(self) -> Tensor:
+        """Of the nodes [n, 3] m; values there of a linear field are its coefficients."""
+        return torch.from_numpy(self.grid.places)
+
+    def depth(self, places: Tensor, axis: int, side: int) -> Tensor:
+        """How far places [..., 3] are in front of a face, within the body [m]."""
+        face = self.setup.origin[axis] + (self.setup.size[axis] if side > 0 else 0.0)
+        return side * (face - places[..., axis])
+
+    def nodal(self, amounts: Tensor) -> Tensor:
+        """Amounts [..., P] at the points, over the nodes [..., n]."""
+        return torch.from_numpy(self.grid.collect(amounts.numpy()))
+
+    def at(self, places: Tensor) -> Tensor:
+        """Shares of the nodes [B, n] of what is attached at places [B, 3] m, the nearest of the body."""
+        nodes, weights, _ = (torch.from_numpy(a) for a in self.grid.stencil(*self.grid.nearest(places.numpy())))
+        return torch.zeros(len(places), self.grid.nodes, dtype=torch.float64).scatter_add(1, nodes, weights)
+
+    def marks(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes [M, 27] of the markers, and weights and slopes [M, 27, 4]: they move with the nearest surface point."""
+        at = np.array([m.at for m in self.setup.markers], float)
+        on, cells = self.grid.nearest(at)
+        nodes, weights, slopes = self.grid.stencil(on, cells)
+        off = np.einsum("mka,ma->mk", slopes, at - on)
+        return nodes, np.concatenate([(weights + off)[..., None], slopes], -1)
+
+    def scenario(self, trial: Trial) -> Scenario:
+        """What is believed about a trial."""
+        s = trial.setup
+        prony = None
+        if s.prony:
+            pairs = torch.tensor(s.prony, dtype=torch.float64)
+            prony = Prony(moduli=pairs[:, 0].clone(), times=pairs[:, 1].clone())
+        center = torch.tensor(s.center, dtype=torch.float64)
+        spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.grid.nodes, 3)
+        nodes = self.grid.nodes
+        return Scenario(
+            stiffness=torch.full((self.count,), s.youngs_modulus, dtype=torch.float64),
+            poisson_ratio=torch.tensor(s.poisson_ratio, dtype=torch.float64),
+            density=torch.full((self.count,), s.density, dtype=torch.float64),
+            prony=prony,
+            stiffening=torch.zeros(2, dtype=torch.float64),
+            softening=torch.tensor([0.0, 1.0], dtype=torch.float64),
+            air_stiffness=torch.tensor([c.air_stiffness for c in s.cavities], dtype=torch.float64),
+            pressure=trial.pressure,
+            gravity=torch.tensor(s.gravity, dtype=torch.float64),
+            displacement=torch.zeros(nodes, 3, dtype=torch.float64),
+            velocity=torch.tensor(s.velocity, dtype=torch.float64) + torch.cross(spin, self.places - center, dim=-1),
+            mass=torch.zeros(nodes, dtype=torch.float64),
+            drag=torch.zeros(nodes, dtype=torch.float64),
+            fluid=torch.zeros((), dtype=torch.float64),
+            grounds=tuple(_ground(p) for p in s.planes),
+            pushes=tuple(
+                push for load in s.loads for push in _pushes(load, torch.from_numpy(self.grid.within(load.box)))
+            ),
+            springs=(),
+            duration=s.duration,
+            until=s.duration,
+        )
+
+
+def _pushes(load: Load, share: Tensor) -> list[Push]:
+    """A force that grows does so in steps, and one that ends meets its opposite."""
+    force, steps = torch.tensor(load.force, dtype=torch.float64), STEPS if load.ramp > 0 else 1
+    starts = [load.start + load.ramp * (k + 0.5) / steps for k in range(steps)]
+    pushes = [Push(share=share, force=force / steps, start=start) for start in starts]
+    return [*pushes, Push(share=share, force=-force, start=load.end)] if load.end < math.inf else pushes
+
+
+def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
+    """Axis and side of the face of the body that a clamp covers; None if it holds another part."""
+    low, high = box
+    thin = 1e-9
+    for axis, side in itertools.product(range(3), (-1, 1)):
+        others = [a for a in range(3) if a != axis]
+        begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
+        covers = all(
+            low[a] <= setup.origin[a] + thin and high[a] >= setup.origin[a] + setup.size[a] - thin for a in others
+        )
+        face = end if side > 0 else begin
+        if covers and low[axis] <= face + thin and high[axis] >= face - thin:
+            return axis, side
+    return None
+
+
+def _ground(plane: Boundary) -> Ground:
+    normal = torch.tensor(plane.normal, dtype=torch.float64)
+    size = float(normal.norm())
+    if not size > 0 or not math.isfinite(size):
+        raise ValueError(f"plane: normal = {plane.normal}, wanted one that is not zero")
+    unit = normal / size
+    zero = torch.zeros((), dtype=torch.float64)
+    return Ground(
+        normal=unit,
+        offset=unit @ torch.tensor(plane.point, dtype=torch.float64),
+        friction=None if isinstance(plane.friction, str) else zero + plane.friction,
+        adhesion=zero,
+        reach=zero,
+    )

@@ -1,0 +1,172 @@
+"""From a body and what acts on it to the tensors of the operator, and what is wrong with them, if anything."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.loads import Attached
+from torchsoro.simulation.material import Body
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.segment import Inputs, Scene
+
+MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # bytes that a rollout may keep for its gradient, by device
+
+
+def on_lattice(
+    scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, weight: Tensor
+) -> tuple[Scene, Inputs, Tensor, Tensor, Tensor]:
+    """From particles to the points of their lattice, in everything that counts particles."""
+    lattice = Lattice.around(x[0], scene.cell)
+    offset = (x - x[:1]).detach()
+    if bool(((offset - offset[:, :1]).abs() > 1e-3 * scene.cell).any()):
+        raise ValueError(
+            "body.position: simulations of a batch whose bodies differ by more than a shift, wanted the same lattice "
+            "for the total-Lagrangian formulation"
+        )
+    if lattice.index is None:
+        return replace(scene, lattice=lattice), whole, x, velocity, weight
+
+    def vectors(t: Tensor) -> Tensor:
+        return lattice.spread(t.transpose(-1, -2)).transpose(-1, -2)
+
+    absent = torch.full((lattice.count,), layout.ABSENT, dtype=torch.int32, device=x.device)
+    index = lattice.index
+    scene = replace(
+        scene,
+        lattice=lattice,
+        kind=absent.index_copy(0, index, scene.kind),
+        share=lattice.spread(scene.share),
+        probes=index[scene.probes],
+    )
+    whole = replace(whole, coefficients=lattice.spread(whole.coefficients))
+    return scene, whole, vectors(x), vectors(velocity), lattice.spread(weight)
+
+
+def body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
+    """Tensors of a body with loads, with the number of axes that are not a batch."""
+    body = attached.body
+    flat = (body.mass, body.volume, body.bulk, body.shear, body.viscosity, body.volume_viscosity, body.void_fraction)
+    pairs = [(t, 1) for t in (*flat, attached.spring, attached.drag) if t is not None]
+    return pairs + [(t, 2) for t in (body.velocity, body.stiffening, attached.anchor) if t is not None]
+
+
+def coefficients(attached: Attached, wide) -> Tensor:
+    """Particle coefficients [B, COEFFICIENTS, N]; ``wide`` broadcasts a tensor over the batch."""
+    body = attached.body
+    zero = torch.zeros_like(body.volume)
+    anchor = torch.zeros_like(body.position) if attached.anchor is None else attached.anchor
+    stiffening = (zero, zero) if body.stiffening is None else body.stiffening.unbind(-1)
+    rows: list[Tensor] = [torch.empty(0)] * layout.COEFFICIENTS
+    for place, values in (
+        (layout.MASS, body.mass),
+        (layout.VOLUME, body.volume),
+        (layout.BULK, body.bulk),
+        (layout.SHEAR, body.shear),
+        (layout.VISCOSITY, body.viscosity),
+        (layout.VOLUME_VISCOSITY, body.volume_viscosity),
+        (layout.SPRING, attached.spring),
+        (layout.DRAG, attached.drag),
+        (layout.VOID_FRACTION, body.void_fraction),
+        (layout.STIFFENING, stiffening[0]),
+        (layout.STIFFENING + 1, stiffening[1]),
+    ):
+        rows[place] = wide(zero if values is None else values, 1)
+    for c in range(3):
+        rows[layout.ANCHOR + c] = wide(anchor[..., c], 1)
+    return torch.stack(rows, 1)
+
+
+def supply_at(body: Body, pressure: Waveform | None, times: Tensor, **like) -> Tensor:
+    """Supply pressure [..., chambers, T + 1]."""
+    chambers = int(body.chamber.max()) + 1
+    if pressure is None:
+        return torch.zeros(chambers, len(times), **like)
+    values = pressure.at(times.to(pressure.time)).to(**like)
+    if values.ndim == 1:
+        values = values.unsqueeze(0)
+    if values.shape[-2] != chambers:
+        raise ValueError(f"pressure: {values.shape[-2]} chambers, wanted the body's {chambers}")
+    return values
+
+
+def gravity_at(gravity, times: Tensor, **like) -> Tensor:
+    """Gravity at each substep [..., T, 3]."""
+    if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
+        wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
+        if gravity[1].shape[-1] != 3:
+            raise ValueError(
+                f"gravity: shape {tuple(gravity[1].shape)}, wanted [..., S, 3] over {len(gravity[0])} times"
+            )
+        values = wave.at(times.to(gravity[0])).transpose(-1, -2).to(**like)
+    else:
+        constant = torch.as_tensor(gravity, **like)
+        if constant.shape[-1:] != (3,):
+            raise ValueError(f"gravity: shape {tuple(constant.shape)}, wanted [..., 3]")
+        values = constant.unsqueeze(-2).expand(*constant.shape[:-1], len(times), 3)
+    if not bool(torch.isfinite(values.detach()).all()):
+        raise ValueError(f"gravity = {gravity}: wanted finite numbers")
+    return values
+
+
+def check_body(body: Body) -> None:
+    """Refuse a body of wrong shapes, precision, device or values."""
+    x = body.position
+    if x.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"body.position: dtype {x.dtype}, wanted float32 or float64")
+    if x.device.type not in MEMORY or (x.is_cuda and x.dtype != torch.float32):
+        raise ValueError(f"body.position: {x.dtype} on {x.device}, wanted float32 on cuda, or either precision on cpu")
+    if x.ndim < 2:
+        raise ValueError(f"body.position: shape {tuple(x.shape)}, wanted [..., N, 3]")
+    count = x.shape[-2]
+    if body.chamber.shape != (count,):
+        raise ValueError(f"body.chamber: shape {tuple(body.chamber.shape)}, wanted [{count}]")
+    for name in (
+        "position",
+        "velocity",
+        "mass",
+        "volume",
+        "bulk",
+        "shear",
+        "viscosity",
+        "volume_viscosity",
+        "void_fraction",
+        "drag",
+        "stiffening",
+    ):
+        value = getattr(body, name)
+        if value is None:
+            continue
+        if value.dtype != x.dtype or value.device != x.device:
+            raise ValueError(f"body.{name}: {value.dtype} on {value.device}, wanted {x.dtype} on {x.device}")
+        vector = name in ("position", "velocity", "stiffening")
+        tail = (count, 2 if name == "stiffening" else 3) if vector else (count,)
+        if tuple(value.shape[-len(tail) :]) != tail:
+            raise ValueError(f"body.{name}: shape {tuple(value.shape)}, wanted [..., {', '.join(map(str, tail))}]")
+        finite = torch.isfinite(value.detach())
+        least = value.detach() > 0 if name in ("mass", "volume") else value.detach() >= 0
+        if not bool((finite if vector else finite & least).all()):
+            wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
+            bad = value.detach()[~(finite if vector else finite & least)][0]
+            raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
+
+
+def check_weight(weight: Tensor, count: int) -> Tensor:
+    """Refuse weights [..., N] that are not finite or all zero."""
+    if weight.shape[-1:] != (count,):
+        raise ValueError(f"weight: shape {tuple(weight.shape)}, wanted [..., {count}]")
+    if not bool(torch.isfinite(weight.detach()).all() & (weight.detach().sum(-1) > 0).all()):
+        raise ValueError("weight: not finite or all zero, wanted finite numbers with a positive sum")
+    return weight
+
+
+def check_probes(probes: Tensor, count: int) -> None:
+    """Refuse probes that are not indices of particles."""
+    if probes.dtype != torch.int64 or probes.ndim != 1:
+        raise ValueError(f"probes: {probes.dtype} of shape {tuple(probes.shape)}, wanted int64 [P]")
+    if len(probes) and (int(probes.min()) < 0 or int(probes.max()) >= count):
+        raise ValueError(f"probes: {int(probes.min())} to {int(probes.max())}, wanted 0 to {count - 1}")

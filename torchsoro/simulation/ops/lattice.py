@@ -1,0 +1,253 @@
+"""The reference lattice of the total-Lagrangian form: where particles lie on it, and sums over it in plain torch."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.kernels import layout
+
+# Places of a cell's two points per axis: the two of Gauss, for which the pressure of a uniformly deformed chamber does
+# no work inside it; and those of the particles, where motion is recorded.
+QUADRATURE = 0.5 / math.sqrt(3.0)
+PARTICLES = 0.25
+# The centre of the matter that a node outside of a face carries is 3/4 of a cell away, the face half a cell.
+_DEPTH = 0.25
+_OFF = 1e-3  # how far a particle may be from its place, in particle spacings
+
+
+@lru_cache(maxsize=256)
+def spline(count: int, place: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Weights of a line's nodes at its points, the distances from node to point, and the slopes; in cells.
+
+    Args:
+        count: Points along the axis, an even number.
+        place: Of the two points of a cell, from its centre.
+
+    Returns:
+        Three float64 matrices [count, count / 2 + 2].
+    """
+    cells = count // 2
+    weight, slope = torch.zeros(2, count, cells + 2, dtype=torch.float64)
+    cell = torch.arange(cells)
+    for odd, sign in enumerate((-1, 1)):
+        f = 1 + sign * place
+        numbers = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2)
+        slopes = (f - 1.5, -2 * (f - 1), f - 0.5)
+        for k in range(3):
+            weight[2 * cell + odd, cell + k] = numbers[k]
+            slope[2 * cell + odd, cell + k] = slopes[k]
+    points = (
+        (torch.arange(count) // 2).double() + 0.5 + torch.tensor([-place, place], dtype=torch.float64).repeat(cells)
+    )
+    nodes = torch.arange(cells + 2).double() - 0.5
+    return weight, points[:, None] - nodes[None, :], slope
+
+
+@lru_cache(maxsize=1024)
+def _matrix(kind: str, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A matrix [points, nodes] of an axis: "weight", "slope" (1/cell), "moment" (cells), "mark", or "back"."""
+    weight, distance, slope = spline(count, QUADRATURE)
+    mark = spline(count, PARTICLES)[0]
+    if kind == "back":
+        found = torch.linalg.pinv(mark).T
+    else:
+        found = {"weight": weight, "slope": slope, "moment": weight * distance, "mark": mark}[kind]
+    return found.to(dtype=dtype, device=device)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Lattice:
+    """A box of 2 x 2 x 2 points per cell around a body, and its nodes.
+
+    Attributes:
+        points: Points along x, y, z; even numbers.
+        low: Lower corner [m].
+        cell: Edge of a cell [m].
+        index: int64 [N], the point of each particle; None if there is one for each, in the same order.
+    """
+
+    points: tuple[int, int, int]
+    low: tuple[float, float, float]
+    cell: float
+    index: Tensor | None = None
+
+    @classmethod
+    def around(cls, position: Tensor, cell: float) -> Lattice:
+        """The lattice of an undeformed body.
+
+        Args:
+            position: [N, 3] m, on a lattice of two particles per cell and axis, parallel to the axes.
+            cell: [m].
+
+        Raises:
+            ValueError: if the particles are not on such a lattice, or two share a place.
+        """
+        x = position.detach().double()
+        h = cell / 2
+        low = x.amin(0) - h / 2
+        place = (x - low) / h - 0.5
+        whole = place.round().long()
+        # From the middle of all, lest the lowest particle's rounding counts.
+        off = place - whole
+        off = (off - off.mean(0)).abs().amax(1)
+        if bool((off > _OFF).any()):
+            worst = int(off.argmax())
+            raise ValueError(
+                f"body.position: particle {worst} at {tuple(x[worst].tolist())} m is {float(off[worst]):.2g} spacings "
+                f"off its place, wanted an undeformed lattice of spacing {h:g} m (half a cell) parallel to the axes "
+                "for the total-Lagrangian formulation"
+            )
+        counts = (whole.amax(0) + 1).tolist()
+        nx, ny, nz = (n + n % 2 for n in counts)
+        index = (whole[:, 0] * ny + whole[:, 1]) * nz + whole[:, 2]
+        if len(torch.unique(index)) < len(index):
+            raise ValueError("body.position: two particles share a lattice place, wanted one particle for each")
+        every = len(index) == nx * ny * nz and bool((index == torch.arange(len(index), device=x.device)).all())
+        a, b, c = low.tolist()
+        return cls(points=(nx, ny, nz), low=(a, b, c), cell=cell, index=None if every else index)
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return math.prod(self.points)
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Nodes along x, y, z."""
+        nx, ny, nz = (n // 2 + 2 for n in self.points)
+        return nx, ny, nz
+
+    @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return math.prod(self.shape)
+
+    def spread(self, values: Tensor, empty: float = 0.0) -> Tensor:
+        """From particles to points: [..., N] to [..., points], differentiable."""
+        if self.index is None:
+            return values
+        wide = values.new_full((*values.shape[:-1], self.count), empty)
+        return wide.index_copy(-1, self.index, values)
+
+    @cached_property
+    def places(self) -> Tensor:
+        """Reference places of the particles of all points [points, 3] m, float64."""
+        axes = [
+            low + (torch.arange(n).double() + 0.5) * self.cell / 2 for n, low in zip(self.points, self.low, strict=True)
+        ]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+    @cached_property
+    def node_places(self) -> Tensor:
+        """Reference places of the nodes [nodes, 3] m, float64."""
+        axes = [low + (torch.arange(n).double() - 0.5) * self.cell for n, low in zip(self.shape, self.low, strict=True)]
+        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+
+    def to_nodes(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
+        """Sum over points, with weights or another kind of matrix (and one more along an axis): [..., nodes]."""
+        wx, wy, wz = self._matrices(values, kind, along)
+        wide = values.reshape(-1, *self.points)
+        return torch.einsum("bxyz,xi,yj,zk->bijk", wide, wx, wy, wz).reshape(*values.shape[:-1], self.nodes)
+
+    def to_points(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
+        """Sum over nodes, likewise: [..., nodes] to [..., points]."""
+        wx, wy, wz = self._matrices(values, kind, along)
+        wide = values.reshape(-1, *self.shape)
+        return torch.einsum("bijk,xi,yj,zk->bxyz", wide, wx, wy, wz).reshape(*values.shape[:-1], self.count)
+
+    def _matrices(self, like: Tensor, kind: str, along: tuple[int, str] | None) -> list[Tensor]:
+        kinds = [along[1] if along and a == along[0] else kind for a in range(3)]
+        return [_matrix(k, n, like.dtype, like.device) for k, n in zip(kinds, self.points, strict=True)]
+
+    def nodal(self, mass: Tensor, drag: Tensor, dt: float) -> Tensor:
+        """What kernels need to know of the nodes.
+
+        Args:
+            mass: Of the points [B, points] kg.
+            drag: Drag coefficient of the points [B, points] N s/m.
+            dt: Substep [s].
+
+        Returns:
+            [B, 5, nodes], differentiable: mass in kg; the way from the node to the surface of the matter that it
+            carries, along x, y, z in cells; what drag, taken implicitly, leaves of its velocity in a substep.
+        """
+        total = self.to_nodes(mass)
+        there = total > 0
+        safe = torch.where(there, total, torch.ones_like(total))
+        ways = []
+        for axis in range(3):
+            center = self.to_nodes(mass, along=(axis, "moment")) / safe
+            way = torch.sign(center) * torch.relu(center.abs() - _DEPTH - 1e-6)
+            ways.append(torch.where(there, way, torch.zeros_like(way)))
+        left = safe / (safe + dt * self.to_nodes(drag))
+        return torch.stack([total, *ways, left], 1)
+
+    def gradient(self, field: Tensor) -> Tensor:
+        """Gradient at all places of quadrature of a nodal vector field: [B, 3, nodes] to [B, 3, 3, points]."""
+        return torch.stack([self.to_points(field, along=(axis, "slope")) / self.cell for axis in range(3)], 2)
+
+    def stencil(self, points: Tensor, *, place: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Nodes of some points, their weights, and slopes.
+
+        Args:
+            points: int64 [P].
+            place: ``QUADRATURE`` or ``PARTICLES``.
+
+        Returns:
+            int64 [P, 27]; [P, 27]; [P, 3, 27] in 1/m.
+        """
+        points = points.cpu()
+        _, ny, nz = self.points
+        _, my, mz = self.shape
+        low = torch.stack([points // (ny * nz), points // nz % ny, points % nz], 1)
+        weights, slopes = [], []
+        for axis in range(3):
+            weight, _, slope = spline(self.points[axis], place)
+            columns = (low[:, axis] // 2)[:, None] + torch.arange(3)
+            weights.append(weight[low[:, axis, None], columns])
+            slopes.append(slope[low[:, axis, None], columns] / self.cell)
+        corner = ((low[:, 0] // 2) * my + low[:, 1] // 2) * mz + low[:, 2] // 2
+        three = torch.arange(3)
+        offsets = ((three[:, None, None] * my + three[None, :, None]) * mz + three[None, None, :]).reshape(-1)
+
+        def product(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+            return torch.einsum("pi,pj,pk->pijk", x, y, z).reshape(len(points), 27)
+
+        by_axis = [product(*(slopes[a] if a == axis else weights[a] for a in range(3))) for axis in range(3)]
+        return corner[:, None] + offsets, product(*weights), torch.stack(by_axis, 1)
+
+    def project(self, values: Tensor, present: Tensor) -> Tensor:
+        """Nodal values of a vector field that is known at the particles: exact for an affine field.
+
+        Args:
+            values: [B, points, 3].
+            present: bool [points], where there is a particle.
+
+        Returns:
+            [B, 3, nodes], by least squares.
+        """
+        like = values.double()
+        where, nodes = self.places.to(like), self.node_places.to(like)
+        middle = where[present].mean(0)
+        arms = torch.cat([torch.ones_like(where[:, :1]), (where - middle) / self.cell], 1)
+        held = arms[present]
+        affine = torch.linalg.lstsq(held.T @ held, torch.eye(4).to(like), driver="gelsd" if not like.is_cuda else None)
+        fit = affine.solution @ held.T @ like[:, present]
+        rest = torch.where(present[:, None], like - arms @ fit, torch.zeros_like(like)).transpose(1, 2)
+        node_arms = torch.cat([torch.ones_like(nodes[:, :1]), (nodes - middle) / self.cell], 1)
+        found = (node_arms @ fit).transpose(1, 2) + self.to_nodes(rest, "back")
+        return found.to(values.dtype)
+
+
+def numbers(lattice: Lattice, dt: float) -> list[float]:
+    """What kernels need to know of a lattice, in the order of ``kernels.layout``."""
+    weight, _, slope = spline(2, QUADRATURE)
+    table = [*weight.reshape(-1).tolist(), *(slope / lattice.cell).reshape(-1).tolist()]
+    found = [dt, lattice.cell, *lattice.low, *table]
+    assert len(found) == layout.LATTICE_NUMBERS
+    return found

@@ -1,0 +1,412 @@
+"""The simulator: a body, what acts on it, and how long, to a named trajectory; differentiable in all of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.assembly import (
+    MEMORY,
+    body_tensors,
+    check_body,
+    check_probes,
+    check_weight,
+    coefficients,
+    gravity_at,
+    on_lattice,
+    supply_at,
+)
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.loads import Load, attach
+from torchsoro.simulation.material import Body, Prony
+from torchsoro.simulation.ops.rollout import initial_state, rollout
+from torchsoro.simulation.ops.segment import Inputs, Scene
+from torchsoro.simulation.ops.total import total_state
+from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
+
+TRANSFERS = {"apic": 0.0, "flip": 1.0}
+FORMULATIONS = ("updated", "total")
+_LARGEST = 2**31 - 1  # Taichi indexes a buffer with 32 bits
+_NODE_SHARE = 1.15  # what is kept of the nodes, for each byte of particle state
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """What was recorded; the leading batch is there only if something simulated had one.
+
+    Attributes:
+        time: [S] s.
+        position: Probes [..., S, P, 3] m.
+        velocity: Probes [..., S, P, 3] m/s.
+        center_of_gravity: [..., S, 3] m, weighted as asked for.
+        center_velocity: [..., S, 3] m/s.
+        chamber_volume: Gas volume of each chamber [..., S, chambers] m3.
+        chamber_pressure: Mean gas pressure (Eq. 10) of each chamber [..., S, chambers] Pa.
+        probes: int64 [P] particle indices.
+        final: Last state, in the layout of the formulation; with it a later run can go on.
+        dt: Substep [s].
+    """
+
+    time: Tensor
+    position: Tensor
+    velocity: Tensor
+    center_of_gravity: Tensor
+    center_velocity: Tensor
+    chamber_volume: Tensor
+    chamber_pressure: Tensor
+    probes: Tensor
+    final: Tensor
+    dt: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """How a rollout is kept for its gradient.
+
+    Attributes:
+        segment: Substeps between two kept states.
+        keep: Keep every state of a segment in the forward pass, so that backward need not compute it again.
+        memory: What this takes [bytes].
+    """
+
+    segment: int
+    keep: bool
+    memory: int
+
+
+def plan_checkpoints(
+    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = _NODE_SHARE
+) -> Plan:
+    """Choose a plan within a memory budget: everything kept if it fits, else segments.
+
+    Args:
+        steps: Substeps of the rollout.
+        state_bytes: Bytes of one state.
+        element_bytes: Bytes of a number, 4 or 8.
+        budget: Bytes.
+        node_share: What is kept of a step in all, over the state.
+
+    Raises:
+        ValueError: if no plan fits; says the smallest budget that does.
+    """
+    each = int(state_bytes * node_share)
+    most = max(1, _LARGEST * element_bytes // state_bytes - 1)
+    if each * (steps + 1) <= budget and steps <= most:
+        return Plan(segment=steps, keep=True, memory=each * (steps + 1))
+    # Long segments cost little more than short ones to begin with, so the longest that leave room for their starts.
+    segment = min(most, steps, math.isqrt(steps) + 1)
+    least = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    if least > budget:
+        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")
+    segment = min(most, max(segment, (budget - least) // each))
+    memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    return Plan(segment=segment, keep=False, memory=memory)
+
+
+class Simulator(nn.Module):
+    """Differentiable visco-hyperelastic material point method, in two formulations.
+
+    - "updated": MLS-MPM, the paper's. The grid stays, particles move through it; bodies meet each other on the grid.
+    - "total": total-Lagrangian. The grid is the body's own lattice and moves with it: no loss of energy, the same bits
+      in every run, several times faster. Needs particles on a lattice of half a cell, chambers have one pressure each,
+      and a body does not feel itself where it folds (see ``selfcontact``).
+
+    A call simulates a body and returns a :class:`Trajectory`. Gradients flow to every tensor of the body, the Prony
+    series, pressure, gravity, planes and loads that requires one.
+
+    Args:
+        cell: Grid cell dx [m].
+        dt: Substep [s]; "auto" takes the largest that is stable for the body at hand and divides the sampling interval.
+        low: Lower corner of the analysis box [m].
+        high: Upper corner of the analysis box [m].
+        transfer: "apic" (the paper's; damps a little at every substep) or "flip" (affine FLIP; hardly damps); of the
+            updated formulation.
+        formulation: "updated" or "total".
+        memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 16 GiB on CUDA if None.
+        segment: Substeps between two kept states, instead of the plan from the budget; for tests.
+        safety: Share of the largest stable step that dt = "auto" takes.
+
+    Raises:
+        ValueError: for numbers that are not finite and positive, an empty box, or an unknown transfer.
+    """
+
+    def __init__(
+        self,
+        *,
+        cell: float,
+        dt: float | Literal["auto"],
+        low: Sequence[float],
+        high: Sequence[float],
+        transfer: str = "apic",
+        formulation: Literal["updated", "total"] = "updated",
+        memory_budget: int | None = None,
+        segment: int | None = None,
+        safety: float = 0.9,
+    ) -> None:
+        super().__init__()
+        numbers = {"cell": cell, "dt": dt, "memory_budget": memory_budget, "segment": segment, "safety": safety}
+        if dt == "auto":
+            del numbers["dt"]
+        for name, value in numbers.items():
+            if isinstance(value, str) or (value is not None and not (math.isfinite(value) and value > 0)):
+                raise ValueError(f"{name} = {value}: wanted finite and positive")
+        if len(low) != 3 or len(high) != 3 or not all(b - a > 6 * cell for a, b in zip(low, high, strict=True)):
+            raise ValueError(f"low, high = {tuple(low)}, {tuple(high)}: wanted three numbers each, over 6 cells apart")
+        if transfer not in TRANSFERS:
+            raise ValueError(f"transfer = {transfer!r}: wanted one of {', '.join(map(repr, TRANSFERS))}")
+        if formulation not in FORMULATIONS:
+            raise ValueError(f"formulation = {formulation!r}: wanted one of {', '.join(map(repr, FORMULATIONS))}")
+        self.cell, self.transfer, self.safety = float(cell), transfer, safety
+        self.formulation: Literal["updated", "total"] = formulation
+        self.dt: float | Literal["auto"] = "auto" if dt == "auto" else float(dt)
+        self.low, self.high = _triple(low), _triple(high)
+        self.memory_budget, self.segment = memory_budget, segment
+
+    def extra_repr(self) -> str:
+        """For ``print``."""
+        how = f"transfer={self.transfer!r}" if self.formulation == "updated" else "formulation='total'"
+        return f"cell={self.cell:g} m, dt={self.dt} s, {how}"
+
+    def forward(
+        self,
+        body: Body,
+        *,
+        duration: float,
+        prony: Prony | None = None,
+        pressure: Waveform | None = None,
+        gravity: Tensor | Sequence[float] | tuple[Tensor, Tensor] = (0.0, 0.0, -9.81),
+        planes: Sequence[Plane] = (),
+        loads: Sequence[Load] = (),
+        sample_every: float | None = None,
+        probes: Tensor | None = None,
+        weight: Tensor | None = None,
+        start: Tensor | None = None,
+    ) -> Trajectory:
+        """Simulate.
+
+        Args:
+            body: Particles; leading axes are a batch of independent simulations, and so are those of what follows.
+            duration: [s], a whole number of substeps.
+            prony: Maxwell elements of the solids.
+            pressure: Gauge pressure p_act of the chambers [..., chambers, S], or [S] for a single chamber.
+            gravity: [..., 3] m/s2; or a pair of times [S] and values [..., S, 3], interpolated linearly.
+            planes: Ground and walls.
+            loads: What is attached.
+            sample_every: Time between two samples [s], a whole number of substeps; about a hundred samples if None.
+            probes: Particles to record, int64 [P]; none if None.
+            weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None.
+            start: State to go on from (``Trajectory.final``) instead of the undeformed body.
+
+        Returns:
+            The trajectory, sampled at 0, ``sample_every``, ... and at the end.
+
+        Raises:
+            ValueError: for bad input, before any work; also if dt is above the limit of the fastest wave.
+            SimulationDiverged: if a particle leaves the box, collapses or is no longer finite.
+        """
+        x = body.position
+        like = {"dtype": x.dtype, "device": x.device}
+        if self.dt != "auto":
+            steps, every = _steps(duration, sample_every, self.dt)
+        check_body(body)
+        if start is None:
+            self._check_inside(x)
+        dt = self.step(body, prony, duration=duration, sample_every=sample_every)
+        steps, every = _steps(duration, sample_every, dt)
+        attached = attach(body, loads)
+        body = attached.body
+
+        times = torch.arange(steps + 1, dtype=torch.float64, device=x.device) * dt
+        supply = supply_at(body, pressure, times, **like)
+        pull = gravity_at(gravity, times[:-1], **like)
+        forces = [force.at(times[:-1]).to(**like) for force in attached.forces]
+        maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(dt).to(**like)
+        numbers = [[torch.as_tensor(n, **like) for n in plane.numbers()] for plane in planes]
+        mass = body.mass if weight is None else check_weight(weight, x.shape[-2]).to(**like)
+
+        ranks = [(x, 2), (maxwell, 2), (supply, 2), (pull, 2), (mass, 1), *((f, 2) for f in forces)]
+        ranks += [(n, 0) for plane in numbers for n in plane]
+        ranks += [(t, t_rank) for t, t_rank in body_tensors(attached)]
+        leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
+        try:
+            lead = torch.broadcast_shapes(*leads)
+        except RuntimeError:
+            seen = ", ".join(map(str, sorted({axes for axes in leads if axes})))
+            raise ValueError(f"leading axes {seen}: wanted batches that broadcast against each other") from None
+        batch = math.prod(lead)
+
+        def wide(t: Tensor, rank: int) -> Tensor:
+            tail = t.shape[t.ndim - rank :]
+            return t.expand((*lead, *tail)).reshape((batch, *tail))
+
+        planes_tensor = torch.zeros(batch, 0, 3, **like)
+        if planes:
+            planes_tensor = torch.stack([torch.stack([wide(n, 0) for n in p], -1) for p in numbers], 1)
+        force_tensor = torch.zeros(steps, batch, 0, 3, **like)
+        if forces:
+            force_tensor = torch.stack([wide(f, 2).transpose(0, 1) for f in forces], 2)
+        whole = Inputs(
+            coefficients=coefficients(attached, wide),
+            prony=wide(maxwell, 2),
+            pressure=wide(supply, 2).permute(2, 0, 1),
+            gravity=wide(pull, 2).transpose(0, 1),
+            force=force_tensor,
+            planes=planes_tensor,
+            origin=self._origin(planes, planes_tensor, batch, **like),
+        )
+        scene = Scene(
+            dt=dt,
+            cell=self.cell,
+            blend=TRANSFERS[self.transfer],
+            low=self.low,
+            high=self.high,
+            kind=body.chamber.to(device=x.device, dtype=torch.int32),
+            share=attached.share,
+            plane_kind=torch.tensor(
+                [[p.axis, p.side, int(p.sticks)] for p in planes], dtype=torch.int32, device=x.device
+            ).reshape(-1, 3),
+            springs=attached.spring is not None,
+            viscous=_present(body, body.viscosity, body.volume_viscosity),
+            stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
+            probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
+        )
+        check_probes(scene.probes, x.shape[-2])
+        velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
+        x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
+        if self.formulation == "total":
+            scene, whole, x, velocity, weights = on_lattice(scene, whole, x, velocity, weights)
+        state = start
+        if state is None and scene.lattice is not None:
+            there = scene.kind != layout.ABSENT
+            state = total_state(scene.lattice, x, velocity, there, maxwell.shape[-2])
+        elif state is None:
+            state = initial_state(x, velocity, maxwell.shape[-2])
+        samples = sorted({*range(0, steps + 1, every), steps})
+        seen, final = self._march(scene, whole, state, weights, samples)
+        shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in seen]
+        where = torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device)
+        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
+
+    def _march(
+        self, scene: Scene, whole: Inputs, state: Tensor, weight: Tensor, samples: list[int]
+    ) -> tuple[list[Tensor], Tensor]:
+        """Run the segments of the plan one after the other."""
+        steps = whole.gravity.shape[0]
+        differentiable = torch.is_grad_enabled() and any(
+            t.requires_grad for t in (state, weight, *(getattr(whole, f.name) for f in fields(whole)))
+        )
+        segment, keep = steps, False
+        if differentiable:
+            budget = self.memory_budget or MEMORY[state.device.type]
+            plan = plan_checkpoints(
+                steps=steps,
+                state_bytes=state.numel() * state.element_size(),
+                node_share=_NODE_SHARE if scene.lattice is None else 1 + 3 * scene.lattice.nodes / state.shape[1],
+                element_bytes=state.element_size(),
+                budget=budget,
+            )
+            segment, keep = (plan.segment, plan.keep) if self.segment is None else (self.segment, False)
+        parts: list[tuple[Tensor, ...]] = []
+        for first in range(0, steps, segment):
+            last = min(first + segment, steps)
+            inside = tuple(k - first for k in samples if first < k <= last or k == first == 0)
+            cut = replace(
+                whole,
+                pressure=whole.pressure[first : last + 1],
+                gravity=whole.gravity[first:last],
+                force=whole.force[first:last],
+            )
+            state, *seen = rollout(scene, cut, state, weight, first=first, samples=inside, keep=keep)
+            parts.append(tuple(seen))
+        return [torch.cat(each) for each in zip(*parts, strict=True)], state
+
+    def _check_inside(self, x: Tensor) -> None:
+        low, high = (x.new_tensor(corner) for corner in (self.low, self.high))
+        places = x.detach().reshape(-1, 3)
+        outside = ((places <= low + self.cell) | (places >= high - self.cell)).any(-1)
+        if bool(outside.any()):
+            raise ValueError(
+                f"body.position: a particle at {tuple(places[outside][0].tolist())} m, wanted inside the analysis box "
+                f"from {self.low} to {self.high} m and a cell of {self.cell:g} m away from its faces"
+            )
+
+    def step(self, body: Body, prony: Prony | None, *, duration: float, sample_every: float | None = None) -> float:
+        """The substep [s] of a call, which every call asks for first.
+
+        Args:
+            body: Particles.
+            prony: Maxwell elements of the solids.
+            duration: [s].
+            sample_every: Time between two samples [s].
+
+        Raises:
+            ValueError: if a given step is above the stability limit of the body's fastest wave; says the term that sets
+                it.
+        """
+        if self.dt == "auto":
+            limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation)
+            each = duration / 100 if sample_every is None else sample_every
+            return each / math.ceil(each / limit)
+        found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation)
+        if found.number > STABLE_COURANT:
+            limit = self.dt * STABLE_COURANT / found.number
+            raise ValueError(
+                f"dt = {self.dt:g} s: above the limit of about {limit:.3g} s, set by {found.term} "
+                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {STABLE_COURANT})"
+            )
+        return self.dt
+
+    def _origin(self, planes: Sequence[Plane], numbers: Tensor, batch: int, **like) -> Tensor:
+        """A grid node of each simulation: on the first plane of each axis, else the box's lower corner."""
+        columns = []
+        for axis in range(3):
+            first = next((i for i, plane in enumerate(planes) if plane.axis == axis), None)
+            low = torch.full((batch,), self.low[axis], **like)
+            columns.append(low if first is None else numbers[:, first, layout.PLANE_OFFSET])
+        return torch.stack(columns, -1)
+
+
+def _named(seen: list[Tensor]) -> dict[str, Tensor]:
+    names = (
+        "position",
+        "velocity",
+        "center_of_gravity",
+        "center_velocity",
+        "chamber_volume",
+        "chamber_pressure",
+    )
+    return dict(zip(names, seen, strict=True))
+
+
+def _steps(duration: float, sample_every: float | None, dt: float) -> tuple[int, int]:
+    """Substeps in all, and between two samples."""
+    steps = _whole("duration", duration, dt)
+    return steps, max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, dt)
+
+
+def _whole(name: str, value: float, dt: float) -> int:
+    """How many substeps a time is."""
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{name} = {value}: wanted finite and positive")
+    steps = round(value / dt)
+    if steps < 1 or abs(steps * dt - value) > 1e-6 * value:
+        raise ValueError(f"{name} = {value:g} s: wanted a whole number of substeps of {dt:g} s")
+    return steps
+
+
+def _present(body: Body, *coefficients: Tensor | None) -> bool:
+    """Whether a solid has any of these coefficients [..., N], or one that is yet to be found."""
+    given = [v for v in coefficients if v is not None]
+    return any(v.requires_grad or bool((v[..., body.chamber < 0] != 0).any()) for v in given)
+
+
+def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
