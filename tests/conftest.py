@@ -38,12 +38,19 @@ def pytest_configure(config: pytest.Config) -> None:
         coverage.options.cov_fail_under = 0
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The flag that runs everything."""
+    parser.addoption("--slow", action="store_true", help="run the tests that are marked slow, too")
+
+
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give the marker ``gpu`` to every test that asks for the fixture ``cuda``."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Give the marker ``gpu`` to every test that asks for the fixture ``cuda``, and skip slow ones without ``--slow``."""
     for item in items:
         if "cuda" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.gpu)
+        if item.get_closest_marker("slow") is not None and not config.option.slow:
+            item.add_marker(pytest.mark.skip(reason="slow: runs with --slow"))
 
 
 @pytest.fixture

@@ -67,7 +67,7 @@ def test_floor_of_the_papers_walker_is_its_state_there_and_back():
 # The naive step ---------------------------------------------------------------------------------------------------
 
 
-def test_naive_step_falls_freely_and_keeps_its_momentum(recipes):
+def test_naive_step_falls_freely_and_keeps_its_momentum():
     domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())
     dt, steps, cell = 2e-5, 20, domain.cell
@@ -76,25 +76,25 @@ def test_naive_step_falls_freely_and_keeps_its_momentum(recipes):
         stepper.step()
     speed = -9.81 * dt * steps
     torch.testing.assert_close(
-        naive.velocity, torch.tensor([0.0, 0.0, speed]).expand(domain.count, 3), rtol=1e-4, atol=1e-8
+        stepper.velocity, torch.tensor([0.0, 0.0, speed]).expand(domain.count, 3), rtol=1e-4, atol=1e-8
     )
     fallen = -9.81 * dt**2 * steps * (steps + 1) / 2
-    assert float((naive.position - body.position)[:, 2].mean()) == pytest.approx(fallen, rel=1e-3)
+    assert float((stepper.position - body.position)[:, 2].mean()) == pytest.approx(fallen, rel=1e-3)
 
     generator = torch.Generator().manual_seed(0)
     noise = 0.1 * torch.randn(domain.count, 3, generator=generator)
-    naive.v.from_numpy(noise.numpy())
+    stepper.v.from_numpy(noise.numpy())
     before = (body.mass.double()[:, None] * noise.double()).sum(0)
     for _ in range(steps):
         stepper.step(20e3)
-    after = (body.mass.double()[:, None] * naive.velocity.double()).sum(0)
+    after = (body.mass.double()[:, None] * stepper.velocity.double()).sum(0)
     gained = torch.tensor([0.0, 0.0, speed]).double() * body.mass.double().sum()
     scale = float((body.mass[:, None] * noise.abs()).sum())
     torch.testing.assert_close(after - before, gained, rtol=0, atol=1e-6 * scale)
-    assert not torch.allclose(naive.velocity, noise, atol=0.01)
+    assert not torch.allclose(stepper.velocity, noise, atol=0.01)
 
 
-def test_naive_step_is_the_simulators(recipes):
+def test_naive_step_is_the_simulators():
     domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())
     generator = torch.Generator().manual_seed(0)
@@ -114,9 +114,9 @@ def test_naive_step_is_the_simulators(recipes):
     )
     assert float((seen.position[-1] - seen.position[0]).abs().max()) > 1e-5
     # The two add up a stress in another order; 4e-8 is ten units in the last place of a place of 35 mm.
-    torch.testing.assert_close(naive.position, seen.position[-1], rtol=0, atol=4e-8)
+    torch.testing.assert_close(stepper.position, seen.position[-1], rtol=0, atol=4e-8)
     # Random velocities of 0.1 m/s: a thousandth, as rounding decides whether a node that hardly moves is held.
-    torch.testing.assert_close(naive.velocity, seen.velocity[-1], rtol=0, atol=1e-4)
+    torch.testing.assert_close(stepper.velocity, seen.velocity[-1], rtol=0, atol=1e-4)
 
 
 # The sections -----------------------------------------------------------------------------------------------------

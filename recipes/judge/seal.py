@@ -12,7 +12,6 @@ may be off by 10 %, the pressure by 5 %, beside clock, scale, frame, marker plac
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
 import multiprocessing
@@ -25,12 +24,12 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
+from believed import believed_motion
 from camera import DECOYS, Errors, decoy, draw_errors, film, instants
 from effects import LIBRARY, OUTSIDE, Effect, own_world
 from experiment import Trial, toml
 from lobatto import Floats
 from march import Broken, March, case_of
-from scipy.interpolate import CubicSpline
 from specimens import SPECIMENS, Specimen, mesh_for
 from visible import detectability
 from world import Line, World
@@ -95,18 +94,6 @@ def _motion(specimen: Specimen, trial: Trial, number: int, world: World, errors:
     points = np.array([m["at"] for m in specimen.setup["marker"]], float)
     nodes, shapes = mesh.interpolation(np.concatenate([points + np.asarray(errors.places), points]))
     return March(case, world).run(instants(specimen, errors, trial.name)[1], nodes, shapes)
-
-
-@functools.cache
-def believed_motion(name: str, number: int, world: World, finer: float) -> CubicSpline:
-    """Stated markers over time in one trial, had the experimenter been right in all but ``world``."""
-    specimen = SPECIMENS[name]()
-    trial = specimen.trials[number]
-    mesh = mesh_for(name, finer)
-    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
-    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
-    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-    return CubicSpline(t, March(case, world).run(t, *mesh.interpolation(points)))
 
 
 def unsure(specimen: Specimen, times: dict[int, Floats], finer: float) -> list[list[Floats]]:

@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 import tyro
+from believed import believed_motion
 from experiment import Recording, Trial, read_setup
 from lobatto import Floats
 from march import March, case_of, mesh_of
-from seal import believed_motion
 from specimens import SPECIMENS, mesh_for
 from world import Lump, World
 
