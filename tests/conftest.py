@@ -45,7 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Give the marker ``gpu`` to every test that asks for the fixture ``cuda``, and skip slow ones without ``--slow``."""
+    """Mark every test that asks for the fixture ``cuda`` as ``gpu``; skip slow ones without ``--slow``."""
     for item in items:
         if "cuda" in getattr(item, "fixturenames", ()):
             item.add_marker(pytest.mark.gpu)
