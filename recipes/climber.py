@@ -12,6 +12,7 @@ Every number of the settings can be overridden: --help lists them. The loop is `
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import CLIMBER
@@ -32,7 +33,16 @@ def main(settings: Settings) -> dict[str, float]:
     return design(climber(dataclasses.replace(settings, robot="climber")), "climber")
 
 
-if __name__ == "__main__":
-    chosen = from_command_line(CLIMBER, description=__doc__)
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Design a climber as the command line says, and print what came out of it.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        print(report(main(chosen), chosen))
+        settings = from_command_line(CLIMBER, description=__doc__, arguments=arguments)
+        print(report(main(settings), settings))
+
+
+if __name__ == "__main__":
+    cli()

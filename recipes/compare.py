@@ -242,6 +242,15 @@ def line(name: str, found: Mapping[str, Any]) -> str:
     return f"{name:28s} L = {1e3 * found['L']:6.2f} mm, {stride}, fall {1e3 * found['fall']:.2f} mm, {seconds:.1f} s"
 
 
-if __name__ == "__main__":
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Perform the checks of a robot as the command line says.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(tyro.cli(Options, description=__doc__, args=arguments))
+
+
+if __name__ == "__main__":
+    cli()

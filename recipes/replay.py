@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -93,6 +94,15 @@ def main(options: Options) -> dict[str, float]:
     return found
 
 
-if __name__ == "__main__":
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Show or keep a robot as the command line says.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(tyro.cli(Options, description=__doc__, args=arguments))
+
+
+if __name__ == "__main__":
+    cli()

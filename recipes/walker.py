@@ -13,6 +13,7 @@ Every number of the settings can be overridden: --help lists them. The loop is `
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import WALKER
@@ -33,7 +34,16 @@ def main(settings: Settings) -> dict[str, float]:
     return design(walker(dataclasses.replace(settings, robot="walker")), "walker")
 
 
-if __name__ == "__main__":
-    chosen = from_command_line(WALKER, description=__doc__)
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Design a walker as the command line says, and print what came out of it.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        print(report(main(chosen), chosen))
+        settings = from_command_line(WALKER, description=__doc__, arguments=arguments)
+        print(report(main(settings), settings))
+
+
+if __name__ == "__main__":
+    cli()
