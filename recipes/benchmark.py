@@ -15,19 +15,6 @@ beside it.
 "floor" is what a forward step must at least move (state read and written, coefficients read, node arrays written and
 read) over the bandwidth of a large copy on the same device. It supposes that nothing stays in a cache from one step to
 the next: a state of a few tens of megabytes may stay in that of a large GPU, and a step then take less.
-
-What each optimisation bought
------------------------------
-64,000 particles, three elements, one H200, in microseconds per forward step; the first line of each is where it began.
-
-- Updated: 147 with one particle per thread and scalar atomics. Threads sorted by cell that sum among their warp before
-  they add, loop bounds known at the launch (three tasks a step instead of five) and blocks of 256 threads: 75.
-- Total: 68 with forces summed along z and then over 36 lines for each node. Summing axis by axis, and all loop bounds
-  found once a launch: 58 a call. Sums over a chamber in three levels, all its small buffers in six arguments (an
-  argument costs a microsecond a launch): 40 in long runs. Four blocks a multiprocessor instead of thousands, most of
-  them empty: 30.
-- A kernel's compiled form looked up once instead of for every segment (4 ms), and the longest segments that fit into
-  memory instead of sqrt(steps): forward and backward of 5,000 steps from 264 to 114 a step.
 """
 
 from __future__ import annotations
@@ -37,6 +24,7 @@ import json
 import os
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,6 +48,7 @@ from torchsoro.benchmark.timing import (
     skipping,
     table,
 )
+from torchsoro.command_line import plain_errors
 
 PAPER_STEPS = 75_000
 SIZES = {"cpu": (2000, 4096, 8000, 16_384), "cuda": (16_384, 64_000, 216_000, 512_000, 2_000_376)}
@@ -399,5 +388,15 @@ def main(options: Options) -> dict[str, Any]:
     return results
 
 
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Measure what the command line asks for.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
+    with plain_errors():
+        main(tyro.cli(Options, description=__doc__, args=arguments))
+
+
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    cli()

@@ -11,6 +11,7 @@ Nothing is resampled, smoothed or filled. Markers of setup.toml must have the sa
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
@@ -90,6 +91,15 @@ def main(options: Options) -> None:
     print(f"{options.out}: {recording.time[-1]:g} s")
 
 
-if __name__ == "__main__":
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Convert what the command line names.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(tyro.cli(Options, description=__doc__, args=arguments))
+
+
+if __name__ == "__main__":
+    cli()

@@ -11,6 +11,8 @@ explanation.json and model.toml, the setup with what was missing, which predicts
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import tyro
 
 from torchsoro.command_line import plain_errors
@@ -22,6 +24,15 @@ def main(options: Options) -> None:
     explain(options)
 
 
-if __name__ == "__main__":
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Explain an experiment, or predict a trial, as the command line says.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        main(tyro.cli(Options, description=__doc__))
+        main(tyro.cli(Options, description=__doc__, args=arguments))
+
+
+if __name__ == "__main__":
+    cli()

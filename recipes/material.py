@@ -17,6 +17,7 @@ import csv
 import dataclasses
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -336,8 +337,17 @@ def write_curve(path: Path, curve: Curve) -> None:
         file.write(text.getvalue().encode())
 
 
-if __name__ == "__main__":
+def cli(arguments: Sequence[str] | None = None) -> None:
+    """Make a material as the command line says, and print what was left out.
+
+    Args:
+        arguments: Instead of the process's own.
+    """
     with plain_errors():
-        chosen = tyro.cli(Options, description=__doc__)
+        chosen = tyro.cli(Options, description=__doc__, args=arguments)
         result = main(chosen)
         print(f"{result.material.left_out}\nwritten to {chosen.out}: material.toml, report.html, master.csv")
+
+
+if __name__ == "__main__":
+    cli()

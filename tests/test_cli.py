@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-import torchsoro
 from torchsoro import cli
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +36,7 @@ def test_help_and_the_package_load_neither_torch_nor_taichi():
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
     assert ended.returncode == 0, ended.stderr
-    assert f"torchsoro {torchsoro.__version__}" in ended.stdout
+    assert f"torchsoro {importlib.metadata.version('torchsoro')}" in ended.stdout
 
 
 def test_a_command_that_does_not_exist_is_refused_with_those_that_do():

@@ -34,6 +34,7 @@ sim2real.hypotheses
 sim2real.inference
 sim2real.report
 sim2real.pipeline
+cli
 """
 RANK = {name: rank for rank, line in enumerate(ORDER.split("\n")) for name in line.split()}
 
@@ -48,6 +49,7 @@ TOP_LEVEL = {
     "recipes",
     "tests",
     "notebooks",
+    "docs",
 }
 LONGEST = 500  # lines
 
