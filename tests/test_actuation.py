@@ -166,6 +166,30 @@ def test_square_wave_reaches_its_periodic_state():
     torch.testing.assert_close(seen, tensor(high, high * fall), rtol=1e-9, atol=0)
 
 
+NUMBERS = {"amplitude": 5e4, "frequency": 20.0, "duty": 0.4, "rise": 4e-3, "fall": 7e-3, "start": 3e-3}
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_gradient_of_a_square_wave_by_each_number_is_the_central_difference(name):
+    at = torch.tensor([1e-3, 9.04e-3, 0.02353, 0.04007, 0.0777, 0.10003], dtype=torch.float64)  # none at a sample
+
+    def pressures(value: torch.Tensor | float) -> torch.Tensor:
+        return square_wave(**{**NUMBERS, name: value}, end=0.12).at(at) / NUMBERS["amplitude"]
+
+    number = torch.tensor(NUMBERS[name], dtype=torch.float64, requires_grad=True)
+    for i, pressure in enumerate(pressures(number)):
+        (slope,) = torch.autograd.grad(pressure, number, retain_graph=True)
+        step = 1e-5 * NUMBERS[name]
+        difference = (pressures(NUMBERS[name] + step)[i] - pressures(NUMBERS[name] - step)[i]) / (2 * step)
+        assert float(slope) * NUMBERS[name] == pytest.approx(float(difference) * NUMBERS[name], abs=1e-7)
+
+
+def test_amplitudes_of_several_chambers_scale_the_wave_of_each():
+    one = square_wave(**NUMBERS, end=0.1)
+    both = square_wave(**{**NUMBERS, "amplitude": torch.tensor([5e4, -1e4])}, end=0.1)
+    torch.testing.assert_close(both.pressure, torch.stack([one.pressure, -0.2 * one.pressure]))
+
+
 def test_square_wave_ends_cleanly_where_rounding_puts_the_last_switch_beside_the_end():
     for half_cycles in range(1, 60):
         for side in (-math.inf, math.inf):

@@ -14,6 +14,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+_MOST_SAMPLES = 10_000_000  # of a square wave: 160 MB
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
 class Waveform:
@@ -57,7 +59,7 @@ class Waveform:
             )
 
     def at(self, t: Tensor) -> Tensor:
-        """Interpolate linearly; differentiable with respect to the pressure samples (and to ``t``).
+        """Interpolate linearly; differentiable with respect to the samples' pressures and times, and to ``t``.
 
         Args:
             t: Times, s, floating point [T], on the device of the samples.
@@ -81,72 +83,101 @@ class Waveform:
 
 def square_wave(
     *,
-    amplitude: float,
-    frequency: float,
-    duty: float = 0.5,
-    rise: float,
-    fall: float,
-    start: float = 0.0,
+    amplitude: float | Tensor,
+    frequency: float | Tensor,
+    duty: float | Tensor = 0.5,
+    rise: float | Tensor,
+    fall: float | Tensor,
+    start: float | Tensor = 0.0,
     end: float,
     samples_per_period: int = 400,
 ) -> Waveform:
     """Pressure behind a valve that switches between 0 and ``amplitude``, as a first-order lag.
 
     While the valve is open ``p' = (amplitude - p) / rise``, while it vents ``p' = -p / fall``. The samples are the
-    exact exponentials, evenly spaced within each half cycle, with one sample at every switching instant.
+    exact exponentials, evenly spaced within each half cycle, with one sample at every switching instant. Times and
+    pressures of the samples are differentiable in every number that is given as a tensor; their count is not, so that
+    a derivative by ``frequency``, ``duty`` or ``start`` is that of the samples there are.
 
     Args:
-        amplitude: Supply pressure, Pa gauge; negative for vacuum.
-        frequency: Cycles per second, Hz.
+        amplitude: Supply pressure, Pa gauge; negative for vacuum. A number, or a tensor [...] such as one per chamber.
+        frequency: Cycles per second, Hz. This and what follows: a number or a tensor of no axes.
         duty: Part of each cycle with the valve open, in (0, 1).
         rise: Time constant of filling, s.
         fall: Time constant of venting, s.
         start: First opening of the valve, s, >= 0. The pressure is 0 until then.
-        end: Last sample, s, after ``start``.
+        end: Last sample, s, after ``start``; a number.
         samples_per_period: Samples in one full cycle, at least 4.
 
     Returns:
-        Waveform from t = 0 to ``end``, float64 [S].
+        Waveform from t = 0 to ``end``, float64 [..., S].
 
     Raises:
         ValueError: An argument is out of its range.
     """
-    for name, value in (("frequency", frequency), ("rise", rise), ("fall", fall)):
-        if not (math.isfinite(value) and value > 0.0):
-            raise ValueError(f"{name}: got {value!r}, want a finite number > 0")
-    if not math.isfinite(amplitude):
+    height = _double("amplitude", amplitude)
+    if not bool(torch.isfinite(height.detach()).all()):
         raise ValueError(f"amplitude: got {amplitude!r}, want a finite pressure in Pa")
-    if not 0.0 < duty < 1.0:
-        raise ValueError(f"duty: got {duty!r}, want more than 0 and less than 1")
-    if not (math.isfinite(start) and start >= 0.0):
-        raise ValueError(f"start: got {start!r}, want a finite time >= 0 s")
-    if not (math.isfinite(end) and end > start):
-        raise ValueError(f"end: got {end!r}, want a finite time after start ({start!r} s)")
+    cycles_per_second, open_part, filling, venting, first = (
+        _double(name, value, scalar=True)
+        for name, value in (("frequency", frequency), ("duty", duty), ("rise", rise), ("fall", fall), ("start", start))
+    )
+    for name, value in (("frequency", cycles_per_second), ("rise", filling), ("fall", venting)):
+        if not (math.isfinite(value.item()) and value.item() > 0.0):
+            raise ValueError(f"{name}: got {value.item()!r}, want a finite number > 0")
+    if not 0.0 < open_part.item() < 1.0:
+        raise ValueError(f"duty: got {open_part.item()!r}, want more than 0 and less than 1")
+    if not (math.isfinite(first.item()) and first.item() >= 0.0):
+        raise ValueError(f"start: got {first.item()!r}, want a finite time >= 0 s")
+    last = _double("end", end, scalar=True).detach()
+    if not (math.isfinite(last.item()) and last.item() > first.item()):
+        raise ValueError(f"end: got {last.item()!r}, want a finite time after start ({first.item()!r} s)")
     if isinstance(samples_per_period, bool) or not isinstance(samples_per_period, int) or samples_per_period < 4:
         raise ValueError(f"samples_per_period: got {samples_per_period!r}, want a whole number >= 4")
+    cycles = (last.item() - first.item()) * cycles_per_second.item()
+    if cycles * samples_per_period > _MOST_SAMPLES:
+        raise ValueError(
+            f"frequency: got {cycles_per_second.item()!r} Hz, {cycles:.3g} cycles of {samples_per_period} samples, "
+            f"want at most {_MOST_SAMPLES} samples"
+        )
 
-    period = 1.0 / frequency
-    times: list[Tensor] = [torch.zeros(1 if start > 0.0 else 0, dtype=torch.float64)]
-    pressures: list[Tensor] = [torch.zeros_like(times[0])]
-    pressure = 0.0  # at the beginning of the half cycle
-    begin, half_cycle = start, 0
-    while begin < end:
+    period = 1.0 / cycles_per_second
+    rest = torch.zeros(1 if first.item() > 0.0 else 0, dtype=torch.float64)
+    times, pressures = [rest], [rest.expand(*height.shape, len(rest))]
+    pressure = torch.zeros_like(height)  # at the beginning of the half cycle
+    begin, half_cycle = first, 0
+    while begin.item() < last.item():
         valve_open = half_cycle % 2 == 0
-        target, constant, share = (amplitude, rise, duty) if valve_open else (0.0, fall, 1.0 - duty)
-        cycles = half_cycle // 2 + (duty if valve_open else 1.0)
-        finish = start + cycles * period  # from the start, so that rounding does not add up
-        if finish > end - 1e-9 * period:
-            finish = end
-        samples = max(2, round(samples_per_period * share))
-        samples = max(1, math.ceil(samples * (finish - begin) / (share * period) - 1e-6))
-        elapsed = torch.linspace(0.0, finish - begin, samples + 1, dtype=torch.float64)
-        lagged = target + (pressure - target) * torch.exp(-elapsed / constant)
+        target, constant = (height, filling) if valve_open else (torch.zeros_like(height), venting)
+        share = open_part if valve_open else 1.0 - open_part
+        # From the start, so that rounding does not add up.
+        finish = first + (half_cycle // 2 + (open_part if valve_open else 1.0)) * period
+        if finish.item() > last.item() - 1e-9 * period.item():
+            finish = last
+        length = (finish - begin).item()
+        samples = max(2, round(samples_per_period * share.item()))
+        samples = max(1, math.ceil(samples * length / (share * period).item() - 1e-6))
+        elapsed = torch.linspace(0.0, 1.0, samples + 1, dtype=torch.float64) * (finish - begin)
+        lagged = target.unsqueeze(-1) + (pressure - target).unsqueeze(-1) * torch.exp(-elapsed / constant)
         times.append(begin + elapsed[:-1])
-        pressures.append(lagged[:-1])
-        pressure, begin, half_cycle = float(lagged[-1]), finish, half_cycle + 1
-    times.append(torch.tensor([end], dtype=torch.float64))
-    pressures.append(torch.tensor([pressure], dtype=torch.float64))
-    return Waveform(time=torch.cat(times), pressure=torch.cat(pressures))
+        pressures.append(lagged[..., :-1])
+        pressure, begin, half_cycle = lagged[..., -1], finish, half_cycle + 1
+    times.append(last.reshape(1))
+    pressures.append(pressure.unsqueeze(-1))
+    return Waveform(time=torch.cat(times), pressure=torch.cat(pressures, -1))
+
+
+def _double(name: str, value: float | Tensor, *, scalar: bool = False) -> Tensor:
+    """A number as a float64 tensor on the CPU, with its gradient."""
+    if isinstance(value, Tensor):
+        if scalar and value.ndim != 0:
+            raise ValueError(
+                f"{name}: got a tensor of shape {tuple(value.shape)}, want a number or a tensor of no axes"
+            )
+        return value.to("cpu", torch.float64)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"{name}: got {value!r}, want a number or a tensor")
+    return torch.tensor(value, dtype=torch.float64)
 
 
 def read_pressure_csv(
