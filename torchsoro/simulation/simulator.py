@@ -218,7 +218,7 @@ class Simulator(nn.Module):
         check_body(body)
         if start is None:
             self._check_inside(x)
-        dt = self.step(body, prony, duration=duration, sample_every=sample_every)
+        dt = self.step(body, prony, duration=duration, sample_every=sample_every, loads=loads)
         steps, every = _steps(duration, sample_every, dt)
         attached = attach(body, loads)
         body = attached.body
@@ -337,7 +337,15 @@ class Simulator(nn.Module):
                 f"from {self.low} to {self.high} m and a cell of {self.cell:g} m away from its faces"
             )
 
-    def step(self, body: Body, prony: Prony | None, *, duration: float, sample_every: float | None = None) -> float:
+    def step(
+        self,
+        body: Body,
+        prony: Prony | None,
+        *,
+        duration: float,
+        sample_every: float | None = None,
+        loads: Sequence[Load] = (),
+    ) -> float:
         """The substep [s] of a call, which every call asks for first.
 
         Args:
@@ -345,16 +353,17 @@ class Simulator(nn.Module):
             prony: Maxwell elements of the solids.
             duration: [s].
             sample_every: Time between two samples [s].
+            loads: What is attached.
 
         Raises:
-            ValueError: if a given step is above the stability limit of the body's fastest wave; says the term that sets
+            ValueError: if a given step is above the stability limit of the body with its loads; says the term that sets
                 it.
         """
         if self.dt == "auto":
-            limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation)
+            limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation, loads=loads)
             each = duration / 100 if sample_every is None else sample_every
             return each / math.ceil(each / limit)
-        found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation)
+        found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation, loads=loads)
         if found.number > STABLE_COURANT:
             limit = self.dt * STABLE_COURANT / found.number
             raise ValueError(
