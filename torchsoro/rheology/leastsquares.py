@@ -111,10 +111,18 @@ def free(problem: Problem, elements: int | None) -> list[Found]:
 
 
 def _optimised(
-    problem: Problem, start: np.ndarray, hold: tuple[int, float] | None = None, *, tolerance: float = 1e-9
+    problem: Problem,
+    start: np.ndarray,
+    hold: tuple[int, float] | None = None,
+    *,
+    limits: tuple[np.ndarray, np.ndarray] | None = None,
+    tolerance: float = 1e-9,
 ) -> Found:
-    """Optimise relaxation times, the moduli being projected out (Golub and Pereyra 1973, Kaufman 1975)."""
-    low, high = np.log(problem.window)
+    """Optimise relaxation times, the moduli being projected out (Golub and Pereyra 1973, Kaufman 1975).
+
+    ``limits`` are of ln(tau) [M]; the problem's window if None.
+    """
+    low, high = limits or np.log(problem.window)
     last: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
 
     def state(log_times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -139,8 +147,8 @@ def _optimised(
         return change - basis @ (basis.T @ change)
 
     inside = np.clip(np.log(start), low + 1e-6 * (high - low), high - 1e-6 * (high - low))
-    limits: dict[str, Any] = {"bounds": (low, high), "ftol": tolerance, "xtol": tolerance, "gtol": 1e-12}
-    best = least_squares(residual, inside, jac=jacobian, max_nfev=200, **limits)  # pyright: ignore[reportArgumentType]
+    search: dict[str, Any] = {"bounds": (low, high), "ftol": tolerance, "xtol": tolerance, "gtol": 1e-12}
+    best = least_squares(residual, inside, jac=jacobian, max_nfev=200, **search)  # pyright: ignore[reportArgumentType]
     order = np.argsort(best.x) if hold is None else np.arange(len(start))  # a column that is held keeps its place
     values = state(best.x)[2]
     values = np.concatenate([values[: problem.first], values[problem.first :][order]])
@@ -195,8 +203,10 @@ def inflation(problem: Problem, found: Found) -> float:
 def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) -> Iterator[tuple[float, float]]:
     """Where the least error, at each value of one unknown, has risen by ``rise``: both ends, for every unknown.
 
-    All other moduli are fitted anew, and the relaxation times where they are ``optimised``. An end that is not reached
-    is 0 or inf.
+    All other moduli are fitted anew, and the relaxation times where they are ``optimised``, each within its own part of
+    the window: up to the geometric mean with its neighbour. Without these limits the terms exchange places: the one
+    whose modulus is held moves to where the data see nothing, the rest take over its part, and the ends found are those
+    of the term beyond the data. An end that is not reached is 0 or inf.
     """
     matrix = problem.matrix(found.times)[0]
     below = found.weight * roughness(problem, found.times)
@@ -205,6 +215,9 @@ def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) ->
     if rise < 1e-18 * len(target):  # data without noise
         yield from ((float(value), float(value)) for value in found.values)
         return
+    middles = np.log(found.times[1:] * found.times[:-1]) / 2
+    low, high = np.log(problem.window)
+    limits = np.append(low, middles), np.append(middles, high)
     for column, value in enumerate(found.values):
         # With all else kept, the error rises by ``rise`` within this distance, so the end lies beyond it.
         near = math.sqrt(rise) / max(float(np.linalg.norm(rows[:, column])), 1e-300)
@@ -215,7 +228,7 @@ def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) ->
             def excess(at: float, column: int = column) -> float:
                 nonlocal times
                 if optimised:
-                    there = _optimised(problem, times, (column, at), tolerance=1e-5)
+                    there = _optimised(problem, times, (column, at), limits=limits, tolerance=1e-5)
                     times, error = there.times, there.error
                 else:
                     error = float(((rows @ solve(rows, target, (column, at)) - target) ** 2).sum())
