@@ -9,7 +9,8 @@ import enum
 import io
 import math
 import os
-from collections.abc import Iterator, Mapping
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -44,6 +45,31 @@ def atomic_write(path: str | Path) -> Iterator[BinaryIO]:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def check_folder(name: str, folder: Path, files: Iterable[str] = ()) -> None:
+    """Refuse a folder into which results cannot be written, before they are computed; nothing is made.
+
+    Args:
+        name: Of the argument, for messages.
+        folder: Need not exist.
+        files: Names of the files that are to be written there.
+
+    Raises:
+        ValueError: if the folder is a file or lies under one, cannot be written, or has a folder in a file's place.
+    """
+    try:
+        nearest = next(place for place in (folder.absolute(), *folder.absolute().parents) if place.exists())
+        if not nearest.is_dir():
+            under = "" if nearest == folder.absolute() else f" lies under {nearest}, which"
+            raise ValueError(f"{name} = {folder}:{under} is a file, wanted a folder")
+        with tempfile.TemporaryFile(dir=nearest):
+            pass
+        taken = [file for file in files if (folder / file).is_dir()]
+    except OSError as error:
+        raise ValueError(f"{name} = {folder}: cannot be written ({error.strerror}), wanted a folder that can") from error
+    if taken:
+        raise ValueError(f"{name} = {folder}: holds a folder {taken[0]}, wanted no folder of a result's name")
 
 
 class MetricsFile:
