@@ -17,8 +17,8 @@ def test_a_folder_that_can_be_written_passes_and_is_not_made(tmp_path):
     [
         ("file", r"out = .*file: is a file, wanted a folder"),
         ("file/run/a", r"out = .*file/run/a: lies under .*file, which is a file, wanted a folder"),
-        ("x" * 300, r"out = .*: cannot be written \(.*\), wanted a folder that can"),
-        ("/proc/run", r"out = /proc/run: cannot be written \(.*\), wanted a folder that can"),
+        ("x" * 300, r"out = .*: not writable \(.*\), wanted a folder that is"),
+        ("/proc/run", r"out = /proc/run: not writable \(.*\), wanted a folder that is"),
         ("taken", r"out = .*taken: holds a folder report\.html, wanted no folder"),
     ],
 )

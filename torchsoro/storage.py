@@ -67,7 +67,7 @@ def check_folder(name: str, folder: Path, files: Iterable[str] = ()) -> None:
             pass
         taken = [file for file in files if (folder / file).is_dir()]
     except OSError as error:
-        raise ValueError(f"{name} = {folder}: cannot be written ({error.strerror}), wanted a folder that can") from error
+        raise ValueError(f"{name} = {folder}: not writable ({error.strerror}), wanted a folder that is") from error
     if taken:
         raise ValueError(f"{name} = {folder}: holds a folder {taken[0]}, wanted no folder of a result's name")
 
