@@ -189,18 +189,6 @@ def test_the_centre_of_gravity_is_weighted_as_asked(way):
     torch.testing.assert_close(run.center_of_gravity[0], (body.position[0] + 3 * body.position[63]) / 4)
 
 
-@ways("apic", "total")
-def test_a_run_goes_on_from_where_it_ended(way):
-    _, body = block((4, 4, 6), air=True)
-    arguments = {"prony": Prony.paper(3), "planes": [ground()], "pressure": constant(300.0), "sample_every": 5 * DT}
-    sim = simulator(**way)
-    whole = sim(body, duration=40 * DT, **arguments)
-    first = sim(body, duration=15 * DT, **arguments)
-    second = sim(body, duration=25 * DT, start=first.final, **arguments)
-    torch.testing.assert_close(second.final, whole.final, rtol=1e-10, atol=1e-13)
-    torch.testing.assert_close(second.center_of_gravity, whole.center_of_gravity[3:], rtol=0, atol=1e-14)
-
-
 def test_two_simulators_do_not_disturb_each_other():
     _, body = block()
     coarse, fine = simulator(), simulator(cell=4 * H)

@@ -16,20 +16,22 @@ _INPUTS = tuple(f.name for f in fields(Inputs))
 _OBSERVED = 6
 
 
-def initial_state(x: Tensor, v: Tensor, elements: int) -> Tensor:
+def initial_state(x: Tensor, v: Tensor, elements: int, affine: Tensor | None = None) -> Tensor:
     """State of undeformed particles without history (a gas keeps J = 1 where a solid keeps F[0, 0] = 1).
 
     Args:
         x: Positions [B, N, 3] in m.
         v: Velocities [B, N, 3] in m/s.
         elements: Number of Maxwell elements.
+        affine: Velocity gradient [B, N, 3, 3] in 1/s; zero if None.
 
     Returns:
-        State [B, S, N], differentiable by x and v.
+        State [B, S, N], differentiable by x, v and affine.
     """
     batch, count, _ = x.shape
     F = torch.eye(3, dtype=x.dtype, device=x.device).reshape(1, 9, 1).expand(batch, 9, count)
-    C, H = x.new_zeros(batch, 9, count), x.new_zeros(batch, 6 * elements, count)
+    C = x.new_zeros(batch, 9, count) if affine is None else affine.flatten(-2).transpose(1, 2)
+    H = x.new_zeros(batch, 6 * elements, count)
     return torch.cat([x.transpose(1, 2), v.transpose(1, 2), C, F, H], dim=1)
 
 
