@@ -12,7 +12,7 @@ from test_experiment import experiment
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.residual import Camera
+from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -73,10 +73,10 @@ def bar(folder: Path):
             scenario = by.twin.scenario(trial)
             if name is not None:
                 scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), by.twin)
-            camera = Camera(found.setup, [trial])
-            errors = np.zeros(len(camera.deviations))
+            observation = ObservationModel(found.setup, [trial])
+            errors = np.zeros(len(observation.deviations))
             errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
-            seen = camera.see(by([scenario])[0].alone(), 0, errors)
+            seen = observation.observe(by([scenario])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             place[7, 0] = np.nan
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))

@@ -36,7 +36,7 @@ def varied(trial: Trial, duration: float, edge: float, gap: float = 1e-4) -> lis
         scenarios = [plain]
         for effect in library():
             if effect.applies(plain, twin):
-                values = np.concatenate([d[:1] for d in effect.looks(twin)])[-2:]
+                values = np.concatenate([d[:1] for d in effect.probe_points(twin)])[-2:]
                 scales = [q.scale for q in effect.quantities] + [0.1 * s for s in t.setup.size] * effect.local
                 scenarios.append(effect(plain, torch.tensor(values * scales), twin))
         found.append((twin, scenarios))
@@ -91,7 +91,7 @@ def simulated(folder: Path) -> int:
         whole = scenarios[0]
         for effect in library():
             if effect.applies(whole, twin):
-                values = effect.looks(twin)[-1][-1:]
+                values = effect.probe_points(twin)[-1][-1:]
                 scales = [q.scale for q in effect.quantities] + [0.1 * s for s in trial.setup.size] * effect.local
                 whole = effect(whole, torch.tensor(0.2 * values * scales), twin)
         bodies.append((twin, [scenarios[0], whole]))

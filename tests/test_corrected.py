@@ -10,7 +10,7 @@ from ringing import effect
 
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.inference.discretization import measure
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.search import search
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
@@ -20,9 +20,9 @@ def test_a_finer_twin_corrects_where_one_is(made):
     twin, ensemble, record = made
     setup = record(None).setup
     fine = Ensemble(Twin(setup, edge=0.6 * twin.edge, across=5))
-    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
+    problem = FitProblem(record(None), twin, ensemble=ensemble, fine=fine)
     at = np.array([0.8])
-    there = Problem(record(None), fine.twin, ensemble=fine)
+    there = FitProblem(record(None), fine.twin, ensemble=fine)
     wanted = there.simulate([((), at[None])])[0]
     for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
         assert np.abs(motion.place - right.place).max() < 1e-7
@@ -32,11 +32,11 @@ def test_a_finer_twin_corrects_where_one_is(made):
 def test_each_effect_is_corrected_where_it_is(made):
     twin, ensemble, record = made
     fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
-    problem = Problem(record(None), twin, ensemble=ensemble, fine=fine)
+    problem = FitProblem(record(None), twin, ensemble=ensemble, fine=fine)
     drag, tilt = (effect(name) for name in ("drag", "gravity_tilt"))
     points = [((), np.array([[0.3]])), ((drag,), np.array([[0.5, 20.0]]))]
     told = problem.corrected_each(points)
-    wanted = Problem(record(None), fine.twin, ensemble=fine).simulate(points)
+    wanted = FitProblem(record(None), fine.twin, ensemble=fine).simulate(points)
     for motions, right in zip(told.simulate(points), wanted, strict=True):
         for one, other in zip(motions, right, strict=True):
             assert np.abs(one.place - other.place).max() < 1e-7
@@ -51,11 +51,11 @@ def test_what_the_twin_gets_wrong_is_not_taken_for_the_effect(made):
     fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
     recorded, left = record("drag", (2000.0,), by=fine), []
     for other in (None, fine):
-        problem = Problem(recorded, twin, ensemble=Ensemble(twin), fine=other)
-        _, nothing, best = search(problem, [effect("drag"), effect("gravity_tilt")], 600.0, lambda line: None)
-        assert nothing.misfit > 3 * nothing.samples and best[0].name == "drag"
+        problem = FitProblem(recorded, twin, ensemble=Ensemble(twin), fine=other)
+        _, null_model, best = search(problem, [effect("drag"), effect("gravity_tilt")], 600.0, lambda line: None)
+        assert null_model.chi2 > 3 * null_model.samples and best[0].name == "drag"
         assert best[0].values[0][0] == pytest.approx(2000.0, rel=0.03)
-        left.append(best[0].misfit / best[0].samples)
+        left.append(best[0].chi2 / best[0].samples)
     assert left[1] < 1.1 and left[0] > 1.5
 
 
@@ -63,7 +63,7 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
     twin, ensemble, record = made
     experiment = record(None)
     still = [((), np.zeros((1, 1)))]
-    problem = Problem(experiment, twin, ensemble=ensemble)
+    problem = FitProblem(experiment, twin, ensemble=ensemble)
     time, trials = np.arange(0.0, 0.2001, 0.0025), []
     for trial, motion in zip(experiment.trials, problem.simulate(still)[0], strict=True):
         place = motion.alone().place[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
@@ -71,9 +71,9 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
     fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
     assert not problem.stated
     experiment = dataclasses.replace(experiment, trials=(trials[0],), heldout=(trials[1],))
-    numerics = measure(experiment, ensemble, fine)
-    told = {"shift": numerics.shift, "correction": numerics.correction}
-    problem = Problem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
+    discretization = measure(experiment, ensemble, fine)
+    told = {"shift": discretization.shift, "correction": discretization.correction}
+    problem = FitProblem(experiment, twin, trials=trials, ensemble=ensemble, fine=fine, **told)
     assert problem.stated.keys() == {t.name for t in trials}
     for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
         place = motion.alone().place
@@ -83,4 +83,4 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
         assert len(steps) > 8 and (steps > 5e-5).all() and (steps < 1e-3).all()
     # Also where modulus and pressure are not what is believed.
     moved = problem.corrected(np.array([0.8])).correction
-    assert all(moved[t.name] is numerics.correction[t.name] for t in trials)
+    assert all(moved[t.name] is discretization.correction[t.name] for t in trials)

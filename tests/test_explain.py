@@ -15,16 +15,19 @@ from ringing import EDGE, effect
 from torchsoro.sim2real.data.experiment import Boundary
 from torchsoro.sim2real.data.recording import Recording, read_table
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.discretization import WALLS, choose_twin, cost, finer, measure
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.discretization import measure
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.model import predict_trial, read_model
-from torchsoro.sim2real.inference.residual import LASTING, Band, Camera, Slip, estimate_noise, find_slips, reordered
+from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
+from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel
+from torchsoro.sim2real.inference.recording_faults import find_slips, reordered
+from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, finer
 from torchsoro.sim2real.inference.search import _simpler
 from torchsoro.sim2real.inference.verdict import judge
-from torchsoro.sim2real.report.report import as_json, effect_rows
+from torchsoro.sim2real.report.explanation import as_json, effect_rows
 from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 
 # Measurement ------------------------------------------------------------------------------------------------------
 
@@ -36,7 +39,7 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
     place = np.stack([np.sin(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     velocity = np.stack([7 * np.cos(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     gradient = np.broadcast_to(np.eye(3) + 0.1 * rng.normal(size=(1, markers, 3, 3)), (steps, markers, 3, 3))
-    motion = Motion(time=time, place=place, velocity=velocity, gradient=gradient, dt=1e-3)
+    motion = MarkerMotion(time=time, place=place, velocity=velocity, gradient=gradient, dt=1e-3)
     recording = Recording(time=np.linspace(0.05, 0.25, 9), place=np.zeros((9, markers, 2)), axes=(0, 2))
 
     class Two:
@@ -44,15 +47,17 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
         axes, kind = (0, 2), "video"
 
     trial = dataclasses.make_dataclass("T", ["name", "recording"])("t", recording)
-    slip = Slip(trial="t", marker=1, start=0.1)
-    camera = Camera(Two(), [trial], slips=[slip])  # type: ignore[arg-type]
-    assert len(camera.names) == len(camera.deviations) == 1 + 5 + 6 + 3
-    at = 0.5 * camera.deviations * rng.normal(size=len(camera.deviations))
-    _, by = camera.linearise(motion, 0, at)
-    for k, scale in enumerate(camera.deviations):
+    slip = MarkerSlip(trial="t", marker=1, start=0.1)
+    observation = ObservationModel(Two(), [trial], slips=[slip])  # type: ignore[arg-type]
+    assert len(observation.names) == len(observation.deviations) == 1 + 5 + 6 + 3
+    at = 0.5 * observation.deviations * rng.normal(size=len(observation.deviations))
+    _, by = observation.linearise(motion, 0, at)
+    for k, scale in enumerate(observation.deviations):
         step = np.zeros_like(at)
         step[k] = 1e-3 * scale
-        difference = (camera.see(motion, 0, at + step) - camera.see(motion, 0, at - step)) / (2e-3 * scale)
+        difference = (observation.observe(motion, 0, at + step) - observation.observe(motion, 0, at - step)) / (
+            2e-3 * scale
+        )
         # Rotations add up only where they are small, and a spline's second derivative jumps.
         np.testing.assert_allclose(by[..., k], difference, rtol=0.02, atol=0.02 * np.abs(difference).max() + 1e-9)
 
@@ -60,14 +65,14 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
 def test_a_band_makes_its_own_noise_white():
     rng = np.random.default_rng(2)
     time = np.arange(60) * 0.01
-    numerics = np.array([[2e-4, 0.0]])
+    discretization = np.array([[2e-4, 0.0]])
     alike = np.exp(-np.abs(time[:, None] - time[None]) / 0.03)
-    band = Band(Recording(time=time, place=np.zeros((60, 1, 2)), axes=(0, 2)), 1e-4, numerics)
+    noise_model = NoiseModel(Recording(time=time, place=np.zeros((60, 1, 2)), axes=(0, 2)), 1e-4, discretization)
     noise = 1e-8 * ((1 - LASTING) * np.eye(60) + LASTING * alike)
-    root = [np.linalg.cholesky(noise + n**2 * alike) for n in numerics[0]]
+    root = [np.linalg.cholesky(noise + n**2 * alike) for n in discretization[0]]
     draws = rng.normal(size=(2, 60, 400))
     values = np.stack([root[a] @ draws[a] for a in range(2)], 1)[:, None]
-    np.testing.assert_allclose(band.whiten(values), draws.reshape(120, 400), atol=1e-9)
+    np.testing.assert_allclose(noise_model.whiten(values), draws.reshape(120, 400), atol=1e-9)
 
 
 @pytest.mark.parametrize("noise", [3e-5, 2e-4])
@@ -84,14 +89,14 @@ def test_a_marker_that_slips_is_found_and_a_motion_of_all_is_not(made):
     trials = record(None).trials
     rng = np.random.default_rng(4)
     still = [5e-5 * rng.normal(size=t.recording.place.shape) for t in trials]
-    bands = [Band(t.recording, 5e-5, np.zeros((2, 3))) for t in trials]
-    assert not find_slips(trials, bands, still)
+    noise_models = [NoiseModel(t.recording, 5e-5, np.zeros((2, 3))) for t in trials]
+    assert not find_slips(trials, noise_models, still)
     slipped = [r.copy() for r in still]
     slipped[1][trials[1].recording.time > 0.1, 1] += [1e-3, 0.0, -1e-3]
-    (slip,) = find_slips(trials, bands, slipped)
+    (slip,) = find_slips(trials, noise_models, slipped)
     assert (slip.trial, slip.marker) == ("b", 1) and slip.start == pytest.approx(0.1, abs=0.01)
     swinging = [r + 1e-3 * np.sin(60 * t.recording.time)[:, None, None] for r, t in zip(still, trials, strict=True)]
-    assert not find_slips(trials, bands, swinging)
+    assert not find_slips(trials, noise_models, swinging)
 
 
 def test_confused_columns_are_put_right(made):
@@ -121,11 +126,11 @@ def test_confused_columns_are_put_right(made):
 def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
     twin, ensemble, record = made
     recorded = record(name, values)
-    problem = Problem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
-    (ranked,) = problem.look([effect(name)], problem.base())
+    problem = FitProblem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
+    (ranked,) = problem.probe([effect(name)], problem.base())
     fits = problem.fit([((effect(name),), start) for _, start in ranked[:3]])
-    fit = min((f for f in fits if f is not None), key=lambda fit: fit.misfit)
-    assert fit.misfit / fit.samples == pytest.approx(1.0, abs=0.35)
+    fit = min((f for f in fits if f is not None), key=lambda fit: fit.chi2)
+    assert fit.chi2 / fit.samples == pytest.approx(1.0, abs=0.35)
     # A mass near the tip is a lighter one at the tip of a bar that is softer within what is believed.
     assert fit.values[0][0] == pytest.approx(values[0], rel=wrong)
     deviation = np.sqrt(np.diag(fit.covariances[0]))
@@ -141,7 +146,7 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
 def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.004, 0.055, 0.01, 0.015))
-    problem = Problem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
+    problem = FitProblem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
     mass, tether = effect("attached_mass"), effect("tether")
     start = np.array([0.0, 0.0, 0.0, 2.0, 9.0, 5.0, 7.0])
     (hung,) = problem.fit([((tether,), start)], rounds=2)
@@ -163,7 +168,7 @@ def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
             trial.recording, time=trial.recording.time[held], place=trial.recording.place[held]
         )
         late.append(dataclasses.replace(trial, recording=recording))
-    early = Problem(recorded, twin, trials=late, ensemble=ensemble).early(0.4)
+    early = FitProblem(recorded, twin, trials=late, ensemble=ensemble).early(0.4)
     for whole, part in zip(late, early.trials, strict=True):
         share = len(part.recording.time) / len(whole.recording.time)
         assert share == pytest.approx(0.4, abs=0.05)
@@ -175,17 +180,19 @@ def test_a_clock_that_is_behind_has_seen_what_comes_after_the_end(made):
     experiment, behind, trials = record(None), 0.012, []
     for trial in experiment.trials:
         (motion,) = ensemble([twin.scenario(trial).replace(until=0.3)])
-        camera = Camera(experiment.setup, [trial])
-        place = camera.see(motion.alone(), 0, np.where(np.arange(len(camera.deviations)) == 0, -behind, 0.0))
+        observation = ObservationModel(experiment.setup, [trial])
+        place = observation.observe(
+            motion.alone(), 0, np.where(np.arange(len(observation.deviations)) == 0, -behind, 0.0)
+        )
         recording = dataclasses.replace(trial.recording, place=place)
         trials.append(dataclasses.replace(trial, recording=recording))
-    problem = Problem(experiment, twin, trials=trials, ensemble=ensemble)
+    problem = FitProblem(experiment, twin, trials=trials, ensemble=ensemble)
     for part, end in ((problem, 0.2), (problem.early(0.5), 0.1)):
         motions = [m.alone() for m in part.simulate([((), np.zeros((1, 1)))])[0]]
-        misfit, errors, _, _ = part.measure(motions, np.zeros(len(part.camera.deviations)))
+        chi2, errors, _, _ = part.measure(motions, np.zeros(len(part.observation.deviations)))
         # Nothing is left but what so late a clock costs by its prior.
         assert errors[:2] == pytest.approx(-behind, abs=2e-4)
-        assert misfit < 2 * (behind / part.camera.deviations[0]) ** 2
+        assert chi2 < 2 * (behind / part.observation.deviations[0]) ** 2
         assert all(s.duration == pytest.approx(end) for s in part.scenarios)
 
 
@@ -195,19 +202,19 @@ def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
     name, values = leak.simpler(np.array([0.0, 0.02]))
     assert name == "pressure_lag" and values == pytest.approx([0.02])
     name, values = leak.simpler(np.array([0.1, 0.0]))
-    told = effect("pressure_loss").told(values, None)
+    told = effect("pressure_loss").reported(values, None)
     assert name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
 
 
 def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.002, 0.05, 0.01, 0.02), gravity=(9.81, 0.0, 0.0))
-    problem = Problem(recorded, twin, trials=recorded.trials, ensemble=ensemble)
-    (ranked,) = problem.look([effect("attached_mass")], problem.base())
+    problem = FitProblem(recorded, twin, trials=recorded.trials, ensemble=ensemble)
+    (ranked,) = problem.probe([effect("attached_mass")], problem.base())
     _, start = ranked[0]
     assert start[-3:] / 10 * twin.setup.size == pytest.approx((0.05, 0.01, 0.02), abs=0.006)
     (fit,) = problem.fit([((effect("attached_mass"),), start)])
-    assert fit is not None and fit.misfit / fit.samples == pytest.approx(1.0, abs=0.35)
+    assert fit is not None and fit.chi2 / fit.samples == pytest.approx(1.0, abs=0.35)
     assert fit.values[0] == pytest.approx((0.002, 0.05, 0.01, 0.02), rel=0.3, abs=0.003)
     (row,) = effect_rows(fit, 1.0, problem)
     off = np.abs(np.array(row["location_m"]) - (0.05, 0.01, 0.02))
@@ -219,7 +226,7 @@ def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
     twin, ensemble, record = made
     told = record("drag", (600.0,))
     off = dataclasses.replace(told.trials[1], recording=record("drag", (500.0,)).trials[1].recording)
-    problem = Problem(dataclasses.replace(told, trials=(told.trials[0], off)), twin, ensemble=ensemble)
+    problem = FitProblem(dataclasses.replace(told, trials=(told.trials[0], off)), twin, ensemble=ensemble)
     tasks = [((effect("drag"),), np.array([0.0, 1.0]))]
     (both,) = problem.fit(tasks)
     there = problem.only(problem.trials[:1])
@@ -233,27 +240,27 @@ def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
 
 def test_what_is_believed_costs_little_within_its_tolerance(made):
     twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
+    problem = FitProblem(record(None), twin, ensemble=ensemble)
     held = np.array([False])
-    costs = [float((problem.belief(np.array([a]), held)[0] ** 2).sum()) for a in (0.0, 1.0, 2.0)]
+    costs = [float((problem.prior_residual(np.array([a]), held)[0] ** 2).sum()) for a in (0.0, 1.0, 2.0)]
     assert costs[0] == 0 and costs[1] < 0.1 and costs[2] > 20
     for a in (0.5, 1.5):
-        r, slope = (x[0] for x in problem.belief(np.array([a]), held))
-        ahead = problem.belief(np.array([a + 1e-6]), held)[0][0]
+        r, slope = (x[0] for x in problem.prior_residual(np.array([a]), held))
+        ahead = problem.prior_residual(np.array([a + 1e-6]), held)[0][0]
         assert (ahead - r) / 1e-6 == pytest.approx(slope, rel=0.1)
-    assert not problem.belief(np.array([3.0]), np.array([True]))[0].any()
+    assert not problem.prior_residual(np.array([3.0]), np.array([True]))[0].any()
 
 
 def test_a_verdict_names_the_effect_or_nothing(made):
     twin, ensemble, record = made
     effects = [effect(name) for name in ("modulus", "drag", "gravity_tilt")]
     quiet = {"report": lambda line: None}
-    told = judge(Problem(record("drag", (600.0,)), twin, ensemble=ensemble), effects, **quiet)
+    told = judge(FitProblem(record("drag", (600.0,)), twin, ensemble=ensemble), effects, **quiet)
     assert told.kind == "explained" and told.chosen[0].fit.name == "drag"
     deviation = float(np.sqrt(told.chosen[0].fit.covariances[0][0, 0]))
     assert abs(told.chosen[0].fit.values[0][0] - 600.0) < 5 * deviation
-    nothing = judge(Problem(record(None), twin, ensemble=ensemble), effects, **quiet)
-    assert nothing.kind == "nothing_missing" and nothing.excess == pytest.approx(1.0, abs=0.3)
+    null_model = judge(FitProblem(record(None), twin, ensemble=ensemble), effects, **quiet)
+    assert null_model.kind == "nothing_missing" and null_model.excess == pytest.approx(1.0, abs=0.3)
 
 
 def test_a_wrong_frequency_is_found_over_many_swings(made):
@@ -261,7 +268,7 @@ def test_a_wrong_frequency_is_found_over_many_swings(made):
     twin, ensemble, record = made
     recorded = record("modulus", (0.9,))
     told = judge(
-        Problem(recorded, twin, ensemble=ensemble), [effect("modulus"), effect("drag")], report=lambda line: None
+        FitProblem(recorded, twin, ensemble=ensemble), [effect("modulus"), effect("drag")], report=lambda line: None
     )
     assert told.chosen and told.chosen[0].fit.name == "modulus"
     assert told.chosen[0].fit.values[0][0] == pytest.approx(0.9, abs=0.01)
@@ -314,13 +321,13 @@ def test_what_cannot_be_asked_is_refused_before_any_work(made, tmp_path, monkeyp
 def test_a_beginning_without_samples_is_none(made):
     twin, ensemble, record = made
     experiment = record(None)
-    early = Problem(experiment, twin, ensemble=ensemble).early(0.35)
+    early = FitProblem(experiment, twin, ensemble=ensemble).early(0.35)
     assert early is not None and all(t.setup.duration == pytest.approx(0.07) for t in early.trials)
-    assert Problem(experiment, twin, ensemble=ensemble).early(0.12) is None
+    assert FitProblem(experiment, twin, ensemble=ensemble).early(0.12) is None
     recording = experiment.trials[0].recording
     before = dataclasses.replace(recording, time=recording.time - 0.06)
     experiment = dataclasses.replace(experiment, trials=(dataclasses.replace(experiment.trials[0], recording=before),))
-    early = Problem(experiment, twin, ensemble=ensemble).early(0.12)
+    early = FitProblem(experiment, twin, ensemble=ensemble).early(0.12)
     assert early is not None and early.trials[0].setup.duration == pytest.approx(0.024)
 
 
@@ -345,7 +352,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     monkeypatch.setattr("torchsoro.sim2real.inference.verdict.library", lambda: (effect("drag"),))
     told = explain.explain(explain.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
     assert told is not None
-    broken = dataclasses.replace(told.verdict.ranking[0], kept=np.inf)  # JSON knows no infinity
+    broken = dataclasses.replace(told.verdict.ranking[0], heldout_ratio=np.inf)  # JSON knows no infinity
     verdict = dataclasses.replace(told.verdict, ranking=(broken,))
     json.dumps(as_json(dataclasses.replace(told, verdict=verdict), {}), allow_nan=False)
     answer = json.loads((tmp_path / "out" / "explanation.json").read_text())
@@ -391,12 +398,14 @@ def test_what_no_effect_explains_bends_no_clock(made):
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.01, 0.06, 0.01, 0.01))
     told = judge(
-        Problem(recorded, twin, ensemble=ensemble), [effect("gravity_tilt"), effect("drag")], report=lambda line: None
+        FitProblem(recorded, twin, ensemble=ensemble),
+        [effect("gravity_tilt"), effect("drag")],
+        report=lambda line: None,
     )
     assert told.kind != "explained" and told.excess > 4
-    errors = np.abs(told.nothing.errors / told.problem.camera.deviations)
+    errors = np.abs(told.null_model.errors / told.problem.observation.deviations)
     assert errors.max() < 6
-    assert np.mean(told.problem.numerics) > 1e-4
+    assert np.mean(told.problem.discretization) > 1e-4
 
 
 def test_two_effects_are_found_where_one_does_not_do(made):
@@ -409,12 +418,12 @@ def test_two_effects_are_found_where_one_does_not_do(made):
     for trial in one.trials:
         s = thrown(twin.scenario(trial), values, twin)
         s = effect("drag")(s, torch.tensor([[600.0]], dtype=torch.float64), twin)
-        seen = Camera(one.setup, [trial]).see(ensemble([s])[0].alone(), 0, np.zeros(12))
+        seen = ObservationModel(one.setup, [trial]).observe(ensemble([s])[0].alone(), 0, np.zeros(12))
         noise = 5e-5 * np.random.default_rng(5).normal(size=seen.shape)
         trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=seen + noise)))
     both = dataclasses.replace(one, trials=tuple(trials))
     effects = [effect(name) for name in ("drag", "initial_motion", "gravity_tilt")]
-    told = judge(Problem(both, twin, ensemble=ensemble), effects, report=lambda line: None)
+    told = judge(FitProblem(both, twin, ensemble=ensemble), effects, report=lambda line: None)
     assert told.chosen and {e.name for e in told.chosen[0].fit.effects} == {"drag", "initial_motion"}
     # Which of the numbers is which effect's does not depend on their order.
     found = dict(zip((e.name for e in told.chosen[0].fit.effects), told.chosen[0].fit.values, strict=True))

@@ -14,14 +14,14 @@ from test_experiment import experiment
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.outer_effects import GravityTilt
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.force_map import force_map, patches
 from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.phases import mismatches, phases
-from torchsoro.sim2real.inference.residual import Camera
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Push
-from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 
 COUNT = 3  # patches
 
@@ -33,7 +33,7 @@ def made(tmp_path_factory):
     twin = Twin(found.setup, edge=0.01, across=2)
     ensemble = Ensemble(twin)
 
-    def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> Problem:
+    def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> FitProblem:
         rng, trials = np.random.default_rng(1), []
         share = patches(twin, COUNT)[1][patch]
         pushed = torch.tensor(force, dtype=torch.float64)
@@ -42,20 +42,20 @@ def made(tmp_path_factory):
             if trial is thrown:
                 pushes = tuple(Push(share=share, force=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
                 s = s.replace(pushes=pushes)
-            camera = Camera(found.setup, [trial])
-            errors = np.zeros(len(camera.deviations))
+            observation = ObservationModel(found.setup, [trial])
+            errors = np.zeros(len(observation.deviations))
             errors[0], errors[6:] = 0.002, 2e-4
-            seen = camera.see(ensemble([s])[0].alone(), 0, errors)
+            seen = observation.observe(ensemble([s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
-        return Problem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)
+        return FitProblem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)
 
     return record
 
 
 def fitted(problem):
-    (nothing,) = problem.fit([((), None)], rounds=4)
-    return nothing
+    (null_model,) = problem.fit([((), None)], rounds=4)
+    return null_model
 
 
 @pytest.mark.parametrize(("patch", "force"), [(2, (0.0, 0.0, 0.05)), (1, (0.0, -0.1, 0.0)), (2, (0.5, 0.0, 0.0))])
@@ -75,11 +75,11 @@ def test_a_planted_force_is_found(made, patch, force):
 
 def test_no_force_is_needed_where_the_recording_agrees(made):
     problem = made()
-    nothing = fitted(problem)
-    found = force_map(problem, nothing, count=COUNT)
+    null_model = fitted(problem)
+    found = force_map(problem, null_model, count=COUNT)
     assert found.share < 0.02 and not found.needed and str(found).startswith("No force")
-    after = predict(problem, nothing, problem.trials)
-    assert all(m.start is None for m in mismatches(problem, nothing, problem.trials, after))
+    after = predict(problem, null_model, problem.trials)
+    assert all(m.start is None for m in mismatches(problem, null_model, problem.trials, after))
 
 
 # Phases -----------------------------------------------------------------------------------------------------------
@@ -101,7 +101,7 @@ def motion_of(z):
     at = np.array([[0.06, 0.01, 0.02], [0.04, 0.0, 0.01]])
     place = at + z[:, None, None] * np.array([0, 0, 1.0])
     gradient = np.broadcast_to(np.eye(3), (len(z), 2, 3, 3))
-    return Motion(time=np.linspace(0, 1, len(z)), place=place, velocity=0 * place, gradient=gradient, dt=1e-3)
+    return MarkerMotion(time=np.linspace(0, 1, len(z)), place=place, velocity=0 * place, gradient=gradient, dt=1e-3)
 
 
 STILL = np.zeros(401)

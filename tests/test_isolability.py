@@ -15,14 +15,16 @@ from scipy.integrate import solve_ivp
 from torchsoro.sim2real.hypotheses.body_effects import Density, Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.inference.cosines import Response, cleared, compare, first_seen, imitation, settle
-from torchsoro.sim2real.inference.discretization import Numerics
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.discretization import DiscretizationError
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.isolability import isolability
-from torchsoro.sim2real.inference.likelihood import Beliefs
+from torchsoro.sim2real.inference.likelihood import Tolerances
 from torchsoro.sim2real.inference.next_experiment import REPEAT, Proposal, advice, next_experiment
 from torchsoro.sim2real.inference.ranking import Candidate
 from torchsoro.sim2real.inference.verdict import Verdict
-from torchsoro.sim2real.report.report import Explanation, as_json, draw_alike, lead
+from torchsoro.sim2real.report.drawings import draw_alike
+from torchsoro.sim2real.report.explanation import Explanation, as_json
+from torchsoro.sim2real.report.sentences import lead
 from torchsoro.sim2real.twin.scenario import Scenario
 
 # A chain: four masses between springs, from a wall on; two of them are seen. ----------------------------------------
@@ -98,16 +100,16 @@ def test_screening_finds_the_node_where_a_force_was_planted(node):
     r, candidates = left[:, 0], left[:, 1:]
     lengths = np.linalg.norm(candidates, axis=0)
     strengths = candidates.T @ r / lengths**2
-    misfits = r @ r - strengths**2 * lengths**2
-    assert misfits.argmin() == node
+    chi2s = r @ r - strengths**2 * lengths**2
+    assert chi2s.argmin() == node
     deviation = 1 / lengths[node]
     assert abs(strengths[node] - strength) < 4 * deviation
-    assert misfits[node] == pytest.approx(2 * len(TIME), rel=0.4)
+    assert chi2s[node] == pytest.approx(2 * len(TIME), rel=0.4)
     # How far another node stays behind: what of the planted change it cannot imitate.
     for k in set(range(NODES)) - {node}:
         alike = imitation(candidates[:, node], candidates[:, k : k + 1], np.array([True]))
         expected = (strength * lengths[node]) ** 2 * (1 - alike**2)
-        assert misfits[k] - misfits[node] == pytest.approx(expected, rel=0.15)
+        assert chi2s[k] - chi2s[node] == pytest.approx(expected, rel=0.15)
 
 
 def test_forces_on_a_chain_are_seen_and_alike_as_in_closed_form():
@@ -130,13 +132,13 @@ def test_a_common_unknown_takes_up_what_its_belief_allows():
     """The effect is the unknown itself: it stands out where its value is hard to believe."""
     change = columns()[:, :1]
 
-    def belief(x):
+    def prior_residual(x):
         return np.hypot(0.3 * x, np.maximum(np.abs(x) - 1, 0) / 0.15)
 
-    length, slopes = settle(0.5 * change[:, 0], change, belief)
+    length, slopes = settle(0.5 * change[:, 0], change, prior_residual)
     assert length == pytest.approx(0.15, rel=1e-3) and slopes == pytest.approx(0.3, rel=1e-3)
-    found, _ = first_seen(np.ones(1), change, change, belief, 40.0)
-    assert float(belief(np.array([found]))[0]) == pytest.approx(math.sqrt(40.0), rel=0.01)
+    found, _ = first_seen(np.ones(1), change, change, prior_residual, 40.0)
+    assert float(prior_residual(np.array([found]))[0]) == pytest.approx(math.sqrt(40.0), rel=0.01)
 
 
 def test_what_begins_at_a_strength_is_seen_from_there_on():
@@ -159,7 +161,7 @@ class Twice(Density):
 class Idle(Hypothesis):
     """Changes nothing."""
 
-    name, seam = "idle", "nothing"
+    name, affected_quantity = "idle", "nothing"
     quantities = (Quantity("amount", "1", 1.0, 0.0, 10.0),)
     starts = ((1.0,),)
 
@@ -181,30 +183,30 @@ def problem(made):
     """From rest, under its own weight, believed to be springy: no time but that of density and modulus."""
     twin, ensemble, record = made
     recorded = record(None)
-    return Problem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
+    return FitProblem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
 
 
 @pytest.fixture(scope="module")
-def told(problem):
+def screened(problem):
     names = ("modulus", "density", "attached_mass", "drag", "gravity_tilt")
     return isolability(problem, [*map(effect, names), Twice(), Idle(), Broken()])
 
 
-def test_effects_that_are_the_same_are_alike(told):
-    at = {name: i for i, name in enumerate(told.effects)}
+def test_effects_that_are_the_same_are_alike(screened):
+    at = {name: i for i, name in enumerate(screened.effects)}
     density, twice = at["density"], at["twice"]
-    assert told.alike[density, twice] == pytest.approx(1.0, abs=1e-6)
-    assert told.alike[twice, density] == pytest.approx(1.0, abs=1e-6)
-    assert ("density", "twice") in told.confused()
-    np.testing.assert_array_equal(np.diag(told.alike), 1.0)
-    assert (told.alike >= 0).all() and (told.alike <= 1 + 1e-9).all()
+    assert screened.alike[density, twice] == pytest.approx(1.0, abs=1e-6)
+    assert screened.alike[twice, density] == pytest.approx(1.0, abs=1e-6)
+    assert ("density", "twice") in screened.confused()
+    np.testing.assert_array_equal(np.diag(screened.alike), 1.0)
+    assert (screened.alike >= 0).all() and (screened.alike <= 1 + 1e-9).all()
 
 
 def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than_like_drag(problem):
     """With a modulus that is known well: within a wide belief, it takes up most of what a mass does."""
     trial, names = problem.trials[0], ("modulus", "density", "attached_mass", "drag")
-    sure = Problem(
-        problem.experiment, problem.twin, trials=[trial], ensemble=problem.ensemble, beliefs=Beliefs(modulus=1e-3)
+    sure = FitProblem(
+        problem.experiment, problem.twin, trials=[trial], ensemble=problem.ensemble, tolerances=Tolerances(modulus=1e-3)
     )
     modulus, density, mass, drag = range(4)
     found = isolability(sure, [effect(name) for name in names])
@@ -214,24 +216,24 @@ def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than
     assert found.alike[mass, drag] < 0.97
 
 
-def test_what_changes_nothing_or_breaks_down_is_never_seen(told):
-    idle, broken = told.effects.index("idle"), told.effects.index("broken")
-    assert np.isinf(told.detectable[[idle, broken]]).all()
-    assert np.isfinite(np.delete(told.detectable, [idle, broken])).all()
+def test_what_changes_nothing_or_breaks_down_is_never_seen(screened):
+    idle, broken = screened.effects.index("idle"), screened.effects.index("broken")
+    assert np.isinf(screened.detectable[[idle, broken]]).all()
+    assert np.isfinite(np.delete(screened.detectable, [idle, broken])).all()
     for k in (idle, broken):
-        assert not np.delete(told.alike[k], k).any() and not np.delete(told.alike[:, k], k).any()
-    answer = json.loads(json.dumps(told.as_json()))
+        assert not np.delete(screened.alike[k], k).any() and not np.delete(screened.alike[:, k], k).any()
+    answer = json.loads(json.dumps(screened.as_json()))
     assert answer["detectable"][idle]["value"] is None and answer["effects"][idle] == "idle"
-    draw_alike(told)
+    draw_alike(screened)
 
 
-def test_recorded_places_do_not_count(problem, told):
+def test_recorded_places_do_not_count(problem, screened):
     trial = problem.trials[0]
     place = trial.recording.place + 0.1 * np.random.default_rng(0).normal(size=trial.recording.place.shape)
     other = dataclasses.replace(trial, recording=dataclasses.replace(trial.recording, place=place))
     again = isolability(problem.only([other]), [effect("drag"), effect("density")])
-    drag = told.effects.index("drag")
-    assert again.detectable[0] == pytest.approx(told.detectable[drag], rel=0.02)
+    drag = screened.effects.index("drag")
+    assert again.detectable[0] == pytest.approx(screened.detectable[drag], rel=0.02)
 
 
 def test_a_known_pull_tells_density_from_modulus(problem):
@@ -249,21 +251,21 @@ def test_a_known_pull_tells_density_from_modulus(problem):
     assert not advice([])
 
 
-def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(problem, told):
-    density, nothing = problem.fit([((effect("density"),), None), ((), None)], rounds=1)
+def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(problem, screened):
+    density, null_model = problem.fit([((effect("density"),), None), ((), None)], rounds=1)
     chosen = Candidate(fit=density, score=50.0, gain=50.0, explained=1.0)
     verdict = Verdict(
-        kind="cannot_distinguish", problem=problem, nothing=nothing, ranking=(chosen,), chosen=(chosen,) * 2
+        kind="cannot_distinguish", problem=problem, null_model=null_model, ranking=(chosen,), chosen=(chosen,) * 2
     )
     found = Explanation(
         problem=problem,
-        numerics=Numerics(deviation=(), shift=(), correction={}, edges=(0.01,), walls=(2,)),
+        discretization=DiscretizationError(deviation=(), shift=(), correction={}, edges=(0.01,), walls=(2,)),
         verdict=verdict,
         before=(),
         after=(),
         heldout=(),
         seconds=1.0,
-        isolability=told,
+        isolability=screened,
         following=(
             Proposal(words="the same for 9 s", alike=0.5, distance=900.0),
             Proposal(words=REPEAT, alike=1.0, distance=0.0),

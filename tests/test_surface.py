@@ -12,7 +12,7 @@ import trimesh
 
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.data.surface import Surface, read_surface
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.twin.ensemble import SAFETY, Ensemble
 from torchsoro.sim2real.twin.twin import Twin
@@ -176,7 +176,7 @@ def test_a_round_bar_that_is_thrown_bears_it(tmp_path):
 def test_a_model_takes_its_mesh_along(tmp_path):
     found = folder(tmp_path / "experiment", prism(CORNERS, 0, 20))
     twin = Twin(found.setup, edge=0.01, across=2)
-    (fit,) = Problem(found, twin, ensemble=Ensemble(twin)).fit([((), None)], rounds=1)
+    (fit,) = FitProblem(found, twin, ensemble=Ensemble(twin)).fit([((), None)], rounds=1)
     assert fit is not None
     out = tmp_path / "out"
     out.mkdir()

@@ -336,7 +336,7 @@ def test_adhesion_pulls_as_far_as_it_reaches(trial, gap, speed, expected):
     twin = Twin(t.setup, edge=EDGE)
     effect = next(e for e in library() if e.name == "adhesion")
     values = torch.tensor([[traction, math.log(reach)]], dtype=torch.float64)
-    assert effect.told(values[0].numpy(), twin.scenario(t))["energy_j_m2"][0] == pytest.approx(traction * reach)
+    assert effect.reported(values[0].numpy(), twin.scenario(t))["energy_j_m2"][0] == pytest.approx(traction * reach)
     motion = Ensemble(twin)([effect(twin.scenario(t), values, twin)])[0].alone()
     last = 2 if expected < 0 else -1  # before it meets the plane
     assert motion.velocity[last, :, 2].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
@@ -354,7 +354,7 @@ def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
     assert twice.applies(believed, twin) and not twice.applies(twin.scenario(t), twin)
     without = twice(believed, torch.tensor([[-1.0]], dtype=torch.float64), twin)
     assert not without.air_stiffness.any()
-    assert twice.told(np.array([-1.0]), believed)["air_stiffness_pa"][0] == -2e4
+    assert twice.reported(np.array([-1.0]), believed)["air_stiffness_pa"][0] == -2e4
     # Pressure acts from inside: the forces on the whole body add up to nothing.
     free = run(changed(t, t.pressure, clamps=(), duration=0.05))
     assert abs((free.place[-1] - free.place[0]).mean(0)[0]) < 2e-4
@@ -404,7 +404,7 @@ def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
     assert effect.applies(scenario, twin) and len(effect.quantities) <= 3
     count = len(effect.quantities)
     zero = torch.zeros(1, count, dtype=torch.float64)
-    some = torch.tensor(effect.looks(twin)[-1][:1, :count]) * torch.tensor([q.scale for q in effect.quantities])
+    some = torch.tensor(effect.probe_points(twin)[-1][:1, :count]) * torch.tensor([q.scale for q in effect.quantities])
     if effect.local:
         place = torch.tensor([[0.035, 0.01, 0.015]], dtype=torch.float64)
         zero, some = torch.cat([zero, place], 1), torch.cat([some, place], 1)

@@ -11,9 +11,9 @@ import pytest
 from ringing import effect
 
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.ranking import Candidate, rank
-from torchsoro.sim2real.inference.search import _freed
+from torchsoro.sim2real.inference.search import _unconstrained
 from torchsoro.sim2real.inference.verdict import Thresholds, decide
 
 
@@ -21,14 +21,14 @@ from torchsoro.sim2real.inference.verdict import Thresholds, decide
 def still(made):
     """Recordings that lack nothing, and their fit without an effect."""
     twin, ensemble, record = made
-    problem = Problem(record(None), twin, ensemble=ensemble)
+    problem = FitProblem(record(None), twin, ensemble=ensemble)
     return problem, problem.fit([((), None)], rounds=3)[0]
 
 
-def fitted(nothing, name, score, explained, kept=math.nan):
+def fitted(null_model, name, score, explained, heldout_ratio=math.nan):
     """An effect of which only these numbers count."""
-    fit = dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),))
-    return Candidate(fit=fit, score=score, gain=400.0, explained=explained, kept=kept)
+    fit = dataclasses.replace(null_model, effects=(effect(name),), values=(np.ones(6),))
+    return Candidate(fit=fit, score=score, gain=400.0, explained=explained, heldout_ratio=heldout_ratio)
 
 
 def on(planes):
@@ -37,21 +37,21 @@ def on(planes):
 
 
 def test_candidates_are_scored_by_the_best_of_them(still):
-    problem, nothing = still
-    worse = dataclasses.replace(nothing, misfit=3 * nothing.samples, effects=(effect("drag"),), unknowns=1)
-    better = dataclasses.replace(worse, misfit=1.5 * nothing.samples, effects=(effect("tether"),), unknowns=6)
-    start = dataclasses.replace(nothing, misfit=10.0 * nothing.samples)
-    trust = problem.camera.deviations
-    first, second = rank([worse, better], start, start.misfit, trust)
+    problem, null_model = still
+    worse = dataclasses.replace(null_model, chi2=3 * null_model.samples, effects=(effect("drag"),), unknowns=1)
+    better = dataclasses.replace(worse, chi2=1.5 * null_model.samples, effects=(effect("tether"),), unknowns=6)
+    start = dataclasses.replace(null_model, chi2=10.0 * null_model.samples)
+    trust = problem.observation.deviations
+    first, second = rank([worse, better], start, start.chi2, trust)
     assert first.fit is better and second.fit is worse
     # What no form of an effect is known well enough for does not count, and then the simpler is the better.
-    near = dataclasses.replace(worse, misfit=better.misfit + 0.5 * nothing.samples)
-    simple, other = rank([near, better], start, 1e3 * start.misfit, trust)
+    near = dataclasses.replace(worse, chi2=better.chi2 + 0.5 * null_model.samples)
+    simple, other = rank([near, better], start, 1e3 * start.chi2, trust)
     assert simple.fit is near and simple.gain < other.gain
     # A clock that would have to be off by five standard deviations tells against an effect, thirty do not forbid it.
     for off, lost in ((2.0, 0.0), (5.0, 2.0), (30.0, 12.0)):
         bent = dataclasses.replace(near, errors=off * trust * (np.arange(len(trust)) == 0))
-        told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.misfit, trust)}
+        told = {c.fit.name: c.score for c in rank([bent, better], start, 1e3 * start.chi2, trust)}
         assert told["drag"] == pytest.approx(simple.score - lost)
 
 
@@ -69,128 +69,140 @@ def test_candidates_are_scored_by_the_best_of_them(still):
     ],
 )
 def test_what_is_said_of_the_best_effect(still, start, excess, explained, gain, kept, kind):
-    problem, nothing = still
-    fit = dataclasses.replace(nothing, effects=(effect("drag"),), values=(np.ones(1),))
-    found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, kept=kept)]
-    assert decide(problem, nothing, found, excess, Thresholds(), start=start).kind == kind
+    problem, null_model = still
+    fit = dataclasses.replace(null_model, effects=(effect("drag"),), values=(np.ones(1),))
+    found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, heldout_ratio=kept)]
+    assert decide(problem, null_model, found, excess, Thresholds(), start=start).kind == kind
 
 
 def test_where_trials_that_are_left_out_tell_little_but_noise_a_little_better_is_believed(still):
-    problem, nothing = still
-    found = [fitted(nothing, "density", 400.0, 0.96, kept=0.9)]
+    problem, null_model = still
+    found = [fitted(null_model, "density", 400.0, 0.96, heldout_ratio=0.9)]
     for faint, chosen in ((1.5, 1), (3.0, 0)):
-        assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0, faint=faint).chosen) == chosen
+        assert len(decide(problem, null_model, found, 1.5, Thresholds(), start=9.0, faint=faint).chosen) == chosen
 
 
 def test_a_strained_belief_is_set_free_too(still):
-    problem, nothing = still
-    assert not _freed(problem, library(), nothing)
-    ((chosen, begin),) = _freed(problem, library(), dataclasses.replace(nothing, point=np.array([3.5])))
+    problem, null_model = still
+    assert not _unconstrained(problem, library(), null_model)
+    ((chosen, begin),) = _unconstrained(problem, library(), dataclasses.replace(null_model, point=np.array([3.5])))
     assert [e.name for e in chosen] == ["modulus"]
     assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
 
 
 def test_what_predicts_far_worse_than_another_is_not_believed(still):
-    problem, nothing = still
+    problem, null_model = still
     tether, drag = (
-        dataclasses.replace(nothing, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
+        dataclasses.replace(null_model, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
     )
     common = {"gain": 400.0, "explained": 0.96}
     for kept, chosen in ((0.3, "tether"), (0.38, "tether"), (0.6, "drag"), (0.9, "drag")):
         found = [
-            Candidate(fit=tether, score=480.0, kept=kept, **common),
-            Candidate(fit=drag, score=460.0, kept=0.3, **common),
+            Candidate(fit=tether, score=480.0, heldout_ratio=kept, **common),
+            Candidate(fit=drag, score=460.0, heldout_ratio=0.3, **common),
         ]
-        told = decide(problem, nothing, found, 1.5, Thresholds(), start=9.0)
+        told = decide(problem, null_model, found, 1.5, Thresholds(), start=9.0)
         assert [c.fit.name for c in told.chosen] == [chosen]
     # Of two that predict nearly all, neither does far worse.
-    found = [dataclasses.replace(c, kept=kept) for c, kept in zip(found, (0.05, 0.035), strict=True)]
-    assert decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
+    found = [dataclasses.replace(c, heldout_ratio=kept) for c, kept in zip(found, (0.05, 0.035), strict=True)]
+    assert decide(problem, null_model, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
 
 
 def test_a_threshold_does_not_part_what_predicts_alike(still):
-    problem, nothing = still
-    found = [fitted(nothing, name, 400.0, 0.96, kept=kept) for name, kept in (("density", 0.853), ("drag", 0.849))]
-    assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen) == 2
+    problem, null_model = still
+    found = [
+        fitted(null_model, name, 400.0, 0.96, heldout_ratio=kept)
+        for name, kept in (("density", 0.853), ("drag", 0.849))
+    ]
+    assert len(decide(problem, null_model, found, 1.5, Thresholds(), start=9.0).chosen) == 2
     # If none is believed, what comes near it is not either.
-    assert not decide(problem, nothing, found[:1], 1.5, Thresholds(), start=9.0).chosen
+    assert not decide(problem, null_model, found[:1], 1.5, Thresholds(), start=9.0).chosen
 
 
 @pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
 def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
-    _, nothing = still
+    _, null_model = still
     found = [
-        fitted(nothing, name, score, 0.96) for name, score in (("density", 180.0), ("modulus", 120.0), ("drag", 90.0))
+        fitted(null_model, name, score, 0.96)
+        for name, score in (("density", 180.0), ("modulus", 120.0), ("drag", 90.0))
     ]
-    told = decide(on(planes), nothing, found, 1.5, Thresholds(), start=9.0)
+    told = decide(on(planes), null_model, found, 1.5, Thresholds(), start=9.0)
     assert told.kind == kind
     assert [c.fit.name for c in told.chosen] == ["density", "modulus"][: 1 + len(planes)]
 
 
 @pytest.mark.parametrize("kept, told", [(0.8, ["friction"]), (0.9, ["friction", "adhesion"])])
 def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
-    _, nothing = still
+    _, null_model = still
     found = [
-        fitted(nothing, name, score, 0.96, kept=ratio)
+        fitted(null_model, name, score, 0.96, heldout_ratio=ratio)
         for name, score, ratio in (("adhesion", 420.0, kept), ("friction", 400.0, 0.4), ("drag", 200.0, kept))
     ]
-    assert [c.fit.name for c in decide(on(("a plane",)), nothing, found, 1.5, Thresholds(), start=9.0).chosen] == told
+    assert [
+        c.fit.name for c in decide(on(("a plane",)), null_model, found, 1.5, Thresholds(), start=9.0).chosen
+    ] == told
 
 
 def test_nothing_is_missing_where_noise_and_numerics_cover_all(still):
-    problem, nothing = still
-    found = [fitted(nothing, "drag", 400.0, 0.96, kept=0.5)]
+    problem, null_model = still
+    found = [fitted(null_model, "drag", 400.0, 0.96, heldout_ratio=0.5)]
     for plainly, kind in ((0.75, "nothing_missing"), (0.85, "explained")):
-        assert decide(problem, nothing, found, 0.5, Thresholds(), start=0.75, plainly=plainly).kind == kind
+        assert decide(problem, null_model, found, 0.5, Thresholds(), start=0.75, plainly=plainly).kind == kind
 
 
 def test_what_noise_hides_is_one_effect_where_bodies_slide_too(still):
-    _, nothing = still
-    found = [fitted(nothing, "friction", 400.0, 0.96, kept=0.9)]
-    assert decide(on(("a plane",)), nothing, found, 1.0, Thresholds(), start=1.1).kind == "explained"
+    _, null_model = still
+    found = [fitted(null_model, "friction", 400.0, 0.96, heldout_ratio=0.9)]
+    assert decide(on(("a plane",)), null_model, found, 1.0, Thresholds(), start=1.1).kind == "explained"
 
 
 @pytest.mark.parametrize("best, other, told", [(0.8, 0.61, 2), (0.8, 0.59, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
 def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
-    problem, nothing = still
+    problem, null_model = still
     found = [
-        fitted(nothing, name, score, share) for name, score, share in (("density", 480.0, best), ("drag", 440.0, other))
+        fitted(null_model, name, score, share)
+        for name, score, share in (("density", 480.0, best), ("drag", 440.0, other))
     ]
-    assert len(decide(problem, nothing, found, 1.5, Thresholds(), start=9.0).chosen) == told
+    assert len(decide(problem, null_model, found, 1.5, Thresholds(), start=9.0).chosen) == told
 
 
 @pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])
 def test_the_believed_modulus_may_be_that_of_the_stiff_side(still, slope, ranked):
-    problem, nothing = still
-    freed = dataclasses.replace(nothing, effects=(effect("modulus"),), values=(np.array([-0.25]),), misfit=6600.0)
+    problem, null_model = still
+    unconstrained = dataclasses.replace(
+        null_model, effects=(effect("modulus"),), values=(np.array([-0.25]),), chi2=6600.0
+    )
     off = np.array([-2.5, slope / 0.2, 0.0, 0.0])
     soft = dataclasses.replace(
-        nothing, effects=(effect("soft_side"),), values=(np.array([slope, 0.0, 0.0]),), belief=np.array([-0.25]),
-        point=off, misfit=4400.0, unknowns=3,
+        null_model, effects=(effect("soft_side"),), values=(np.array([slope, 0.0, 0.0]),), ln_factors=np.array([-0.25]),
+        point=off, chi2=4400.0, unknowns=3,
     )  # fmt: skip
-    without = dataclasses.replace(nothing, misfit=7000.0)
-    found = rank([freed, soft], without, 115000.0, problem.camera.deviations)
+    without = dataclasses.replace(null_model, chi2=7000.0)
+    found = rank([unconstrained, soft], without, 115000.0, problem.observation.deviations)
     assert [c.fit.name for c in found] == ranked
 
 
 def test_of_those_that_lean_on_what_is_not_believed_the_least_is_kept(still):
     """Less density is more modulus and more pressure: neither of these does without the other."""
-    problem, nothing = still
-    without = dataclasses.replace(nothing, misfit=8000.0, belief=np.zeros(2), point=np.zeros(2))
+    problem, null_model = still
+    without = dataclasses.replace(null_model, chi2=8000.0, ln_factors=np.zeros(2), point=np.zeros(2))
 
-    def leaning(name, misfit, by):
+    def leaning(name, chi2, by):
         return dataclasses.replace(
-            without, effects=(effect(name),), values=(np.array([0.2]),), misfit=misfit, point=np.array([0.0, by, 1.0])
+            without, effects=(effect(name),), values=(np.array([0.2]),), chi2=chi2, point=np.array([0.0, by, 1.0])
         )
 
     fits = [leaning("density", 7170.0, 1.7), leaning("pressure_loss", 7210.0, 2.2), leaning("modulus", 7900.0, 5.0)]
     drag = leaning("drag", 7890.0, 5.0)
-    found = rank([*fits, drag], without, 30000.0, problem.camera.deviations)
+    found = rank([*fits, drag], without, 30000.0, problem.observation.deviations)
     assert [c.fit.name for c in found] == ["density", "pressure_loss"]
     # What stands by itself sends away what leans, unless that does far better.
-    found = rank([*fits, leaning("modulus", 7200.0, 0.5)], without, 30000.0, problem.camera.deviations)
+    found = rank([*fits, leaning("modulus", 7200.0, 0.5)], without, 30000.0, problem.observation.deviations)
     assert [c.fit.name for c in found] == ["modulus"]
     found = rank(
-        [leaning("density", 1000.0, 1.7), leaning("modulus", 7200.0, 0.5)], without, 30000.0, problem.camera.deviations
+        [leaning("density", 1000.0, 1.7), leaning("modulus", 7200.0, 0.5)],
+        without,
+        30000.0,
+        problem.observation.deviations,
     )
     assert [c.fit.name for c in found] == ["density", "modulus"]

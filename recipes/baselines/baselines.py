@@ -27,7 +27,7 @@ from torchsoro.command_line import plain_errors
 from torchsoro.output.archive import atomic_write
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.fit import Fit, Problem
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import StepForce, force_map, patches
 from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.histories import Lines, simulate
@@ -36,7 +36,7 @@ from torchsoro.sim2real.inference.model import write_model
 from torchsoro.sim2real.inference.verdict import Thresholds, judge
 from torchsoro.sim2real.pipeline import Options as ExplainOptions
 from torchsoro.sim2real.pipeline import begun, predicted, prepared
-from torchsoro.sim2real.report.report import effect_rows
+from torchsoro.sim2real.report.explanation import effect_rows
 from torchsoro.sim2real.twin.ensemble import Ensemble
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
@@ -98,7 +98,7 @@ class Answer:
     fit: Fit | None = None
 
 
-def fitted(problem: Problem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
+def fitted(problem: FitProblem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
     """A fit.
 
     Raises:
@@ -111,18 +111,18 @@ def fitted(problem: Problem, effects: Effects = (), start: np.ndarray | None = N
 
 
 def left_out(
-    problem: Problem, nothing: Fit, other: Callable[[int, Problem, Trial], float]
+    problem: FitProblem, null_model: Fit, other: Callable[[int, FitProblem, Trial], float]
 ) -> dict[str, tuple[float, float]]:
     """The error of each trial as believed, and what a function of its number, the other trials and it gives."""
     found = {}
     for i, trial in enumerate(problem.trials):
         where = problem.only([t for t in problem.trials if t is not trial])
-        (before,) = predict(where, problem.without(nothing, i), [trial], believed=True)
+        (before,) = predict(where, problem.without(null_model, i), [trial], believed=True)
         found[trial.name] = before.total, other(i, where, trial)
     return found
 
 
-def parameters(problem: Problem, names: Sequence[str]) -> Answer:
+def parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
     """Least squares in some parameters at once; those far from what is believed are named."""
     effects = tuple(problem.thought_of([e for e in library() if e.name in names]))
     start = [np.zeros(len(problem.common))]
@@ -132,7 +132,7 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
         begin[0] = 0.0
         start.append(begin)
     fit = fitted(problem, effects, np.concatenate(start), rounds=20)
-    spread = math.sqrt(max(1.0, fit.misfit / fit.samples))
+    spread = math.sqrt(max(1.0, fit.chi2 / fit.samples))
     rows = {r["name"]: r for r in effect_rows(fit, 1.0, problem)}
     sure = []
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
@@ -141,7 +141,7 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
         if v.any() and float(v @ np.linalg.pinv(c) @ v) > strengths * (SURE * spread) ** 2:
             sure.append(effect.name)
 
-    def after(i: int, where: Problem, trial: Trial) -> float:
+    def after(i: int, where: FitProblem, trial: Trial) -> float:
         told = predict(where, problem.without(fit, i), [trial])
         return told[0].total if told else BROKEN
 
@@ -150,7 +150,7 @@ def parameters(problem: Problem, names: Sequence[str]) -> Answer:
     return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
 
 
-def judged(problem: Problem, budget: float, **thresholds: float) -> Answer:
+def judged(problem: FitProblem, budget: float, **thresholds: float) -> Answer:
     """The verdict of explain.py."""
     verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
     rows = effect_rows(verdict.chosen[0].fit, 1.0, verdict.problem) if verdict.chosen else []
@@ -159,19 +159,19 @@ def judged(problem: Problem, budget: float, **thresholds: float) -> Answer:
         effects=rows,
         names=[c.fit.name for c in verdict.chosen],
         heldout=verdict.heldout,
-        fit=verdict.chosen[0].fit if verdict.chosen else verdict.nothing,
+        fit=verdict.chosen[0].fit if verdict.chosen else verdict.null_model,
     )
 
 
-def without_band(problem: Problem) -> Problem:
+def without_band(problem: FitProblem) -> FitProblem:
     """The same, as if the corrected twin made no error."""
-    return problem.only(problem.trials, numerics=[np.zeros_like(n) for n in problem.numerics])
+    return problem.only(problem.trials, discretization=[np.zeros_like(n) for n in problem.discretization])
 
 
 # A network of forces -----------------------------------------------------------------------------------------------
 
 
-def features(problem: Problem, fit: Fit) -> torch.Tensor:
+def features(problem: FitProblem, fit: Fit) -> torch.Tensor:
     """Of each patch and window [T, P, W, F], about one: place, motion of the marker next to it, pressures."""
     places, _ = patches(problem.twin, PATCHES)
     setup = problem.experiment.setup
@@ -227,21 +227,21 @@ def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
     return network
 
 
-def force_network(problem: Problem) -> Answer:
+def force_network(problem: FitProblem) -> Answer:
     """Forces by a network, learned from all trials but one."""
-    nothing = fitted(problem)
+    null_model = fitted(problem)
     s = problem.experiment.setup
     small = 1e-3 * s.youngs_modulus * min(s.size) ** 3 / max(s.size)
     _, shares = patches(problem.twin, PATCHES)
     steps = tuple(StepForce(share, k / WINDOWS, small) for share in shares for k in range(WINDOWS))
     none = np.zeros((len(problem.trials), PATCHES, WINDOWS, 3))
-    motions = simulate(problem, steps, nothing.point[None], none[None], slopes=True)
-    x = features(problem, nothing)
+    motions = simulate(problem, steps, null_model.point[None], none[None], slopes=True)
+    x = features(problem, null_model)
 
-    def after(i: int, where: Problem, trial: Trial) -> float:
+    def after(i: int, where: FitProblem, trial: Trial) -> float:
         others = [k for k in range(len(problem.trials)) if k != i]
-        still = problem.without(nothing, i)
-        lines = Lines(where, still.errors, nothing.point, [motions[k] for k in others], none[others])
+        still = problem.without(null_model, i)
+        lines = Lines(where, still.errors, null_model.point, [motions[k] for k in others], none[others])
         forces = trained(lines, x[others])(x[i]).detach().numpy()
         jumps = np.diff(forces, axis=1, prepend=0.0).reshape(-1)
         fit = dataclasses.replace(still, effects=steps, point=np.concatenate([still.point, jumps]))
@@ -249,19 +249,19 @@ def force_network(problem: Problem) -> Answer:
         found = predict(where, fit, [trial]) or predict(where, still, [trial])
         return found[0].total
 
-    held = left_out(problem, nothing, after)
+    held = left_out(problem, null_model, after)
     (one, other) = (math.sqrt(sum(v[k] ** 2 for v in held.values())) for k in (0, 1))
     return Answer(verdict="unknown_physics" if other < HELPS * one else "nothing_missing", heldout=held)
 
 
-def mapped(problem: Problem) -> Answer:
+def mapped(problem: FitProblem) -> Answer:
     """The place of the largest force that a force map needs, where something is missing."""
-    nothing = fitted(problem)
-    if nothing.misfit < Thresholds().quiet * nothing.samples:
-        return Answer(verdict="nothing_missing", fit=nothing)
-    needed = force_map(problem, nothing, count=SLICES, windows=WINDOWS).needed
+    null_model = fitted(problem)
+    if null_model.chi2 < Thresholds().quiet * null_model.samples:
+        return Answer(verdict="nothing_missing", fit=null_model)
+    needed = force_map(problem, null_model, count=SLICES, windows=WINDOWS).needed
     rows = [{"name": "force", "parameters": {}, "location_m": n.place.tolist()} for n in needed[:1]]
-    return Answer(verdict="unknown_physics", effects=rows, fit=nothing)
+    return Answer(verdict="unknown_physics", effects=rows, fit=null_model)
 
 
 # Sparse regression -------------------------------------------------------------------------------------------------
@@ -279,7 +279,7 @@ def smoothed(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
     return np.asarray(savgol_filter(whole, SMOOTH, 3, deriv=order, delta=float(even[1] - even[0])))
 
 
-def terms(problem: Problem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
+def terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
     """Names of terms, and for each trial their values [N, K] and the residual accelerations [N], by the recordings."""
     names = ["modulus", "stiffening", "viscoelastic", "drag", "friction", "density"]
     names += ["gravity_tilt"] * len(problem.experiment.setup.axes)
@@ -330,10 +330,10 @@ def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
     return x / scale
 
 
-def sparse_regression(problem: Problem) -> Answer:
+def sparse_regression(problem: FitProblem) -> Answer:
     """Terms that the residual accelerations are made of."""
-    nothing = fitted(problem)
-    names, values, targets = terms(problem, nothing)
+    null_model = fitted(problem)
+    names, values, targets = terms(problem, null_model)
     left = whole = 0.0
     for i, (A, y) in enumerate(zip(values, targets, strict=True)):
         others = [k for k in range(len(values)) if k != i]
@@ -367,7 +367,7 @@ def main(options: Options) -> Answer | None:
         problem, _ = prepared(whole)
     else:
         experiment, trials, twin = begun(whole)
-        problem = Problem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
+        problem = FitProblem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
         "modulus-and-damping": lambda: parameters(problem, ["modulus", "viscoelastic"]),

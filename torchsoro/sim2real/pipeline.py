@@ -14,17 +14,20 @@ from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experimen
 from torchsoro.sim2real.data.recording import write_table
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.discretization import WALLS, Numerics, choose_twin, finer, measure
-from torchsoro.sim2real.inference.fit import Fit, Problem
+from torchsoro.sim2real.inference.discretization import DiscretizationError, measure
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
 from torchsoro.sim2real.inference.heldout import Prediction, predict
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
 from torchsoro.sim2real.inference.phases import mismatches
-from torchsoro.sim2real.inference.residual import reordered
+from torchsoro.sim2real.inference.recording_faults import reordered
+from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, finer
 from torchsoro.sim2real.inference.verdict import judge
-from torchsoro.sim2real.report.report import Explanation, lead, write
+from torchsoro.sim2real.report.explanation import Explanation
+from torchsoro.sim2real.report.report import write
+from torchsoro.sim2real.report.sentences import lead
 from torchsoro.sim2real.twin.ensemble import THREADS, Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -101,7 +104,7 @@ def begun(options: Options) -> tuple[Experiment, list[Trial], Twin]:
     return experiment, trials, choose_twin(experiment.setup, len(trials), 60 * options.budget, walls=options.walls)
 
 
-def prepared(options: Options) -> tuple[Problem, Numerics]:
+def prepared(options: Options) -> tuple[FitProblem, DiscretizationError]:
     """What effects are fitted to: recordings, a twin, and that twin's own error.
 
     Raises:
@@ -115,26 +118,26 @@ def prepared(options: Options) -> tuple[Problem, Numerics]:
     ensemble = Ensemble(twin, options.threads or THREADS, options.device)
     fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads, options.device)
     print(f"corrected by one of {fine.twin.count} points")
-    numerics = measure(experiment, ensemble, fine)
-    problem = Problem(
+    discretization = measure(experiment, ensemble, fine)
+    problem = FitProblem(
         experiment,
         twin,
         trials=trials,
-        numerics=numerics.deviation,
-        shift=numerics.shift,
-        correction=numerics.correction,
+        discretization=discretization.deviation,
+        shift=discretization.shift,
+        correction=discretization.correction,
         ensemble=ensemble,
         fine=fine,
     )
     print(
         f"noise {1e3 * problem.noise:.3f} mm, numerics "
-        + ", ".join(f"{1e3 * n.mean():.3f}" for n in numerics.deviation)
+        + ", ".join(f"{1e3 * n.mean():.3f}" for n in discretization.deviation)
     )
-    return problem, numerics
+    return problem, discretization
 
 
 def shown(
-    problem: Problem, best: Fit, trials: list[Trial], kept: list[Trial]
+    problem: FitProblem, best: Fit, trials: list[Trial], kept: list[Trial]
 ) -> tuple[list[Trial], tuple[Prediction, ...], tuple[Prediction, ...]]:
     """The trials that do not break down, as believed and as explained."""
     for asked in ([*trials, *kept], trials):
@@ -156,20 +159,20 @@ def explain(options: Options) -> Explanation | None:
     if options.out.exists() and not options.out.is_dir():
         raise ValueError(f"out = {options.out}: a file, wanted a folder")
     begin = time.perf_counter()
-    problem, numerics = prepared(options)
+    problem, discretization = prepared(options)
     trials = list(problem.trials)
     kept = [t for t in problem.experiment.heldout if t.recording is not None]
     tells = isolability(problem)
-    verdict = judge(problem, named(options.effects), kept=kept, budget=60 * options.budget)
+    verdict = judge(problem, named(options.effects), heldout=kept, budget=60 * options.budget)
     problem = verdict.problem
-    best = verdict.chosen[0].fit if verdict.chosen else verdict.nothing
+    best = verdict.chosen[0].fit if verdict.chosen else verdict.null_model
     following = []
     if verdict.kind == "cannot_distinguish":
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
     everything, before, after = shown(problem, best, trials, kept)
     # Without what the best effect leaves, which was priced for the verdict.
-    known = problem.only(problem.trials, numerics=numerics.deviation)
+    known = problem.only(problem.trials, discretization=discretization.deviation)
     forces = None
     if verdict.kind == "unknown_physics":
         try:
@@ -178,12 +181,12 @@ def explain(options: Options) -> Explanation | None:
             print(f"no force map: {error}")
     found = Explanation(
         problem=problem,
-        numerics=numerics,
+        discretization=discretization,
         verdict=verdict,
         before=before,
         after=after,
         heldout=tuple(t.name for t in kept),
-        mismatches=tuple(mismatches(known, verdict.nothing, everything, after)),
+        mismatches=tuple(mismatches(known, verdict.null_model, everything, after)),
         forces=forces,
         seconds=time.perf_counter() - begin,
         isolability=tells,

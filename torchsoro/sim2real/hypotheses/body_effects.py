@@ -18,11 +18,11 @@ from torchsoro.simulation.material import Prony
 class Modulus(Hypothesis):
     """The solid is stiffer or softer than believed."""
 
-    name, seam = "modulus", "Young's modulus"
+    name, affected_quantity = "modulus", "Young's modulus"
     quantities = (Quantity("ln_factor", "1", 0.1, -12.0, 12.0),)
     starts = ((1.0,), (-1.0,), (2.5,), (-2.5,), (5.0,), (-5.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -34,14 +34,14 @@ class Modulus(Hypothesis):
 class Viscoelastic(Hypothesis):
     """A Maxwell element is missing."""
 
-    name, seam, form = "viscoelastic", "Prony series", LAW
+    name, affected_quantity, model_form_deviation = "viscoelastic", "Prony series", LAW
     quantities = (
         Quantity("modulus_over_equilibrium", "1", 0.2, 0.0, 100.0),
         Quantity("ln_time", "ln s", 1.0, -9.0, 1.5),
     )
     starts = tuple((g, tau) for g in (1.0, 4.0) for tau in (-6.5, -5.0, -3.5, -1.5))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The element, and its viscosity."""
         g, tau = float(values[0]), math.exp(values[1])
         nu = float(scenario.poisson_ratio.reshape(-1)[0])
@@ -66,7 +66,7 @@ class Viscoelastic(Hypothesis):
 class Stiffening(Hypothesis):
     """The solid stiffens with stretch: mu (1 + a x + a^2 x^2), x = I1b - 3, the first terms of Gent's 1 / (1 - a x)."""
 
-    name, seam, form = "stiffening", "stress at large strain", LAW
+    name, affected_quantity, model_form_deviation = "stiffening", "stress at large strain", LAW
     quantities = (Quantity("coefficient", "1", 0.3, 0.0, 10.0),)
     starts = ((1.0,), (3.0,))
 
@@ -78,7 +78,7 @@ class Stiffening(Hypothesis):
 class Softening(Hypothesis):
     """Stress is lower below the largest stretch so far (Mullins)."""
 
-    name, seam, form = "softening", "stress below the largest stretch so far", LAW
+    name, affected_quantity, model_form_deviation = "softening", "stress below the largest stretch so far", LAW
     quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))
     starts = tuple((d, r) for d in (1.0, 3.0) for r in (-7.0, -5.0, -3.0))
 
@@ -90,11 +90,11 @@ class Softening(Hypothesis):
 class Density(Hypothesis):
     """The solid is heavier or lighter than believed."""
 
-    name, seam, form = "density", "density", 0.2
+    name, affected_quantity, model_form_deviation = "density", "density", 0.2
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -106,14 +106,14 @@ class Density(Hypothesis):
 class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 
-    name, seam, form = "soft_side", "Young's modulus over the body", LAW
+    name, affected_quantity, model_form_deviation = "soft_side", "Young's modulus over the body", LAW
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The slopes, and what a soft half has less than the other, which looks alike: 1 - exp(-2/3 of the slope)."""
         lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
-        return {**super().told(values, scenario), "fraction": (lost, "1")}
+        return {**super().reported(values, scenario), "fraction": (lost, "1")}
 
     def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
         """Middle of the soft half."""
@@ -136,7 +136,7 @@ class SoftSide(Hypothesis):
 class PrintOffset(Hypothesis):
     """The chamber lies off its place across the body: walls on one side are thicker, on the other thinner."""
 
-    name, seam = "print_offset", "thickness of the walls"
+    name, affected_quantity = "print_offset", "thickness of the walls"
     quantities = tuple(Quantity(f"offset_{i}_m", "m", 3e-4, -10.0, 10.0) for i in ("first", "second"))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
@@ -162,7 +162,7 @@ class PrintOffset(Hypothesis):
 class AttachedMass(Hypothesis):
     """A point mass, with its weight, somewhere on the body."""
 
-    name, seam, local, mass = "attached_mass", "mass at a place", True, 0
+    name, affected_quantity, local, mass = "attached_mass", "mass at a place", True, 0
     quantities = (Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),)
     starts = ((2.0,), (6.0,))
 
@@ -174,7 +174,7 @@ class AttachedMass(Hypothesis):
 class LoadInertia(Hypothesis):
     """A load that was taken for a dead force is a mass: it has inertia, too."""
 
-    name, seam = "load_inertia", "mass under a load"
+    name, affected_quantity = "load_inertia", "mass under a load"
     quantities = (Quantity("share", "1", 0.2, 0.0, 7.5),)
     starts = ((1.0,), (2.5,), (5.0,))
 
@@ -197,7 +197,13 @@ class LoadInertia(Hypothesis):
 class Tether(Hypothesis):
     """A spring, a dashpot and a mass at a place of the body, as a tube is."""
 
-    name, seam, local, mass, form = "tether", "spring, drag and mass at a place", True, 2, LAW
+    name, affected_quantity, local, mass, model_form_deviation = (
+        "tether",
+        "spring, drag and mass at a place",
+        True,
+        2,
+        LAW,
+    )
     quantities = (
         Quantity("stiffness_n_m", "N/m", 2.0, 0.0, 1000.0),
         Quantity("damping_n_s_m", "N s/m", 0.05, 0.0, 1000.0),

@@ -3,7 +3,7 @@
 A hypothesis of one's own is a subclass of :class:`Hypothesis`:
 
     class Magnet(Hypothesis):
-        name, seam = "magnet", "a force along z on the tip"
+        name, affected_quantity = "magnet", "a force along z on the tip"
         quantities = (Quantity("force", "N", 0.1),)
 
         def forward(self, scenario, values, twin):
@@ -49,7 +49,7 @@ class Hypothesis(nn.Module):
 
     Attributes:
         name: Of the effect.
-        seam: What of the simulation it changes, for people.
+        affected_quantity: What of the simulation it changes, for people.
         quantities: Its parameters.
         local: Whether it acts at a place, which is then inferred along with them.
         starts: Strengths to look at first, in scales: alternatives, or, if ``joint``, one of each parameter.
@@ -60,13 +60,13 @@ class Hypothesis(nn.Module):
     """
 
     name: ClassVar[str]
-    seam: ClassVar[str]
+    affected_quantity: ClassVar[str]
     quantities: tuple[Quantity, ...]
     local: ClassVar[bool] = False
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
     mass: ClassVar[int | None] = None
-    form: ClassVar[float] = 0.1
+    model_form_deviation: ClassVar[float] = 0.1
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The scenario with the effect.
@@ -82,7 +82,7 @@ class Hypothesis(nn.Module):
         """Whether the experiment has what the effect changes."""
         return True
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """Values [K] as people say them: numbers and units by name.
 
         Args:
@@ -108,7 +108,7 @@ class Hypothesis(nn.Module):
         """The effect that it comes to at values [K], by name, and that one's values."""
         return None
 
-    def looks(self, twin: Twin) -> list[np.ndarray]:
+    def probe_points(self, twin: Twin) -> list[np.ndarray]:
         """What to look at first: alternatives, each with directions [D, K] in scales, which add up.
 
         Strengths of what adds up need not be tried; others may change the motion so much that nothing is linear.
@@ -120,7 +120,7 @@ class Hypothesis(nn.Module):
             return alternatives
         return [np.concatenate([a, np.tile(p, (len(a), 1))], 1) for p in _places(twin) for a in alternatives]
 
-    def weak(self, twin: Twin, strength: float) -> list[np.ndarray]:
+    def weak_probe_points(self, twin: Twin, strength: float) -> list[np.ndarray]:
         """Looks that are so weak that the motion changes in proportion; of those that differ in strength only, one.
 
         Args:
@@ -132,20 +132,20 @@ class Hypothesis(nn.Module):
         form = np.array([q.least < 0 for q in self.quantities]) & (np.arange(kinds) > 0)
         shrink = np.concatenate([np.where(form & ~self.joint, 1.0, strength), np.ones(3 * self.local)])
         if self.joint:
-            return [d * shrink for d in self.looks(twin)]
+            return [d * shrink for d in self.probe_points(twin)]
         found: dict[bytes, np.ndarray] = {}
-        for d in sorted(self.looks(twin), key=lambda d: abs(d[0, 0])):
+        for d in sorted(self.probe_points(twin), key=lambda d: abs(d[0, 0])):
             found.setdefault(np.where(shrink == 1, d[0], 0.0).tobytes(), d * shrink)
         return list(found.values())
 
-    def around(self, look: np.ndarray, twin: Twin) -> np.ndarray:
+    def with_masses_aside(self, probe: np.ndarray, twin: Twin) -> np.ndarray:
         """A look of a local effect [D, K], with its mass on the sides of the body as well [D + 4, K]."""
         if self.mass is None:
-            return look
+            return probe
         s, kinds = twin.setup, len(self.quantities)
         longest = int(np.argmax(s.size))
-        row = look[np.flatnonzero(look[:, self.mass])[0]]
-        rows = [look]
+        row = probe[np.flatnonzero(probe[:, self.mass])[0]]
+        rows = [probe]
         for axis in (a for a in range(3) if a != longest):
             for side in (s.origin[axis], s.origin[axis] + s.size[axis]):
                 aside = row.copy()

@@ -28,7 +28,7 @@ from torchsoro.sim2real.hypotheses.outer_effects import (
     Leak,
     PressureGain,
     PressureLag,
-    Slip,
+    Sliding,
     WallOffset,
 )
 
@@ -38,6 +38,6 @@ def library() -> tuple[Hypothesis, ...]:
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness, AirTwice),
-        *(Slip, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
+        *(Sliding, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
     )
     return tuple(kind() for kind in kinds)

@@ -19,11 +19,11 @@ from torchsoro.simulation.actuation import Waveform
 class PressureGain(Hypothesis):
     """The chamber gets less, or more, than the supply's pressure."""
 
-    name, seam, form = "pressure_loss", "chamber pressure", LAW
+    name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
     quantities = (Quantity("ln_factor", "1", 0.05, -30.0, 12.0),)
     starts = ((-1.0,), (-4.0,), (-10.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """What is lost."""
         return {"fraction": (1 - math.exp(values[0]), "1")}
 
@@ -64,7 +64,7 @@ def lagged(scenario: Scenario, tau: Tensor) -> Waveform:
 class PressureLag(Hypothesis):
     """The line fills and empties with a lag: tau p' = p_supply - p."""
 
-    name, seam, form = "pressure_lag", "chamber pressure", LAW
+    name, affected_quantity, model_form_deviation = "pressure_lag", "chamber pressure", LAW
     quantities = (Quantity("time_constant_s", "s", 0.01, 0.0, 100.0),)
     starts = ((1.0,), (3.0,), (8.0,))
 
@@ -80,7 +80,7 @@ class PressureLag(Hypothesis):
 class AirStiffness(Hypothesis):
     """The chamber's pressure falls as it grows: p = p_supply - k (V/V0 - 1)."""
 
-    name, seam, form = "air_stiffness", "chamber pressure by its volume", LAW
+    name, affected_quantity, model_form_deviation = "air_stiffness", "chamber pressure by its volume", LAW
     quantities = (Quantity("air_stiffness_pa", "Pa", 2e4, 0.0, 50.0),)
     starts = ((1.0,), (5.0,))
 
@@ -96,11 +96,11 @@ class AirStiffness(Hypothesis):
 class AirTwice(Hypothesis):
     """There is less air to compress than believed, as where the pressure was measured in the chamber itself."""
 
-    name, seam = "air_stiffness", "chamber pressure by its volume"
+    name, affected_quantity = "air_stiffness", "chamber pressure by its volume"
     quantities = (Quantity("share", "1", 0.1, -10.0, 0.0),)
     starts = ((-3.0,), (-10.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """What is to be added."""
         return {"air_stiffness_pa": (float(values[0]) * float(scenario.air_stiffness.max()), "Pa")}
 
@@ -116,7 +116,7 @@ class AirTwice(Hypothesis):
 class Leak(Hypothesis):
     """A part of the supply is lost behind a line that fills slowly: tau p' = (1 - a) p_supply - p."""
 
-    name, seam, form = "leak", "chamber pressure", LAW
+    name, affected_quantity, model_form_deviation = "leak", "chamber pressure", LAW
     quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
     starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
 
@@ -142,7 +142,7 @@ class Leak(Hypothesis):
 class FluidDrag(Hypothesis):
     """The surrounding fluid slows the body, with the square of the velocity, on the area that moves through it."""
 
-    name, seam, form = "drag", "drag of what surrounds the body", LAW
+    name, affected_quantity, model_form_deviation = "drag", "drag of what surrounds the body", LAW
     # Water, and a plate across its motion: 1000 kg/m3 times 2.
     quantities = (Quantity("density_drag_kg_m3", "kg/m3", 20.0, 0.0, 125.0),)
     starts = ((1.0,), (5.0,), (25.0,))
@@ -152,14 +152,14 @@ class FluidDrag(Hypothesis):
         return scenario.replace(fluid=scenario.fluid + values[:, 0])
 
 
-class Slip(Hypothesis):
+class Sliding(Hypothesis):
     """Planes that were believed to stick let the body slide, with a Coulomb coefficient of 1/a."""
 
-    name, seam = "friction", "friction of the planes"
+    name, affected_quantity = "friction", "friction of the planes"
     quantities = (Quantity("inverse_coefficient", "1", 1.0, 0.0, 50.0),)
     starts = ((1.0,), (2.0,), (4.0,), (8.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The coefficient."""
         return {"coefficient": (1 / max(float(values[0]), 1e-3), "1")}
 
@@ -178,11 +178,11 @@ class Slip(Hypothesis):
 class Friction(Hypothesis):
     """Planes are more or less slippery than believed."""
 
-    name, seam = "friction", "friction of the planes"
+    name, affected_quantity = "friction", "friction of the planes"
     quantities = (Quantity("ln_factor", "1", 0.1, -40.0, 40.0),)
     starts = ((2.0,), (-2.0,), (6.0,), (-6.0,), (11.0,), (-15.0,))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The coefficient."""
         believed = next(float(g.friction.reshape(-1)[0]) for g in scenario.grounds if g.friction is not None)
         return {"coefficient": (believed * math.exp(values[0]), "1")}
@@ -200,11 +200,11 @@ class Friction(Hypothesis):
 class Adhesion(Hypothesis):
     """Planes hold the body back as it lifts off, with the same traction as far as they reach (Dugdale)."""
 
-    name, seam, form = "adhesion", "adhesion of the planes", LAW
+    name, affected_quantity, model_form_deviation = "adhesion", "adhesion of the planes", LAW
     quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0), Quantity("ln_reach", "ln m", 1.0, -11.5, -5.0))
     starts = ((2.0, -8.5), (8.0, -8.5), (30.0, -8.5), (8.0, -7.0))
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """Traction, reach, and the energy that it takes to separate."""
         reach = math.exp(values[1])
         return {
@@ -226,7 +226,7 @@ class Adhesion(Hypothesis):
 class WallOffset(Hypothesis):
     """Planes are elsewhere, towards the body if positive."""
 
-    name, seam = "wall_offset", "place of the planes"
+    name, affected_quantity = "wall_offset", "place of the planes"
     quantities = (Quantity("offset_m", "m", 5e-4, -40.0, 40.0),)
     starts = ((1.0,), (-1.0,), (4.0,), (-4.0,))
 
@@ -247,13 +247,13 @@ def _planes(scenario: Scenario, change: Callable[[Ground], dict[str, Tensor | No
 class GravityTilt(Hypothesis):
     """The body stands at an angle: gravity is turned about two axes."""
 
-    name, seam, form = "gravity_tilt", "direction of gravity", 0.2
+    name, affected_quantity, model_form_deviation = "gravity_tilt", "direction of gravity", 0.2
     quantities = (Quantity("about_first", "rad", 0.03, -20.0, 20.0), Quantity("about_second", "rad", 0.03, -20.0, 20.0))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """Both angles, and the whole."""
-        return {**super().told(values, scenario), "angle_rad": (float(np.hypot(*values)), "rad")}
+        return {**super().reported(values, scenario), "angle_rad": (float(np.hypot(*values)), "rad")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Turned about the two axes normal to gravity."""
@@ -268,13 +268,13 @@ class GravityTilt(Hypothesis):
 class InitialMotion(Hypothesis):
     """The body is not at rest, or moves otherwise, at the start."""
 
-    name, seam, form = "initial_motion", "velocity at the start", LAW
+    name, affected_quantity, model_form_deviation = "initial_motion", "velocity at the start", LAW
     quantities = tuple(Quantity(f"velocity_{axis}", "m/s", 0.02, -50.0, 50.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The velocity, and its size."""
-        return {**super().told(values, scenario), "speed_m_s": (float(np.linalg.norm(values)), "m/s")}
+        return {**super().reported(values, scenario), "speed_m_s": (float(np.linalg.norm(values)), "m/s")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Of the whole body; for a clamped one, as of its farthest points, less near the clamp."""
@@ -287,7 +287,7 @@ class InitialMotion(Hypothesis):
 class InitialSpin(Hypothesis):
     """A free body turns at the start, or turns otherwise."""
 
-    name, seam, form = "initial_motion", "angular velocity at the start", LAW
+    name, affected_quantity, model_form_deviation = "initial_motion", "angular velocity at the start", LAW
     quantities = tuple(Quantity(f"spin_{axis}", "rad/s", 0.5, -100.0, 100.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
@@ -304,13 +304,13 @@ class InitialSpin(Hypothesis):
 class InitialTilt(Hypothesis):
     """A free body is turned at the start."""
 
-    name, seam = "initial_tilt", "direction of the body at the start"
+    name, affected_quantity = "initial_tilt", "direction of the body at the start"
     quantities = tuple(Quantity(f"about_{axis}", "rad", 0.03, -20.0, 20.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def told(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The turn, and its size."""
-        return {**super().told(values, scenario), "angle_rad": (float(np.linalg.norm(values)), "rad")}
+        return {**super().reported(values, scenario), "angle_rad": (float(np.linalg.norm(values)), "rad")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Turned about its centre; what is behind a plane then is moved out."""

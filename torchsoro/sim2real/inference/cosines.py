@@ -17,7 +17,9 @@ from scipy.optimize import least_squares, nnls, root_scalar
 SCORE = 40.0  # squared length of a whitened change at which it stands out
 FARTHEST = 1e4  # times the largest strength that was simulated, beyond which an effect counts as never seen
 
-Belief = Callable[[np.ndarray], np.ndarray]  # what values of the common unknowns cost: residuals [C] of values [C]
+PriorResidual = Callable[
+    [np.ndarray], np.ndarray
+]  # what values of the common unknowns cost: residuals [C] of values [C]
 
 
 def cleared(changes: np.ndarray, nuisances: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -70,13 +72,13 @@ class Response:
     either: bool
 
 
-def settle(change: np.ndarray, common: np.ndarray, belief: Belief) -> tuple[float, np.ndarray]:
+def settle(change: np.ndarray, common: np.ndarray, prior_residual: PriorResidual) -> tuple[float, np.ndarray]:
     """What the common unknowns leave of a change.
 
     Args:
         change: [N].
         common: Change by each of them [N, C].
-        belief: What their values cost.
+        prior_residual: What their values cost.
 
     Returns:
         Length of what is left, beliefs included, and slopes [C] of the Gaussian priors that cost as much there.
@@ -84,15 +86,15 @@ def settle(change: np.ndarray, common: np.ndarray, belief: Belief) -> tuple[floa
     basis, root = np.linalg.qr(common)
     inner = basis.T @ change
     rest = float(change @ change - inner @ inner)
-    slight = belief(np.full(common.shape[1], 1e-3)) / 1e-3
+    slight = prior_residual(np.full(common.shape[1], 1e-3)) / 1e-3
     start = np.linalg.lstsq(np.concatenate([root, np.diag(slight)]), np.append(inner, 0 * slight), rcond=None)[0]
-    found = least_squares(lambda x: np.append(inner - root @ x, belief(x)), np.clip(start, -1.5, 1.5))
+    found = least_squares(lambda x: np.append(inner - root @ x, prior_residual(x)), np.clip(start, -1.5, 1.5))
     x = np.where(np.abs(found.x) < 1e-3, 1e-3, found.x)
-    return math.sqrt(max(rest, 0.0) + 2 * float(found.cost)), np.abs(belief(x) / x)
+    return math.sqrt(max(rest, 0.0) + 2 * float(found.cost)), np.abs(prior_residual(x) / x)
 
 
 def first_seen(
-    strengths: np.ndarray, changes: np.ndarray, common: np.ndarray, belief: Belief, score: float
+    strengths: np.ndarray, changes: np.ndarray, common: np.ndarray, prior_residual: PriorResidual, score: float
 ) -> tuple[float, np.ndarray]:
     """The strength at which an effect stands out, and its change there; straight lines between what was simulated.
 
@@ -100,7 +102,7 @@ def first_seen(
         strengths: In scales, from the smallest on [S].
         changes: At each [N, S].
         common: Change by each common unknown [N, C].
-        belief: What their values cost.
+        prior_residual: What their values cost.
         score: Squared length at which a change stands out.
     """
     at = np.append(0.0, strengths)
@@ -114,7 +116,7 @@ def first_seen(
         return (1 - share) * known[:, k - 1] + share * known[:, k]
 
     def above(s: float) -> float:
-        return settle(change(s), common, belief)[0] - math.sqrt(score)
+        return settle(change(s), common, prior_residual)[0] - math.sqrt(score)
 
     low = 0.0
     for high in (*strengths, *(strengths[-1] * np.geomspace(10, FARTHEST, 4))):
@@ -126,14 +128,14 @@ def first_seen(
 
 
 def compare(
-    responses: Sequence[Response], common: np.ndarray, belief: Belief, score: float = SCORE
+    responses: Sequence[Response], common: np.ndarray, prior_residual: PriorResidual, score: float = SCORE
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which effects are seen, and which of them are alike.
 
     Args:
         responses: Of E effects, without what measurement errors take up.
         common: Change by each common unknown [N, C].
-        belief: What their values cost.
+        prior_residual: What their values cost.
         score: Squared length at which a change stands out.
 
     Returns:
@@ -143,13 +145,13 @@ def compare(
     count = len(responses)
     detectable, alike = np.full(count, np.inf), np.eye(count)
     for i, mine in enumerate(responses):
-        seen = [first_seen(*path, common, belief, score) for path in mine.paths]
+        seen = [first_seen(*path, common, prior_residual, score) for path in mine.paths]
         if not seen:
             continue
         detectable[i], change = min(seen, key=lambda s: s[0])
         if not math.isfinite(detectable[i]):
             continue
-        slopes = settle(change, common, belief)[1]
+        slopes = settle(change, common, prior_residual)[1]
         left = cleared(change[:, None], common, slopes)[:, 0]
         for j, other in enumerate(responses):
             signs = (1, -1) if mine.either or other.either else (1,)

@@ -15,7 +15,7 @@ from scipy.optimize import lsq_linear
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
 STEP = 0.05  # of a scale, for differences
 STIFF = 1e-3  # damping of the step without a trial: what the others hardly tell stays as it was
@@ -24,20 +24,20 @@ FAR = 8.0  # times a look whose parts add up, up to which strength
 NEAR = 0.6  # of a look, up to which a weak one is trusted; from there on it is looked at by itself
 FIRST = 0.5  # the longest step of a search, in shares of what is there plus two scales
 
-Search = Generator[Request, list[Motion], "Point | None"]
+Search = Generator[Request, list[MarkerMotion], "Point | None"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Point:
     """Where a search stands: unknowns in scales, measurement errors, whitened residual, slopes by both, motions."""
 
-    misfit: float
+    chi2: float
     at: np.ndarray
     errors: np.ndarray
     r: np.ndarray
     J: np.ndarray
     columns: np.ndarray
-    motions: list[Motion]
+    motions: list[MarkerMotion]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -62,9 +62,9 @@ class Fit:
     effects: Effects
     values: tuple[np.ndarray, ...]
     covariances: tuple[np.ndarray, ...]
-    belief: np.ndarray
+    ln_factors: np.ndarray
     errors: np.ndarray
-    misfit: float
+    chi2: float
     samples: int
     unknowns: int
     seen: tuple[np.ndarray, ...]
@@ -78,7 +78,7 @@ class Fit:
         return " + ".join(e.name for e in self.effects) or "nothing"
 
 
-class Problem(Likelihood):
+class FitProblem(Likelihood):
     """What effects are fitted to; see :class:`Likelihood` for its arguments."""
 
     eager = False  # whether derivatives come with every step
@@ -92,11 +92,11 @@ class Problem(Likelihood):
             ValueError: if it breaks down.
         """
         at = np.zeros(len(self.common)) if known is None else known.point
-        errors = np.zeros(len(self.camera.deviations)) if known is None else known.errors
+        errors = np.zeros(len(self.observation.deviations)) if known is None else known.errors
         held = np.zeros(len(at), bool)
         return self._whole(self._linearise((), at, errors, held, np.arange(len(at)), 1e9 + 0 * at))
 
-    def look(self, effects: Sequence[Hypothesis], base: Point) -> list[list[tuple[float, np.ndarray]]]:
+    def probe(self, effects: Sequence[Hypothesis], base: Point) -> list[list[tuple[float, np.ndarray]]]:
         """How much effects may explain, from one simulation of each of their looks and straight lines between.
 
         Args:
@@ -107,28 +107,30 @@ class Problem(Likelihood):
             For each, its looks, best first: the misfit that it would leave, and the point to begin a search with, in
             scales. Looks that break down are left out.
         """
-        linear = [e.looks(self.twin) if e.joint else e.weak(self.twin, WEAK) for e in effects]
-        linear = [[e.around(d, self.twin) for d in mine] for e, mine in zip(effects, linear, strict=True)]
-        looks = [mine if e.joint else mine + e.looks(self.twin) for e, mine in zip(effects, linear, strict=True)]
+        linear = [e.probe_points(self.twin) if e.joint else e.weak_probe_points(self.twin, WEAK) for e in effects]
+        linear = [[e.with_masses_aside(d, self.twin) for d in mine] for e, mine in zip(effects, linear, strict=True)]
+        probe_points = [
+            mine if e.joint else mine + e.probe_points(self.twin) for e, mine in zip(effects, linear, strict=True)
+        ]
         requests = [
             ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in mine]))
-            for e, mine in zip(effects, looks, strict=True)
+            for e, mine in zip(effects, probe_points, strict=True)
         ]
         simulated = self.simulate(requests)
         return [
             self._rank(e, mine, len(adding), motions, base)
-            for e, mine, adding, motions in zip(effects, looks, linear, simulated, strict=True)
+            for e, mine, adding, motions in zip(effects, probe_points, linear, simulated, strict=True)
         ]
 
     def _rank(
-        self, effect: Hypothesis, looks: list[np.ndarray], linear: int, motions: list[Motion], base: Point
+        self, effect: Hypothesis, probe_points: list[np.ndarray], linear: int, motions: list[MarkerMotion], base: Point
     ) -> list[tuple[float, np.ndarray]]:
         """As :meth:`look`, of one effect; the first ``linear`` of its looks add up."""
         low, high = self.bounds((effect,))
         count, kinds = len(self.common), len(effect.quantities)
         held = np.array([isinstance(e, type(effect)) for e, _ in self.common])
-        believed, slope = self.belief(base.at, held)
-        prior = np.concatenate([slope, 1 / self.camera.deviations])
+        believed, slope = self.prior_residual(base.at, held)
+        prior = np.concatenate([slope, 1 / self.observation.deviations])
         known = np.concatenate([np.where(slope > 0, believed / np.where(slope > 0, slope, 1), 0), base.errors])
         sound = np.all([m.sound for m in motions], axis=0)
         ranked, at = [], 0
@@ -143,7 +145,7 @@ class Problem(Likelihood):
                 common[i] = 0.0
             left = float(((target - H @ x) ** 2).sum())
             ranked.append((left, np.clip(np.concatenate([common, strength]), low, high)))
-        for number, directions in enumerate(looks):
+        for number, directions in enumerate(probe_points):
             n = len(directions)
             mine = range(at, at + n)
             at += n
@@ -186,7 +188,7 @@ class Problem(Likelihood):
             share = np.abs(x[:n]) + 1e-9
             start = np.concatenate([common, strength, share @ directions[:, kinds:] / share.sum()])
             ranked.append((cost, np.clip(start, low, high)))
-        return sorted(ranked, key=lambda look: look[0])
+        return sorted(ranked, key=lambda probe: probe[0])
 
     # Fitting ----------------------------------------------------------------------------------------------------
 
@@ -210,7 +212,7 @@ class Problem(Likelihood):
         Returns:
             A fit of each; None where the first point breaks down.
         """
-        given = np.zeros(len(self.camera.deviations)) if errors is None else errors
+        given = np.zeros(len(self.observation.deviations)) if errors is None else errors
         searches = [self._search(effects, start, given, rounds, settle) for effects, start in tasks]
         ends: list[Point | None] = [None] * len(tasks)
         asked = {i: next(search) for i, search in enumerate(searches)}
@@ -240,11 +242,11 @@ class Problem(Likelihood):
         held = self._held(fit.effects)
         low, high = self.bounds(fit.effects)
         places = np.array([False] * len(self.common) + [p for e in fit.effects for p in _marks(e)])
-        rows = np.concatenate([np.full(b.count, i != number) for i, b in enumerate(self.bands)])
+        rows = np.concatenate([np.full(b.count, i != number) for i, b in enumerate(self.noise_models)])
         end = fit.end
         end = dataclasses.replace(end, r=end.r[rows], J=end.J[rows], columns=end.columns[rows])
         step = self._step(end, held, places, low, high, STIFF)
-        weight = 1 / self.camera.deviations
+        weight = 1 / self.observation.deviations
         ahead = end.J.T @ (end.r - end.columns @ step) - weight**2 * end.errors
         errors = end.errors + np.linalg.solve(end.J.T @ end.J + np.diag(weight**2), ahead)
         return dataclasses.replace(fit, point=end.at + step, errors=np.delete(errors, number))
@@ -286,11 +288,11 @@ class Problem(Likelihood):
             ahead = yield from self._linearise(
                 effects, current.at + step, current.errors, held, moving if eager else moving[:0], high
             )
-            gained = 0.0 if ahead is None else current.misfit - ahead.misfit
+            gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
             if ahead is not None and gained > 0:
                 if not eager:
                     ahead = dataclasses.replace(ahead, columns=_corrected(current, ahead))
-                settled = anew and gained < max(0.5, 1e-3 * ahead.misfit)
+                settled = anew and gained < max(0.5, 1e-3 * ahead.chi2)
                 current, damping, anew = ahead, max(damping / 5, 1e-4), eager
                 if settled:
                     break
@@ -300,7 +302,7 @@ class Problem(Likelihood):
                 damping *= 10
                 continue
             # Derivatives that were carried along have done what they can.
-            if not anew and gained < 0.3 * current.misfit:
+            if not anew and gained < 0.3 * current.chi2:
                 fresh = yield from self._linearise(effects, current.at, current.errors, held, moving, high)
                 if fresh is None:
                     break
@@ -317,20 +319,20 @@ class Problem(Likelihood):
         if not np.all([m.sound for m in motions]):
             return None
         base = [m.alone(0) for m in motions]
-        misfit, errors, r, J = self.measure(base, errors)
+        chi2, errors, r, J = self.measure(base, errors)
         columns = np.zeros((len(r), len(at)))
         for k, i in enumerate(moving, start=1):
             left = self.residual([m.alone(k) for m in motions], errors)
             columns[:, i] = (r - left) / steps[i]
-        misfit += float((self.belief(at, held)[0] ** 2).sum())
-        if not (math.isfinite(misfit) and np.isfinite(columns).all()):
+        chi2 += float((self.prior_residual(at, held)[0] ** 2).sum())
+        if not (math.isfinite(chi2) and np.isfinite(columns).all()):
             return None
-        return Point(misfit=misfit, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
+        return Point(chi2=chi2, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
 
     def _step(self, point: Point, held, places, low, high, damping) -> np.ndarray:
         """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""
-        weight, fixed, step = 1 / self.camera.deviations, held.copy(), np.zeros_like(point.at)
-        believed, slope = self.belief(point.at, held)
+        weight, fixed, step = 1 / self.observation.deviations, held.copy(), np.zeros_like(point.at)
+        believed, slope = self.prior_residual(point.at, held)
         most = np.where(places, 1.5, FIRST * np.abs(point.at) + 2.0)
         for _ in range(len(step)):
             free = ~fixed
@@ -353,9 +355,9 @@ class Problem(Likelihood):
 
     def _report(self, effects: Effects, point: Point) -> Fit:
         held = self._held(effects)
-        _, slope = self.belief(point.at, held)
+        _, slope = self.prior_residual(point.at, held)
         whole = np.concatenate([point.columns[:, ~held], point.J], 1)
-        prior = np.concatenate([slope[~held] ** 2 + 1e-9, self.camera.deviations**-2])
+        prior = np.concatenate([slope[~held] ** 2 + 1e-9, self.observation.deviations**-2])
         size, n = len(point.at), int((~held).sum())
         covariance = np.zeros((size, size))
         covariance[np.ix_(~held, ~held)] = np.linalg.pinv(whole.T @ whole + np.diag(prior))[:n, :n]
@@ -366,17 +368,17 @@ class Problem(Likelihood):
             values.append(point.at[k : k + count] * scales[k : k + count])
             covariances.append((covariance * np.outer(scales, scales))[k : k + count, k : k + count])
             k += count
-        cuts = np.cumsum([b.count for b in self.bands])[:-1]
+        cuts = np.cumsum([b.count for b in self.noise_models])[:-1]
         return Fit(
             effects=effects,
             values=tuple(values),
             covariances=tuple(covariances),
-            belief=(point.at * scales)[: len(self.common)],
+            ln_factors=(point.at * scales)[: len(self.common)],
             errors=point.errors,
-            misfit=point.misfit,
+            chi2=point.chi2,
             samples=self.samples,
             unknowns=size - len(self.common),
-            seen=tuple(self.camera.see(m, i, point.errors) for i, m in enumerate(point.motions)),
+            seen=tuple(self.observation.observe(m, i, point.errors) for i, m in enumerate(point.motions)),
             whitened=tuple(np.split(point.r, cuts)),
             point=point.at,
             end=point,

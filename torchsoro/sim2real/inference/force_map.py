@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
-from torchsoro.sim2real.inference.fit import Fit, Problem
-from torchsoro.sim2real.inference.histories import Solution, misfit_of, simulate, solve
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.histories import Solution, chi2_of, simulate, solve
 from torchsoro.sim2real.twin.scenario import Push, Scenario
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -38,7 +38,7 @@ class StepForce(Hypothesis):
         size: That one would notice [N].
     """
 
-    name, seam = "force", "a force on a part of the body"
+    name, affected_quantity = "force", "a force on a part of the body"
     joint = True
 
     def __init__(self, share: Tensor, start: float, size: float) -> None:
@@ -107,7 +107,7 @@ class ForceMap:
     windows: np.ndarray
     forces: np.ndarray
     deviations: np.ndarray
-    misfits: np.ndarray
+    chi2s: np.ndarray
     share: float
     simulated: float
 
@@ -148,7 +148,7 @@ class ForceMap:
         if self.simulated < ROUGH * self.share:
             told += " The response is far from linear, so that this is no more than a hint."
         here = int((self.places == needed[0].place).all(-1).argmax())
-        others = [p for p in np.flatnonzero(self.misfits < ALIKE * self.misfits[here]) if p != here]
+        others = [p for p in np.flatnonzero(self.chi2s < ALIKE * self.chi2s[here]) if p != here]
         if others:
             places = " or ".join("(" + ", ".join(f"{1e3 * v:.0f}" for v in self.places[p]) + ")" for p in others)
             told += f" These markers hardly tell its place from {places} mm."
@@ -170,7 +170,7 @@ def patches(twin: Twin, count: int) -> tuple[np.ndarray, list[Tensor]]:
     return places, shares
 
 
-def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) -> ForceMap:
+def force_map(problem: FitProblem, fit: Fit, *, count: int = 4, windows: int = 10) -> ForceMap:
     """Estimate the force that would explain what a fit leaves.
 
     Each trial has forces of its own on the same patches. They are as small and as steady as cross-validation asks for,
@@ -189,15 +189,15 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
     size = _small(problem.twin)
     steps = tuple(StepForce(share, k / windows, size) for share in shares for k in range(windows))
     # Errors that were bent to stand in for a force are no point for a straight line.
-    errors = np.clip(fit.errors, -2 * problem.camera.deviations, 2 * problem.camera.deviations)
+    errors = np.clip(fit.errors, -2 * problem.observation.deviations, 2 * problem.observation.deviations)
     effects, at, forces = (*fit.effects, *steps), fit.point, np.zeros((len(problem.trials), count, windows, 3))
     found: Solution | None = None
-    before = misfit = math.inf
+    before = chi2 = math.inf
     for _ in range(PASSES):
         motions = simulate(problem, effects, at[None], forces[None], slopes=True)
         if found is None:
-            before = misfit = misfit_of(problem, motions, 0, fit.errors, at)
-        if not math.isfinite(misfit) or not all(m.sound.all() for m in motions):
+            before = chi2 = chi2_of(problem, motions, 0, fit.errors, at)
+        if not math.isfinite(chi2) or not all(m.sound.all() for m in motions):
             raise ValueError("fit: its simulation breaks down, wanted a point that bears a small force")
         solution, common, errors = solve(problem, errors, at, motions, forces, before)
         found = found or solution
@@ -207,11 +207,11 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
         ahead = at + SHARES[:, None] * np.append(common, np.zeros(len(at) - len(common)))
         tried = forces + SHARES[:, None, None, None, None] * (solution.forces - forces)
         motions = simulate(problem, effects, ahead, tried)
-        left = [misfit_of(problem, motions, k, errors, a) for k, a in enumerate(ahead)]
-        best, gained = int(np.argmin(left)), misfit - min(left)
+        left = [chi2_of(problem, motions, k, errors, a) for k, a in enumerate(ahead)]
+        best, gained = int(np.argmin(left)), chi2 - min(left)
         if gained <= 0:
             break
-        at, forces, misfit = ahead[best], tried[best], left[best]
+        at, forces, chi2 = ahead[best], tried[best], left[best]
         found = dataclasses.replace(solution, forces=forces)
         if gained < ENOUGH * before:
             break
@@ -223,9 +223,9 @@ def force_map(problem: Problem, fit: Fit, *, count: int = 4, windows: int = 10) 
         windows=ends[:, None] * np.linspace(0, 1, windows + 1),
         forces=size * found.forces,
         deviations=size * found.deviations,
-        misfits=found.misfits,
-        share=1 - found.misfit / before,
-        simulated=1 - misfit / before,
+        chi2s=found.chi2s,
+        share=1 - found.chi2 / before,
+        simulated=1 - chi2 / before,
     )
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchsoro.sim2real.data.experiment import Trial
-from torchsoro.sim2real.inference.fit import Fit, Problem
-from torchsoro.sim2real.inference.residual import LATE
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.observation import LATE
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
 ROUNDS = 10  # in which a trial's clock is found
 
@@ -33,7 +33,7 @@ class Prediction:
     total: float
 
 
-def predict(problem: Problem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
+def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
     """Predict trials with the parameters and measurement errors of a fit; only each trial's clock is found anew.
 
     Args:
@@ -46,7 +46,7 @@ def predict(problem: Problem, fit: Fit, trials: Sequence[Trial], *, believed: bo
 
 
 def predict_all(
-    problem: Problem, fits: Sequence[Fit], trials: Sequence[Trial], *, believed: bool = False
+    problem: FitProblem, fits: Sequence[Fit], trials: Sequence[Trial], *, believed: bool = False
 ) -> list[list[Prediction]]:
     """:func:`predict` for several fits, simulated together; nothing is predicted where it breaks down."""
     there = problem.only(trials, slips=())
@@ -58,18 +58,18 @@ def predict_all(
     ]
 
 
-def _seen(problem: Problem, there: Problem, fit: Fit, motions: Sequence[Motion]) -> list[Prediction]:
+def _seen(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerMotion]) -> list[Prediction]:
     count = len(there.trials)
-    known = fit.errors[len(problem.trials) :][: len(there.camera.deviations) - count]
+    known = fit.errors[len(problem.trials) :][: len(there.observation.deviations) - count]
     found = []
     for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
         assert trial.recording is not None
         one = motion.alone()
         errors = np.concatenate([np.zeros(count), known])
-        weight, most = (problem.noise / there.camera.deviations[i]) ** 2, LATE * there.camera.deviations[i]
+        weight, most = (problem.noise / there.observation.deviations[i]) ** 2, LATE * there.observation.deviations[i]
         clock, least, step = 0.0, math.inf, 0.0
         for _ in range(ROUNDS):
-            seen, by = there.camera.linearise(one, i, errors)
+            seen, by = there.observation.linearise(one, i, errors)
             left, slope = trial.recording.place - seen, by[..., i]
             good = np.isfinite(left)
             now = float((left[good] ** 2).sum()) + weight * errors[i] ** 2
@@ -83,7 +83,7 @@ def _seen(problem: Problem, there: Problem, fit: Fit, motions: Sequence[Motion])
             # A simulation that is far off would otherwise bend the clock without end.
             errors[i] = np.clip(clock + step, -most, most)
         errors[i] = clock
-        seen = there.camera.see(one, i, errors)
+        seen = there.observation.observe(one, i, errors)
         square = (trial.recording.place - seen) ** 2
         error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
         total = float(np.sqrt(np.nanmean(square.sum(-1))))

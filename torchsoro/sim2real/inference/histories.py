@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchsoro.sim2real.inference.fit import STEP, Problem
+from torchsoro.sim2real.inference.fit import STEP, FitProblem
 from torchsoro.sim2real.inference.likelihood import Effects
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows
 ROUNDS = 3  # of straight lines, each at the measurement errors of the one before
@@ -32,10 +32,10 @@ class Solution:
     """
 
     criterion: float
-    misfit: float
+    chi2: float
     forces: np.ndarray
     deviations: np.ndarray
-    misfits: np.ndarray
+    chi2s: np.ndarray
 
 
 class Histories:
@@ -66,23 +66,23 @@ class Histories:
         count = self.shape[1]
         best = Solution(
             criterion=before / self.samples,
-            misfit=before,
+            chi2=before,
             forces=np.zeros(self.shape),
             deviations=np.full(self.shape, np.inf),
-            misfits=np.zeros(count),
+            chi2s=np.zeros(count),
         )
         chosen: list[int] = []
         alone = np.zeros(0)
         while len(chosen) < count:
             tried = {p: self.solve([*chosen, p]) for p in range(count) if p not in chosen}
             if not chosen:
-                alone = np.array([tried[p].misfit for p in range(count)])
+                alone = np.array([tried[p].chi2 for p in range(count)])
             p = min(tried, key=lambda p: tried[p].criterion)
             if tried[p].criterion > (1 - GAIN) * best.criterion:
                 break
             chosen.append(p)
             best = tried[p]
-        return dataclasses.replace(best, misfits=alone)
+        return dataclasses.replace(best, chi2s=alone)
 
     def solve(self, chosen: list[int]) -> Solution:
         """Forces on chosen patches, with the weight that generalised cross-validation chooses."""
@@ -94,19 +94,19 @@ class Histories:
         options = []
         for weight in s[0] ** 2 * np.logspace(-9, 3, 49):
             kept = s**2 / (s**2 + weight)
-            misfit = outside + float((((1 - kept) * c) ** 2).sum())
+            chi2 = outside + float((((1 - kept) * c) ** 2).sum())
             spare = self.samples - COST * kept.sum()
             if spare > 0:
-                options.append((misfit * self.samples / spare**2, weight, misfit, float(kept.sum())))
-        criterion, weight, misfit, freedom = min(options)
+                options.append((chi2 * self.samples / spare**2, weight, chi2, float(kept.sum())))
+        criterion, weight, chi2, freedom = min(options)
         z = V.T @ (s / (s**2 + weight) * c)
-        spread = V.T * np.sqrt(misfit / (self.samples - freedom) / (s**2 + weight))
+        spread = V.T * np.sqrt(chi2 / (self.samples - freedom) / (s**2 + weight))
         shape = (T, len(chosen), W, 3)
         forces, deviations = np.zeros(self.shape), np.full(self.shape, np.inf)
         forces[:, chosen] = np.einsum("tpva,vw->tpwa", z.reshape(shape), self.root)
         spread = np.einsum("tpvaj,vw->tpwaj", spread.reshape(*shape, -1), self.root)
         deviations[:, chosen] = np.sqrt((spread**2).sum(-1))
-        return Solution(criterion=criterion, misfit=misfit, forces=forces, deviations=deviations, misfits=np.zeros(0))
+        return Solution(criterion=criterion, chi2=chi2, forces=forces, deviations=deviations, chi2s=np.zeros(0))
 
 
 class Lines:
@@ -122,10 +122,10 @@ class Lines:
 
     def __init__(
         self,
-        problem: Problem,
+        problem: FitProblem,
         errors: np.ndarray,
         at: np.ndarray,
-        motions: Sequence[Motion],
+        motions: Sequence[MarkerMotion],
         forces: np.ndarray,
     ) -> None:
         self.errors, self.n = errors, len(problem.common)
@@ -136,12 +136,12 @@ class Lines:
         rise = slopes[:, self.n :].reshape(len(r), count, windows, 3)
         # What begins and ends: the difference of two steps.
         pulse = rise - np.concatenate([rise[:, :, 1:], np.zeros_like(rise[:, :, :1])], 2)
-        own = np.repeat(np.arange(trials), [b.count for b in problem.bands])
+        own = np.repeat(np.arange(trials), [b.count for b in problem.noise_models])
         G = (pulse[:, None] * (own[:, None] == np.arange(trials))[:, :, None, None, None]).reshape(len(r), -1)
-        believed, slope = (v[: self.n] for v in problem.belief(at, np.zeros(len(at), bool)))
-        weights = np.concatenate([np.maximum(slope, 1e-6), 1 / problem.camera.deviations])
+        believed, slope = (v[: self.n] for v in problem.prior_residual(at, np.zeros(len(at), bool)))
+        weights = np.concatenate([np.maximum(slope, 1e-6), 1 / problem.observation.deviations])
         self.G = np.concatenate([G, np.zeros((len(weights), G.shape[1]))])
-        self.target = np.concatenate([r + G @ forces.reshape(-1), -believed, -errors / problem.camera.deviations])
+        self.target = np.concatenate([r + G @ forces.reshape(-1), -believed, -errors / problem.observation.deviations])
         along = np.concatenate([slopes[:, : self.n] / STEP, J], 1)
         self.Q, self.R = np.linalg.qr(np.concatenate([along, np.diag(weights)]))
         self.histories = Histories(self._left(self.G), self._left(self.target), len(r), forces.shape)
@@ -155,13 +155,18 @@ class Lines:
         return x[: self.n], self.errors + x[self.n :]
 
 
-def row(motions: Sequence[Motion], number: int) -> list[Motion]:
+def row(motions: Sequence[MarkerMotion], number: int) -> list[MarkerMotion]:
     """One of a batch for each trial."""
     return [m.alone(number) for m in motions]
 
 
 def solve(
-    problem: Problem, errors: np.ndarray, at: np.ndarray, motions: Sequence[Motion], forces: np.ndarray, before: float
+    problem: FitProblem,
+    errors: np.ndarray,
+    at: np.ndarray,
+    motions: Sequence[MarkerMotion],
+    forces: np.ndarray,
+    before: float,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
     """Forces with changes of what is common and the measurement errors that go with them.
 
@@ -182,17 +187,19 @@ def solve(
     return solution, common, errors
 
 
-def misfit_of(problem: Problem, motions: Sequence[Motion], number: int, errors: np.ndarray, at: np.ndarray) -> float:
+def chi2_of(
+    problem: FitProblem, motions: Sequence[MarkerMotion], number: int, errors: np.ndarray, at: np.ndarray
+) -> float:
     """Of one of a batch with its best measurement errors, and of what is believed; infinite if it broke down."""
     if not all(m.sound[number] for m in motions):
         return math.inf
-    believed = problem.belief(at, np.zeros(len(at), bool))[0]
+    believed = problem.prior_residual(at, np.zeros(len(at), bool))[0]
     return problem.measure(row(motions, number), errors)[0] + float((believed**2).sum())
 
 
 def simulate(
-    problem: Problem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool = False
-) -> list[Motion]:
+    problem: FitProblem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool = False
+) -> list[MarkerMotion]:
     """Each trial at points [R, K] with its own forces [R, T, P, W, 3], in steps; the first also with more steps."""
     found = []
     for t, trial in enumerate(problem.trials):

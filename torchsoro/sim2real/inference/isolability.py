@@ -15,13 +15,14 @@ import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.cosines import SCORE, Belief, Response, cleared, compare
-from torchsoro.sim2real.inference.fit import Problem
+from torchsoro.sim2real.inference.cosines import SCORE, PriorResidual, Response, cleared, compare
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS
-from torchsoro.sim2real.inference.residual import Band, Camera
+from torchsoro.sim2real.inference.noise import NoiseModel
+from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
 SAME = 0.97  # of a change that another effect imitates, above which the two are not told apart
 SMALL = 0.1  # of the least strength that is looked at, at which changes are still proportional to it
@@ -62,7 +63,9 @@ class Isolability:
         }
 
 
-def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *, score: float = SCORE) -> Isolability:
+def isolability(
+    problem: FitProblem, effects: Sequence[Hypothesis] | None = None, *, score: float = SCORE
+) -> Isolability:
     """Which effects an experiment would see, and tell apart, by one simulation of each of their looks.
 
     Args:
@@ -78,22 +81,26 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
     # Effects that are fitted always need no simulation of their own.
     fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
     others = [e for e in effects if type(e) not in fitted]
-    looks = [_looks(effect, problem) for effect in others]
+    probe_points = [_probe_points(effect, problem) for effect in others]
     still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
-    asked = [((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, looks, strict=True)]
+    asked = [
+        ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
+    ]
     problem = problem.only(problem.trials)
     problem.ensemble = Even(problem.twin, problem.ensemble.threads, problem.ensemble.device)
     base, *found = problem.simulate([((), still), *asked])
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)
     believed = [m.alone(0) for m in base]
-    blocks = [changes(problem.camera, problem.bands, believed, motions) for motions in (base, *found)]
+    blocks = [changes(problem.observation, problem.noise_models, believed, motions) for motions in (base, *found)]
     blocks[0] = blocks[0][:, 1:] / SMALL
-    by = errors_of(problem.camera, problem.bands, believed)
-    common, *rest = np.split(shortened(blocks, by, problem.camera), np.cumsum([b.shape[1] for b in blocks])[:-1], 1)
+    by = errors_of(problem.observation, problem.noise_models, believed)
+    common, *rest = np.split(
+        shortened(blocks, by, problem.observation), np.cumsum([b.shape[1] for b in blocks])[:-1], 1
+    )
     known = {
         id(effect): _response(effect, mine, block, np.all([m.sound for m in motions], axis=0))
-        for effect, mine, block, motions in zip(others, looks, rest, found, strict=True)
+        for effect, mine, block, motions in zip(others, probe_points, rest, found, strict=True)
     }
     for effect in effects:
         if type(effect) in fitted:
@@ -102,7 +109,7 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
             free = np.ones(1, bool)
             known[id(effect)] = Response(paths=((np.ones(1), column),), cones=((column, free),), either=True)
     responses = [known[id(effect)] for effect in effects]
-    detectable, alike = compare(responses, common, belief_of(problem), score)
+    detectable, alike = compare(responses, common, prior_residual_of(problem), score)
     first = [e.quantities[0] for e in effects]
     return Isolability(
         effects=tuple(e.name for e in effects),
@@ -115,7 +122,7 @@ def isolability(problem: Problem, effects: Sequence[Hypothesis] | None = None, *
 class Even(Ensemble):
     """Simulates all variations with the same time step, so that its error cancels in their differences."""
 
-    def __call__(self, scenarios: Sequence[Scenario]) -> list[Motion]:
+    def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerMotion]:
         """Simulate, as :class:`Ensemble` does."""
         self.step = min(float(super(Even, self).stable(s).min()) for s in scenarios)
         return super().__call__(scenarios)
@@ -125,57 +132,66 @@ class Even(Ensemble):
         return np.full(s.batch, self.step)
 
 
-def belief_of(problem: Problem) -> Belief:
+def prior_residual_of(problem: FitProblem) -> PriorResidual:
     """What values of modulus and pressure cost, in tolerances."""
-    return lambda x: problem.belief(x, np.zeros(len(x), bool))[0]
+    return lambda x: problem.prior_residual(x, np.zeros(len(x), bool))[0]
 
 
-def changes(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion], motions: Sequence[Motion]) -> np.ndarray:
+def changes(
+    observation: ObservationModel,
+    noise_models: Sequence[NoiseModel],
+    believed: Sequence[MarkerMotion],
+    motions: Sequence[MarkerMotion],
+) -> np.ndarray:
     """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]; 0 for broken ones."""
     sound = np.all([m.sound for m in motions], axis=0)
-    still = np.zeros(len(camera.deviations))
+    still = np.zeros(len(observation.deviations))
     parts = []
-    for i, (band, base, motion) in enumerate(zip(bands, believed, motions, strict=True)):
-        seen = camera.see(base, i, still)
-        each = [camera.see(motion.alone(k), i, still) - seen if good else 0 * seen for k, good in enumerate(sound)]
-        parts.append(band.whiten(np.stack(each, -1)))
+    for i, (noise_model, base, motion) in enumerate(zip(noise_models, believed, motions, strict=True)):
+        seen = observation.observe(base, i, still)
+        each = [
+            observation.observe(motion.alone(k), i, still) - seen if good else 0 * seen for k, good in enumerate(sound)
+        ]
+        parts.append(noise_model.whiten(np.stack(each, -1)))
     return np.concatenate(parts)
 
 
-def errors_of(camera: Camera, bands: Sequence[Band], believed: Sequence[Motion]) -> np.ndarray:
+def errors_of(
+    observation: ObservationModel, noise_models: Sequence[NoiseModel], believed: Sequence[MarkerMotion]
+) -> np.ndarray:
     """Whitened change by each measurement error [N, L]."""
-    still = np.zeros(len(camera.deviations))
-    slopes = [camera.linearise(motion, i, still)[1] for i, motion in enumerate(believed)]
-    return np.concatenate([band.whiten(by) for band, by in zip(bands, slopes, strict=True)])
+    still = np.zeros(len(observation.deviations))
+    slopes = [observation.linearise(motion, i, still)[1] for i, motion in enumerate(believed)]
+    return np.concatenate([noise_model.whiten(by) for noise_model, by in zip(noise_models, slopes, strict=True)])
 
 
-def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, camera: Camera) -> np.ndarray:
+def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, observation: ObservationModel) -> np.ndarray:
     """Changes without what measurement errors take up, in as few rows as keep all lengths and angles."""
-    left = cleared(np.concatenate(blocks, 1), by, 1 / camera.deviations)
+    left = cleared(np.concatenate(blocks, 1), by, 1 / observation.deviations)
     return np.asarray(np.linalg.qr(left, mode="r"))
 
 
-def _looks(effect: Hypothesis, problem: Problem) -> list[np.ndarray]:
+def _probe_points(effect: Hypothesis, problem: FitProblem) -> list[np.ndarray]:
     """What to simulate of an effect: alternatives, each with directions [D, K] in scales, weak ones first.
 
     An effect that grows from nothing is known by a weak one. One that begins at some strength, as sliding on a plane
     does, is looked at there, too.
     """
-    weak = effect.weak(problem.twin, SMALL)
+    weak = effect.weak_probe_points(problem.twin, SMALL)
     if effect.joint:  # of many places, every other
         return weak[:: -2 if effect.local else 1]
     if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].grounds:
         return weak
-    known = sorted(effect.looks(problem.twin), key=lambda d: abs(d[0, 0]))
+    known = sorted(effect.probe_points(problem.twin), key=lambda d: abs(d[0, 0]))
     return [*weak, known[0], known[-1]]
 
 
-def _response(effect: Hypothesis, looks: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
+def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
     """An effect's changes [N, K] by look; what breaks down is left out."""
     kinds = len(effect.quantities)
     backwards = np.array([q.least < 0 for q in effect.quantities])
-    numbers = np.split(np.arange(len(sound)), np.cumsum([len(d) for d in looks])[:-1])
-    kept = [(d, columns[:, k]) for d, k in zip(looks, numbers, strict=True) if sound[k].all()]
+    numbers = np.split(np.arange(len(sound)), np.cumsum([len(d) for d in probe_points])[:-1])
+    kept = [(d, columns[:, k]) for d, k in zip(probe_points, numbers, strict=True) if sound[k].all()]
     paths, cones = [], []
     if effect.joint:
         for directions, mine in kept:

@@ -16,10 +16,11 @@ from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
-from torchsoro.sim2real.inference.residual import LASTING, Band, Camera, Priors, Slip, estimate_noise
+from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
+from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel, Priors
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
-from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 
 EDGE = 0.15  # of a belief's tolerance, over which it ends
 FEWEST = 8  # samples of a trial's beginning
@@ -32,7 +33,7 @@ Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at 
 
 
 @dataclass(frozen=True, kw_only=True)
-class Beliefs:
+class Tolerances:
     """What a setup's numbers are good for: tolerances of ln of the modulus and of the pressure."""
 
     modulus: float = 0.1
@@ -73,15 +74,15 @@ class Likelihood:
         twin: Twin,
         *,
         trials: Sequence[Trial] | None = None,
-        numerics: Sequence[np.ndarray] | None = None,
+        discretization: Sequence[np.ndarray] | None = None,
         shift: Sequence[float] = (),
-        correction: Mapping[str, Motion] | None = None,
-        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
-        beliefs: Beliefs | None = None,
+        correction: Mapping[str, MarkerMotion] | None = None,
+        own: Mapping[Effects, Mapping[str, MarkerMotion]] | None = None,
+        tolerances: Tolerances | None = None,
         priors: Priors | None = None,
         noise: float | None = None,
         lasting: float = LASTING,
-        slips: Sequence[Slip] = (),
+        slips: Sequence[MarkerSlip] = (),
         ensemble: Ensemble | None = None,
         fine: Ensemble | None = None,
         report: Callable[[str], None] = lambda line: None,
@@ -92,17 +93,19 @@ class Likelihood:
         recordings = [t.recording for t in self.trials if t.recording is not None]
         self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
         shape = recordings[0].place.shape[1:]
-        self.numerics = list(numerics or [np.zeros(shape)] * len(recordings))
+        self.discretization = list(discretization or [np.zeros(shape)] * len(recordings))
         self.correction, self.own = correction or {}, own or {}
         self.priors, self.slips, self.lasting = priors, tuple(slips), lasting
-        self.camera = Camera(experiment.setup, self.trials, priors, slips)
-        self.bands = [Band(r, self.noise, n, lasting) for r, n in zip(recordings, self.numerics, strict=True)]
-        self.samples = sum(b.count for b in self.bands)
-        self.scenarios = [twin.scenario(t).replace(until=self.camera.until(i)) for i, t in enumerate(self.trials)]
-        self.beliefs = beliefs or Beliefs()
-        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.beliefs.modulus)]
+        self.observation = ObservationModel(experiment.setup, self.trials, priors, slips)
+        self.noise_models = [
+            NoiseModel(r, self.noise, n, lasting) for r, n in zip(recordings, self.discretization, strict=True)
+        ]
+        self.samples = sum(b.count for b in self.noise_models)
+        self.scenarios = [twin.scenario(t).replace(until=self.observation.until(i)) for i, t in enumerate(self.trials)]
+        self.tolerances = tolerances or Tolerances()
+        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.tolerances.modulus)]
         if experiment.setup.cavities:
-            self.common.append((PressureGain(), self.beliefs.pressure))
+            self.common.append((PressureGain(), self.tolerances.pressure))
         self.shift = np.array(shift if len(shift) else [0.0] * len(self.common))
         self.tally = Tally()
 
@@ -110,23 +113,23 @@ class Likelihood:
         self,
         trials: Sequence[Trial],
         *,
-        slips: Sequence[Slip] | None = None,
-        numerics: Sequence[np.ndarray] | None = None,
-        correction: Mapping[str, Motion] | None = None,
-        own: Mapping[Effects, Mapping[str, Motion]] | None = None,
+        slips: Sequence[MarkerSlip] | None = None,
+        discretization: Sequence[np.ndarray] | None = None,
+        correction: Mapping[str, MarkerMotion] | None = None,
+        own: Mapping[Effects, Mapping[str, MarkerMotion]] | None = None,
     ) -> Self:
         """The same of other trials, with other slips, or another error or correction of the twin."""
-        known = dict(zip((t.name for t in self.trials), self.numerics, strict=True))
-        common = np.asarray(np.mean(self.numerics, axis=0))
+        known = dict(zip((t.name for t in self.trials), self.discretization, strict=True))
+        common = np.asarray(np.mean(self.discretization, axis=0))
         there = type(self)(
             self.experiment,
             self.twin,
             trials=trials,
-            numerics=numerics or [known.get(t.name, common) for t in trials],
+            discretization=discretization or [known.get(t.name, common) for t in trials],
             shift=tuple(self.shift),
             correction=self.correction if correction is None else correction,
             own=self.own if own is None else own,
-            beliefs=self.beliefs,
+            tolerances=self.tolerances,
             priors=self.priors,
             noise=self.noise,
             lasting=self.lasting,
@@ -153,7 +156,7 @@ class Likelihood:
         own = {e: {**self.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
         return self.only(self.trials, own={**self.own, **own})
 
-    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, Motion]]:
+    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, MarkerMotion]]:
         """What the finer twin adds at points, by trial; nothing to those with a simulation of one's own."""
         trials = [t for t in trials if t.name not in self.stated]
         if self.fine is None or not trials:
@@ -163,7 +166,7 @@ class Likelihood:
         return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
 
     @property
-    def stated(self) -> dict[str, Motion]:
+    def stated(self) -> dict[str, MarkerMotion]:
         """Of the corrections, those by a simulation of one's own."""
         trials = (*self.experiment.trials, *self.experiment.heldout)
         return {t.name: self.correction[t.name] for t in trials if t.simulated and t.name in self.correction}
@@ -226,7 +229,7 @@ class Likelihood:
                 scenario = effect(scenario, part, self.twin)
         return scenario
 
-    def simulate(self, requests: Sequence[Request]) -> list[list[Motion]]:
+    def simulate(self, requests: Sequence[Request]) -> list[list[MarkerMotion]]:
         """For each request, the motions of all trials, each with a leading batch; all at once."""
         begin = time.perf_counter()
         varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
@@ -243,37 +246,37 @@ class Likelihood:
 
     # Residuals --------------------------------------------------------------------------------------------------
 
-    def residual(self, motions: Sequence[Motion], errors: np.ndarray) -> np.ndarray:
+    def residual(self, motions: Sequence[MarkerMotion], errors: np.ndarray) -> np.ndarray:
         """Whitened residual of all trials."""
         left = []
-        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+        for i, (motion, trial, noise_model) in enumerate(zip(motions, self.trials, self.noise_models, strict=True)):
             assert trial.recording is not None
-            left.append(band.whiten(trial.recording.place - self.camera.see(motion, i, errors)))
+            left.append(noise_model.whiten(trial.recording.place - self.observation.observe(motion, i, errors)))
         return np.concatenate(left)
 
-    def linear(self, motions: Sequence[Motion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linear(self, motions: Sequence[MarkerMotion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`residual`, and its slopes by the measurement errors."""
         left, slopes = [], []
-        for i, (motion, trial, band) in enumerate(zip(motions, self.trials, self.bands, strict=True)):
+        for i, (motion, trial, noise_model) in enumerate(zip(motions, self.trials, self.noise_models, strict=True)):
             assert trial.recording is not None
-            seen, by = self.camera.linearise(motion, i, errors)
-            left.append(band.whiten(trial.recording.place - seen))
-            slopes.append(band.whiten(by))
+            seen, by = self.observation.linearise(motion, i, errors)
+            left.append(noise_model.whiten(trial.recording.place - seen))
+            slopes.append(noise_model.whiten(by))
         return np.concatenate(left), np.concatenate(slopes)
 
     def measure(
-        self, motions: Sequence[Motion], errors: np.ndarray
+        self, motions: Sequence[MarkerMotion], errors: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """The best measurement errors for motions: misfit with their priors, errors, residual, slopes."""
-        weight = 1 / self.camera.deviations
+        weight = 1 / self.observation.deviations
         best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
         for _ in range(6):
             r, J = self.linear(motions, errors)
-            misfit = float(r @ r + ((errors * weight) ** 2).sum())
-            if misfit < best[0]:
-                gained = best[0] - misfit
-                best = (misfit, errors, r, J)
-                if gained < 0.05 + 1e-4 * misfit:
+            chi2 = float(r @ r + ((errors * weight) ** 2).sum())
+            if chi2 < best[0]:
+                gained = best[0] - chi2
+                best = (chi2, errors, r, J)
+                if gained < 0.05 + 1e-4 * chi2:
                     break
             else:  # too far
                 errors = (errors + best[1]) / 2
@@ -282,7 +285,7 @@ class Likelihood:
             errors = errors + np.linalg.solve(H, J.T @ r - weight**2 * errors)
         return best
 
-    def belief(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def prior_residual(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Residuals of the beliefs at a point, and their slopes; none where ``held``.
 
         Within its tolerance a number is nearly as good as another, beyond it is soon hard to believe.
@@ -295,7 +298,9 @@ class Likelihood:
         return np.where(held, 0.0, r), np.where(held, 0.0, slope)
 
 
-def added(trials: Sequence[Trial], coarse: Sequence[Motion], fine: Sequence[Motion]) -> dict[str, Motion]:
+def added(
+    trials: Sequence[Trial], coarse: Sequence[MarkerMotion], fine: Sequence[MarkerMotion]
+) -> dict[str, MarkerMotion]:
     """By trial, what a finer twin adds to motions [S, M, ...]; nothing where one of them broke down."""
     return {
         t.name: b.alone().plus(a.alone(), -1.0)

@@ -71,7 +71,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         fit: What was found.
         twin: To predict with; one as fine as that which corrected the fit's.
     """
-    belief = [*fit.belief.tolist(), 0.0][:2]
+    prior_residual = [*fit.ln_factors.tolist(), 0.0][:2]
     lines = [
         _HEAD,
         setup.read_text(encoding="utf-8").rstrip(),
@@ -81,7 +81,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         f"walls = {twin.walls}",
         f"across = {twin.across}",
     ]
-    lines += [f"ln_modulus = {belief[0]!r}", f"ln_pressure = {belief[1]!r}"]
+    lines += [f"ln_modulus = {prior_residual[0]!r}", f"ln_pressure = {prior_residual[1]!r}"]
     for effect, values in zip(fit.effects, fit.values, strict=True):
         lines += ["", "[[effect]]", f"name = {json.dumps(effect.name)}"]
         count = len(effect.quantities)

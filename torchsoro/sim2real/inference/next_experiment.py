@@ -11,11 +11,12 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Load, Marker, Setup, Trial, Vector
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
-from torchsoro.sim2real.inference.fit import STEP, Problem
-from torchsoro.sim2real.inference.isolability import Even, belief_of, changes, errors_of, shortened
+from torchsoro.sim2real.inference.fit import STEP, FitProblem
+from torchsoro.sim2real.inference.isolability import Even, changes, errors_of, prior_residual_of, shortened
 from torchsoro.sim2real.inference.likelihood import Effects
-from torchsoro.sim2real.inference.residual import Band, Camera
-from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.sim2real.inference.noise import NoiseModel
+from torchsoro.sim2real.inference.observation import ObservationModel
+from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 from torchsoro.simulation.actuation import Waveform
 
 LONGER = 1.5  # times as long; every simulation of the menu takes as long as its longest
@@ -58,7 +59,7 @@ class Choice:
     marker: bool = False
 
 
-def next_experiment(problem: Problem, one: Explained, other: Explained) -> list[Proposal]:
+def next_experiment(problem: FitProblem, one: Explained, other: Explained) -> list[Proposal]:
     """Trials that tell two explanations apart, best first; the same trial once more is among them.
 
     Each explanation is simulated as it was fitted; the other may then change all its numbers, with modulus, pressure
@@ -78,12 +79,12 @@ def next_experiment(problem: Problem, one: Explained, other: Explained) -> list[
     for choice in choices:
         numbers.setdefault(id(choice.trial), len(numbers))
     trials = list({id(c.trial): c.trial for c in choices}.values())
-    wide = Problem(
+    wide = FitProblem(
         dataclasses.replace(problem.experiment, setup=twin.setup),
         twin,
         trials=[_timed(dataclasses.replace(t, setup=_marked(t.setup, extra)), t) for t in trials],
         shift=tuple(problem.shift),
-        beliefs=problem.beliefs,
+        tolerances=problem.tolerances,
         priors=problem.priors,
         noise=problem.noise,
         ensemble=Even(twin, problem.ensemble.threads, problem.ensemble.device),
@@ -188,7 +189,7 @@ def far_marker(twin: Twin) -> Marker:
     return Marker(name="another", at=_vector(places[int(away.argmax())]))
 
 
-def _around(problem: Problem, effects: Effects, at: np.ndarray) -> np.ndarray:
+def _around(problem: FitProblem, effects: Effects, at: np.ndarray) -> np.ndarray:
     """The point where a fit ended, and one for a step of each of its unknowns [1 + K, K']; beliefs as they are."""
     n = len(problem.common)
     _, high = problem.bounds(effects)
@@ -197,7 +198,7 @@ def _around(problem: Problem, effects: Effects, at: np.ndarray) -> np.ndarray:
     return np.concatenate([middle[None], middle + (np.eye(len(at)) * steps)[n:]])
 
 
-def _proposal(problem: Problem, choice: Choice, motions: list[Motion], extra: Marker) -> Proposal:
+def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerMotion], extra: Marker) -> Proposal:
     """What a trial would tell, from simulations of what is believed, and of both explanations with their steps."""
     trial = choice.trial
     if choice.marker:
@@ -206,20 +207,22 @@ def _proposal(problem: Problem, choice: Choice, motions: list[Motion], extra: Ma
         motions = [_first(m, len(trial.setup.markers)) for m in motions]
     trial = _timed(trial, choice.trial)
     assert trial.recording is not None
-    numerics = np.mean(problem.numerics, axis=0)
-    numerics = np.concatenate([numerics, numerics.mean(0, keepdims=True)]) if choice.marker else numerics
-    camera = Camera(trial.setup, [trial], problem.priors)
-    bands = [Band(trial.recording, problem.noise, numerics)]
+    discretization = np.mean(problem.discretization, axis=0)
+    discretization = (
+        np.concatenate([discretization, discretization.mean(0, keepdims=True)]) if choice.marker else discretization
+    )
+    observation = ObservationModel(trial.setup, [trial], problem.priors)
+    noise_models = [NoiseModel(trial.recording, problem.noise, discretization)]
     believed = [motions[0].alone(0)]
-    blocks = [changes(camera, bands, believed, [m]) for m in motions]
+    blocks = [changes(observation, noise_models, believed, [m]) for m in motions]
     widths = np.cumsum([b.shape[1] for b in blocks])[:-1]
-    still, *both = np.split(shortened(blocks, errors_of(camera, bands, believed), camera), widths, 1)
+    still, *both = np.split(shortened(blocks, errors_of(observation, noise_models, believed), observation), widths, 1)
     common = still[:, 1:] / STEP
     # What each makes, and how it may still change.
     cones = [np.concatenate([b[:, :1], b[:, 1:] - b[:, :1]], 1) for b in both]
     alike, distance = 0.0, np.inf
     for mine, other in (cones, cones[::-1]):
-        size, slopes = settle(mine[:, 0], common, belief_of(problem))
+        size, slopes = settle(mine[:, 0], common, prior_residual_of(problem))
         left = cleared(np.concatenate([mine[:, :1], other], 1), common, slopes)
         same = imitation(left[:, 0], left[:, 1:], np.ones(other.shape[1], bool))
         alike, distance = max(alike, same), min(distance, size**2 * (1 - same**2))
@@ -241,7 +244,7 @@ def _marked(setup: Setup, extra: Marker) -> Setup:
     return dataclasses.replace(setup, markers=(*setup.markers, extra))
 
 
-def _first(motion: Motion, markers: int) -> Motion:
+def _first(motion: MarkerMotion, markers: int) -> MarkerMotion:
     """A motion of the first markers only."""
     return dataclasses.replace(
         motion,

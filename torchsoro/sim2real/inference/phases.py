@@ -11,9 +11,9 @@ import torch
 from scipy.signal import savgol_filter
 
 from torchsoro.sim2real.data.experiment import Trial
-from torchsoro.sim2real.inference.fit import STEP, Fit, Problem
+from torchsoro.sim2real.inference.fit import STEP, Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
 SHORT = 0.02  # of a trial: no phase is shorter
 SLOPE = 0.5  # of the range of a pressure in a trial's duration, above which it rises or falls
@@ -118,7 +118,9 @@ def together(values: np.ndarray) -> np.ndarray:
     return np.nan_to_num(_mean(values, 1))
 
 
-def mismatches(problem: Problem, nothing: Fit, trials: Sequence[Trial], after: Sequence[Prediction]) -> list[Mismatch]:
+def mismatches(
+    problem: FitProblem, null_model: Fit, trials: Sequence[Trial], after: Sequence[Prediction]
+) -> list[Mismatch]:
     """Where and when recordings and simulations part.
 
     Measurement errors, modulus and pressure are those of the time before, within what is believed: fitted to the whole
@@ -126,12 +128,12 @@ def mismatches(problem: Problem, nothing: Fit, trials: Sequence[Trial], after: S
 
     Args:
         problem: With what noise and numerics explain.
-        nothing: The fit without any effect.
+        null_model: The fit without any effect.
         trials: With recordings.
         after: Each as explained.
     """
     there, n = problem.only(trials), len(problem.common)
-    point = np.clip(nothing.point[:n], -1, 1)
+    point = np.clip(null_model.point[:n], -1, 1)
     (motions,) = there.simulate([((), point + np.concatenate([np.zeros((1, n)), STEP * np.eye(n)]))])
     found = []
     for i, (trial, motion, other) in enumerate(zip(trials, motions, after, strict=True)):
@@ -144,23 +146,23 @@ def mismatches(problem: Problem, nothing: Fit, trials: Sequence[Trial], after: S
                 phases=tuple(phases(trial, motion.alone())),
                 time=recording.time,
                 before=_before(there, i, motion, point),
-                after=_mean((recording.place - other.seen) / np.hypot(there.noise, there.numerics[i]), 2),
+                after=_mean((recording.place - other.seen) / np.hypot(there.noise, there.discretization[i]), 2),
             )
         )
     return found
 
 
-def _before(there: Problem, i: int, motion: Motion, point: np.ndarray) -> np.ndarray:
+def _before(there: FitProblem, i: int, motion: MarkerMotion, point: np.ndarray) -> np.ndarray:
     """Mismatch of trial ``i`` [T, M] with what is fitted along found from more and more of it, until they part."""
     recording, n = there.trials[i].recording, len(point)
     assert recording is not None
-    time, prior = recording.time, np.concatenate([np.ones(n), 1 / there.camera.deviations])
-    wide = np.hypot(there.noise, there.numerics[i])
+    time, prior = recording.time, np.concatenate([np.ones(n), 1 / there.observation.deviations])
+    wide = np.hypot(there.noise, there.discretization[i])
     x, good = np.zeros(len(prior)), None
 
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        seen, by = there.camera.linearise(motion.alone(0), i, x[n:])
-        rise = [(there.camera.see(motion.alone(k + 1), i, x[n:]) - seen) / STEP for k in range(n)]
+        seen, by = there.observation.linearise(motion.alone(0), i, x[n:])
+        rise = [(there.observation.observe(motion.alone(k + 1), i, x[n:]) - seen) / STEP for k in range(n)]
         slopes = np.concatenate([np.stack(rise, -1), by], -1) / wide[..., None]
         return (recording.place - seen) / wide - slopes[..., :n] @ x[:n], slopes
 
@@ -187,7 +189,7 @@ def _parting(time: np.ndarray, values: np.ndarray) -> float | None:
     return float(time[int(run.argmax())]) if run.any() else None
 
 
-def phases(trial: Trial, motion: Motion) -> list[Phase]:
+def phases(trial: Trial, motion: MarkerMotion) -> list[Phase]:
     """Phases of a trial: of its pressure, of contact with planes, of loads; of swings where there are none.
 
     Args:
@@ -250,7 +252,7 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
     return found
 
 
-def _contacts(trial: Trial, motion: Motion, time: np.ndarray) -> list[str]:
+def _contacts(trial: Trial, motion: MarkerMotion, time: np.ndarray) -> list[str]:
     """Whether a corner of the body, which moves as the marker nearest to it does, is at a plane."""
     s = trial.setup
     if not s.planes:
@@ -286,7 +288,7 @@ def _loads(trial: Trial, time: np.ndarray) -> list[str]:
     return ["time after the load" if ends and t >= max(ends) else name for t, name in zip(time, names, strict=True)]
 
 
-def _swings(motion: Motion, time: np.ndarray) -> list[str]:
+def _swings(motion: MarkerMotion, time: np.ndarray) -> list[str]:
     """From one turning point to the next, of the marker that moves most, along which it does."""
     moved = motion.place - motion.place.mean(0)
     most = int((moved**2).sum((0, 2)).argmax())

@@ -33,48 +33,48 @@ class Candidate:
             an effect may make, and measurement errors far beyond belief tell against it.
         gain: The same over nothing with any modulus and pressure, without allowance for its form.
         explained: Share of the misfit beyond noise and numerics that it takes away.
-        kept: Error on trials that were left out over that without an effect; not a number where none was.
+        heldout_ratio: Error on trials that were left out over that without an effect; not a number where none was.
     """
 
     fit: Fit
     score: float
     gain: float
     explained: float
-    kept: float = math.nan
+    heldout_ratio: float = math.nan
 
 
-def rank(fits: Sequence[Fit], nothing: Fit, believed: float, deviations: np.ndarray) -> list[Candidate]:
+def rank(fits: Sequence[Fit], null_model: Fit, believed: float, deviations: np.ndarray) -> list[Candidate]:
     """Score fits that are better than nothing, best first.
 
     Args:
         fits: Of effects.
-        nothing: The fit without any.
+        null_model: The fit without any.
         believed: Its misfit within beliefs.
         deviations: That measurement errors are believed to have.
     """
-    fits = [fit for fit in fits if fit.misfit < nothing.misfit]
+    fits = [fit for fit in fits if fit.chi2 < null_model.chi2]
     if not fits:
         return []
-    best = min(fits, key=lambda fit: fit.misfit)
+    best = min(fits, key=lambda fit: fit.chi2)
     alike = correlation(best)
-    gained = believed - best.misfit
-    bare = 2 * max(1.0, best.misfit / best.samples) * alike
+    gained = believed - best.chi2
+    bare = 2 * max(1.0, best.chi2 / best.samples) * alike
     unit = max(bare, 2 * FORM * gained)
     worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
-    freed = [f for f in fits if f.effects and all(isinstance(e, Modulus | PressureGain) for e in f.effects)]
+    unconstrained = [f for f in fits if f.effects and all(isinstance(e, Modulus | PressureGain) for e in f.effects)]
     # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
     fits = [
         f
         for f in fits
-        if not any(max(_strained(g), BELIEVED) < _strained(f) and f.misfit > g.misfit - LEANS * unit for g in freed)
+        if not any(max(_strained(g), BELIEVED) < _strained(f) and f.chi2 > g.chi2 - LEANS * unit for g in unconstrained)
     ]
     found = [
         Candidate(
             fit=fit,
-            score=(believed - fit.misfit) / unit - fit.unknowns * worth - _bent(fit, deviations),
+            score=(believed - fit.chi2) / unit - fit.unknowns * worth - _bent(fit, deviations),
             # What sets a modulus free gains over one that is believed.
-            gain=((believed if fit in freed else nothing.misfit) - fit.misfit) / bare - fit.unknowns * worth,
-            explained=min((believed - fit.misfit) / max(believed - fit.samples, 1.0), 1.0),
+            gain=((believed if fit in unconstrained else null_model.chi2) - fit.chi2) / bare - fit.unknowns * worth,
+            explained=min((believed - fit.chi2) / max(believed - fit.samples, 1.0), 1.0),
         )
         for fit in fits
     ]
@@ -88,10 +88,10 @@ def varied(fit: Fit) -> float:
 
 def _strained(fit: Fit) -> float:
     """How far beyond belief modulus or pressure are, in tolerances; the belief may be that of a body's stiff side."""
-    off = np.abs(fit.point[: len(fit.belief)])
+    off = np.abs(fit.point[: len(fit.ln_factors)])
     stiffer = varied(fit)
-    if fit.belief[0] < 0:
-        off[0] *= max(1 + stiffer / float(fit.belief[0]), 0.0)
+    if fit.ln_factors[0] < 0:
+        off[0] *= max(1 + stiffer / float(fit.ln_factors[0]), 0.0)
     return float(off.max())
 
 

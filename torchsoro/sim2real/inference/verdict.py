@@ -13,10 +13,10 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.inference.fit import Fit, Problem
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict_all
 from torchsoro.sim2real.inference.ranking import BELIEVED, FAINT, Candidate, rank, varied
-from torchsoro.sim2real.inference.search import priced, search, within
+from torchsoro.sim2real.inference.search import inflate_discrepancy, search, within
 
 FOLDS = 4  # trials that are left out, one after the other
 
@@ -46,7 +46,7 @@ class Thresholds:
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
         near: By how much it may be larger in any case, even than ``lost``, over the error without an effect.
         left: Of the misfit, above which what the best effect leaves is due to its form, which is never just nature's.
-        form: Times what the best then leaves, up to which another is not told apart from it.
+        equal: Times what the best then leaves, up to which another is not told apart from it.
     """
 
     alarm: float = 40.0
@@ -66,7 +66,7 @@ class Thresholds:
     worse: float = 1.3
     near: float = 0.02
     left: float = 0.05
-    form: float = 2.0
+    equal: float = 2.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -76,7 +76,7 @@ class Verdict:
     Attributes:
         kind: "explained", "nothing_missing", "unknown_physics" or "cannot_distinguish".
         problem: With the slips of markers that were found.
-        nothing: The fit without any effect.
+        null_model: The fit without any effect.
         ranking: The effects that were fitted, best first.
         chosen: The effects that explain the difference: one, or several that cannot be told apart.
         excess: What is left over what noise and numerics explain, for the best effect: 1 if nothing is left.
@@ -84,8 +84,8 @@ class Verdict:
     """
 
     kind: str
-    problem: Problem
-    nothing: Fit
+    problem: FitProblem
+    null_model: Fit
     ranking: tuple[Candidate, ...]
     chosen: tuple[Candidate, ...] = field(default=())
     excess: float = 1.0
@@ -93,10 +93,10 @@ class Verdict:
 
 
 def judge(
-    problem: Problem,
+    problem: FitProblem,
     effects: Sequence[Hypothesis] | None = None,
     *,
-    kept: Sequence[Trial] = (),
+    heldout: Sequence[Trial] = (),
     thresholds: Thresholds | None = None,
     budget: float = 600.0,
     report: Callable[[str], None] = print,
@@ -106,33 +106,33 @@ def judge(
     Args:
         problem: Recordings and twin.
         effects: What is thought of; the library if None.
-        kept: Trials that are only predicted. Without any, each of three or more is predicted from the others.
+        heldout: Trials that are only predicted. Without any, each of three or more is predicted from the others.
         thresholds: What decides.
         budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
     """
     effects = problem.thought_of(library() if effects is None else effects)
-    problem, nothing, best = search(problem, effects, budget, report)
-    believed = within(problem, nothing)
-    plain = rank(best, nothing, believed, problem.camera.deviations)
-    start, plainly = nothing.misfit / nothing.samples, believed / nothing.samples
-    excess = min((c.fit.misfit for c in plain), default=nothing.misfit) / nothing.samples
+    problem, null_model, best = search(problem, effects, budget, report)
+    believed = within(problem, null_model)
+    plain = rank(best, null_model, believed, problem.observation.deviations)
+    start, plainly = null_model.chi2 / null_model.samples, believed / null_model.samples
+    excess = min((c.fit.chi2 for c in plain), default=null_model.chi2) / null_model.samples
     own = problem
-    problem, nothing, fits = priced(problem, nothing, best, report)
-    believed = believed if problem is own else within(problem, nothing)
+    problem, null_model, fits = inflate_discrepancy(problem, null_model, best, report)
+    believed = believed if problem is own else within(problem, null_model)
     # What is explained, and what is left, is told by noise and the twin's own error alone.
     explained = {c.fit.name: c.explained for c in plain}
     found = [
         dataclasses.replace(c, explained=explained.get(c.fit.name, 0.0))
-        for c in rank(fits, nothing, believed, problem.camera.deviations)
+        for c in rank(fits, null_model, believed, problem.observation.deviations)
     ]
-    found, heldout, faint = _proved(problem, nothing, found, kept)
+    found, errors, faint = _predicted(problem, null_model, found, heldout)
     for c in found:
-        report(f"{c.fit.name}: misfit {c.fit.misfit:.0f}, score {c.score:.1f}, kept {c.kept:.2f}, {tell(c.fit)}")
+        report(f"{c.fit.name}: misfit {c.fit.chi2:.0f}, score {c.score:.1f}, kept {c.heldout_ratio:.2f}, {tell(c.fit)}")
     t = thresholds or Thresholds()
-    verdict = decide(problem, nothing, found, excess, t, start=start, plainly=plainly, faint=faint)
+    verdict = decide(problem, null_model, found, excess, t, start=start, plainly=plainly, faint=faint)
     shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
-    return dataclasses.replace(verdict, heldout=heldout.get(shown, {}))
+    return dataclasses.replace(verdict, heldout=errors.get(shown, {}))
 
 
 def number(value: float, unit: str) -> str:
@@ -150,17 +150,17 @@ def tell(fit: Fit) -> str:
     return ", ".join(parts)
 
 
-def _proved(
-    problem: Problem, nothing: Fit, found: list[Candidate], kept: Sequence[Trial]
+def _predicted(
+    problem: FitProblem, null_model: Fit, found: list[Candidate], trials: Sequence[Trial]
 ) -> tuple[list[Candidate], dict[str, dict[str, tuple[float, float]]], float]:
     """The candidates near the best with their error on trials left out; by name, errors as believed and with it.
 
     Last the square of the error without an effect, over that of the noise.
     """
     near = [c for c in found if c.gain > FAINT and c.score > 0.5 * found[0].score][:3]
-    fits = [nothing, *(c.fit for c in near)]
-    if kept:
-        folds = [(problem, fits, list(kept))]
+    fits = [null_model, *(c.fit for c in near)]
+    if trials:
+        folds = [(problem, fits, list(trials))]
     elif len(problem.trials) < 3 or not near:
         return found, {}, math.inf
     else:
@@ -181,9 +181,9 @@ def _proved(
             squares[k] += sum(p.total**2 for p in row) if row else math.inf
             heldout[fit.name] |= {b.trial: (b.total, p.total) for b, p in zip(believed, row, strict=False)}
     ratios = np.sqrt(squares / squares[0])
-    proved = {id(c): float(ratio) for c, ratio in zip(near, ratios[1:], strict=True)}
-    noise = len(heldout[nothing.name]) * len(problem.experiment.setup.axes) * problem.noise**2
-    found = [dataclasses.replace(c, kept=proved.get(id(c), math.nan)) for c in found]
+    ratio_of = {id(c): float(ratio) for c, ratio in zip(near, ratios[1:], strict=True)}
+    noise = len(heldout[null_model.name]) * len(problem.experiment.setup.axes) * problem.noise**2
+    found = [dataclasses.replace(c, heldout_ratio=ratio_of.get(id(c), math.nan)) for c in found]
     return found, heldout, float(squares[0]) / noise
 
 
@@ -195,8 +195,8 @@ def _halves(one: Fit, other: Fit) -> bool:
 
 
 def decide(
-    problem: Problem,
-    nothing: Fit,
+    problem: FitProblem,
+    null_model: Fit,
     found: Sequence[Candidate],
     excess: float,
     t: Thresholds,
@@ -209,7 +209,7 @@ def decide(
 
     Args:
         problem: That was fitted.
-        nothing: Without an effect.
+        null_model: Without an effect.
         found: Effects, best first.
         excess: Times what noise and numerics explain that the best leaves.
         t: What decides.
@@ -218,17 +218,20 @@ def decide(
         faint: Square of the error on trials left out without an effect, over that of the noise.
     """
     believed = [c for c in found if c.gain > t.alarm]
-    if not all(math.isnan(c.kept) for c in found):
+    if not all(math.isnan(c.heldout_ratio) for c in found):
         # Where most of an error is noise, even the truth takes little of it away.
         most = [t.noisy if (start < t.some or faint < t.faint) and c.gain > t.sure else t.lost for c in believed]
-        least = min((c.kept for c, lost in zip(believed, most, strict=True) if c.kept <= lost), default=-math.inf)
+        least = min(
+            (c.heldout_ratio for c, lost in zip(believed, most, strict=True) if c.heldout_ratio <= lost),
+            default=-math.inf,
+        )
         believed = [
             c
             for c, lost in zip(believed, most, strict=True)
-            if c.kept <= max(min(lost, t.worse * least), least + t.near)
+            if c.heldout_ratio <= max(min(lost, t.worse * least), least + t.near)
         ]
     best = believed[0] if believed else None
-    common = {"problem": problem, "nothing": nothing, "ranking": tuple(found), "excess": excess}
+    common = {"problem": problem, "null_model": null_model, "ranking": tuple(found), "excess": excess}
     little = best is not None and start > t.some and best.explained < t.part
     if best is None or best.score < t.alarm or little or plainly < t.covered:
         return Verdict(kind="nothing_missing" if start < t.quiet else "unknown_physics", **common)
@@ -238,8 +241,8 @@ def decide(
     if problem.experiment.setup.planes:
         margin = max(margin, t.rough * best.score)
         # A fit without a trial may end in another dent: that it predicts hardly better than nothing tells little.
-        others += [c for c in found if c not in believed and c.gain > t.alarm and c.kept > t.lost]
-    formed = t.form * (1 - best.explained) if 1 - best.explained > t.left else 0.0
+        others += [c for c in found if c not in believed and c.gain > t.alarm and c.heldout_ratio > t.lost]
+    formed = t.equal * (1 - best.explained) if 1 - best.explained > t.left else 0.0
 
     def alike(c: Candidate) -> bool:
         less = max(margin, t.halves) if _halves(best.fit, c.fit) else margin

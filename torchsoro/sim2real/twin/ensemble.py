@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsoro.sim2real.twin.grid import Grid
 from torchsoro.sim2real.twin.scenario import Scenario
-from torchsoro.sim2real.twin.twin import Motion, Twin
+from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
@@ -64,7 +64,7 @@ class Ensemble:
         self.steep = max(a.steep for a in grid.axes)
         self.safety = safety(grid)
 
-    def __call__(self, scenarios: Sequence[Scenario]) -> list[Motion]:
+    def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerMotion]:
         """Simulate.
 
         Args:
@@ -117,7 +117,7 @@ class Ensemble:
         at = np.array([m.at for m in self.twin.setup.markers], float)
         time = np.arange(samples) * SAMPLE
         return [
-            Motion(
+            MarkerMotion(
                 time=time,
                 place=at + x[:, :, :, 0],
                 velocity=x[:, :, :, 1],

@@ -21,7 +21,7 @@ NEAR = 0.005  # of the body, within which a flat face counts as that of a chambe
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Motion:
+class MarkerMotion:
     """How markers moved; float64.
 
     Attributes:
@@ -38,7 +38,7 @@ class Motion:
     gradient: np.ndarray
     dt: float
 
-    def alone(self, number: int = 0) -> Motion:
+    def alone(self, number: int = 0) -> MarkerMotion:
         """One of a batch."""
         if self.place.ndim == 3:
             return self
@@ -46,7 +46,7 @@ class Motion:
             self, place=self.place[number], velocity=self.velocity[number], gradient=self.gradient[number]
         )
 
-    def plus(self, other: Motion, share: float = 1.0) -> Motion:
+    def plus(self, other: MarkerMotion, share: float = 1.0) -> MarkerMotion:
         """With a share of another motion [S', M, ...] added, whose last values last."""
         at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
         return dataclasses.replace(

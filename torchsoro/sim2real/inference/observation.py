@@ -1,22 +1,16 @@
-"""What is recorded of a motion, measurement errors included, and how far it may be off before that means anything."""
+"""What a motion leaves in a recording: the observation model, with its measurement errors as parameters."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve_triangular
-from scipy.optimize import linear_sum_assignment
 
-from torchsoro.sim2real.data.experiment import Experiment, Setup, Trial
-from torchsoro.sim2real.data.recording import Recording
-from torchsoro.sim2real.twin.twin import Motion
+from torchsoro.sim2real.data.experiment import Setup, Trial
+from torchsoro.sim2real.twin.twin import MarkerMotion
 
-CORRELATION = 0.03  # s over which the twin's own error lasts, and a part of the noise
-LASTING = 0.25  # of the variance of the noise
 LATE = 3.0  # standard deviations that a clock may be behind
 
 
@@ -44,7 +38,7 @@ class Priors:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Slip:
+class MarkerSlip:
     """A marker that moves on the body during a recording.
 
     Attributes:
@@ -62,7 +56,7 @@ class Slip:
         return np.clip((time - self.start) / 0.01, 0.0, 1.0)
 
 
-class Camera:
+class ObservationModel:
     """From motions of all trials to what would have been recorded, and its derivatives by the measurement errors.
 
     The errors are one vector: a clock offset for each trial; clock rate, ln of the scale, rotation about x, y, z; then
@@ -76,7 +70,7 @@ class Camera:
     """
 
     def __init__(
-        self, setup: Setup, trials: Sequence[Trial], priors: Priors | None = None, slips: Sequence[Slip] = ()
+        self, setup: Setup, trials: Sequence[Trial], priors: Priors | None = None, slips: Sequence[MarkerSlip] = ()
     ) -> None:
         priors = priors or Priors()
         self.setup, self.trials, self.slips = setup, tuple(trials), tuple(slips)
@@ -97,7 +91,7 @@ class Camera:
         last = float(trial.recording.time[-1])
         return max(trial.setup.duration, (last + LATE * clock) * (1 + LATE * rate))
 
-    def see(self, motion: Motion, number: int, errors: np.ndarray) -> np.ndarray:
+    def observe(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> np.ndarray:
         """What trial ``number`` would have recorded.
 
         Args:
@@ -111,7 +105,7 @@ class Camera:
         own, place, frame = self._view(motion, number, errors)
         return self._recorded(_at(motion, own, place)[0] @ frame.T, number, errors)
 
-    def linearise(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearise(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`see`, and the derivatives of the places by the errors [T, M, A, K]."""
         count, rate = len(self.trials), errors[len(self.trials)]
         own, place, frame = self._view(motion, number, errors)
@@ -133,7 +127,7 @@ class Camera:
                 by[:, marker, axis, first + axis] = course
         return self._recorded(seen, number, errors), by[:, :, list(self.setup.axes)]
 
-    def _view(self, motion: Motion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _view(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times by the body's clock [T] s, places of markers [M, 3] m, and scale times rotation [3, 3]."""
         recording, count = self.trials[number].recording, len(self.trials)
         assert recording is not None
@@ -160,7 +154,7 @@ class Camera:
         return seen[:, :, list(self.setup.axes)]
 
 
-def _at(motion: Motion, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _at(motion: MarkerMotion, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places and velocities at times, by Hermite's cubic between samples, and deformation gradients.
 
     The places are of points that lie so far [M, 3] m from the motion's own in the undeformed body.
@@ -187,130 +181,3 @@ def _rotation(turn: np.ndarray) -> np.ndarray:
     if angle < 1e-12:
         return np.eye(3) + cross
     return np.eye(3) + math.sin(angle) / angle * cross + (1 - math.cos(angle)) / angle**2 * cross @ cross
-
-
-class Band:
-    """How far residuals may be off: noise, and what the twin's numerics get wrong; both may last for a while.
-
-    Args:
-        recording: Of the trial.
-        noise: Standard deviation of the noise [m].
-        numerics: That of the twin's error, by marker and axis [M, A] m.
-        lasting: Share of the noise's variance that lasts from sample to sample.
-    """
-
-    def __init__(self, recording: Recording, noise: float, numerics: np.ndarray, lasting: float = LASTING) -> None:
-        lag = np.abs(recording.time[:, None] - recording.time[None, :])
-        alike = np.exp(-lag / CORRELATION)
-        self.channels: list[tuple[np.ndarray, list[tuple[int, int]], np.ndarray]] = []
-        known: dict[tuple[bytes, float], int] = {}
-        for m, a in np.ndindex(*numerics.shape):
-            rows = np.flatnonzero(recording.seen[:, m, a])
-            if not len(rows):
-                continue
-            key = rows.tobytes(), float(numerics[m, a])
-            if key in known:
-                self.channels[known[key]][1].append((m, a))
-                continue
-            known[key] = len(self.channels)
-            slow = lasting * noise**2 + numerics[m, a] ** 2
-            covariance = (1 - lasting) * noise**2 * np.eye(len(rows)) + slow * alike[np.ix_(rows, rows)]
-            root = np.linalg.cholesky(covariance)
-            self.channels.append((rows, [(m, a)], solve_triangular(root, np.eye(len(rows)), lower=True)))
-        self.count = sum(len(rows) * len(pairs) for rows, pairs, _ in self.channels)
-
-    def whiten(self, values: np.ndarray) -> np.ndarray:
-        """Divide by what may be: [T, M, A, ...] to [samples, ...], of variance 1 if nothing is wrong."""
-        parts = []
-        for rows, pairs, inverse in self.channels:
-            v = np.stack([values[rows, m, a] for m, a in pairs])
-            flat = inverse @ v.reshape(len(pairs), len(rows), -1)
-            parts.append(flat.reshape(-1, *values.shape[3:]))
-        return np.concatenate(parts)
-
-
-def find_slips(trials: Sequence[Trial], bands: Sequence[Band], left: Sequence[np.ndarray]) -> list[Slip]:
-    """The marker whose slipping would explain most of what is left, if that is half of it all.
-
-    Args:
-        trials: With recordings.
-        bands: How far residuals may be off, of each trial.
-        left: Residuals of each trial [T, M, A] m, not whitened.
-    """
-    markers = left[0].shape[1]
-    gains = np.zeros((len(trials), markers))
-    starts = np.zeros((len(trials), markers))
-    excess = 0.0
-    for i, (trial, band, r) in enumerate(zip(trials, bands, left, strict=True)):
-        assert trial.recording is not None
-        time = trial.recording.time
-        tried = np.linspace(time[0], time[-1], 62)[1:-1]
-        courses = np.stack([Slip(trial=trial.name, marker=0, start=t).course(time) for t in tried], -1)
-        found = np.zeros((markers, len(tried)))
-        for rows, pairs, inverse in band.channels:
-            steps = inverse @ courses[rows]
-            ones = (inverse @ np.ones(len(rows)))[:, None]
-            # Apart from where the marker is from the start on.
-            steps = steps - ones * (ones.T @ steps) / float((ones**2).sum())
-            for m, a in pairs:
-                white = inverse @ r[rows, m, a]
-                excess += float(white @ white) - len(rows)
-                white = white - ones[:, 0] * float(ones[:, 0] @ white) / float((ones**2).sum())
-                found[m] += (steps.T @ white) ** 2 / ((steps**2).sum(0) + 1e-9)
-        gains[i], starts[i] = found.max(1), tried[found.argmax(1)]
-    marker = int(gains.sum(0).argmax())
-    if gains[:, marker].sum() < max(100.0, 0.5 * excess):
-        return []
-    return [
-        Slip(trial=t.name, marker=marker, start=float(starts[i, marker]) - 0.005)
-        for i, t in enumerate(trials)
-        if gains[i, marker] > 30
-    ]
-
-
-def reordered(experiment: Experiment) -> tuple[Experiment, str]:
-    """The experiment with the columns of markers that were confused put right, and what was, in words.
-
-    Only where recordings begin with the body as it is stated, and the stated order is far off.
-    """
-    setup = experiment.setup
-    recordings = [t.recording for t in experiment.trials if t.recording is not None]
-    stated = np.array([m.at for m in setup.markers])[:, list(setup.axes)]
-    first = [np.nanmean(r.place[:5], axis=0) for r in recordings if np.isfinite(r.place[:5]).any(0).all()]
-    if not first:
-        return experiment, ""
-    away = np.linalg.norm(stated[:, None] - np.mean(first, axis=0)[None], axis=-1)
-    _, order = linear_sum_assignment(away)
-    moved = np.flatnonzero(order != np.arange(len(order)))
-    if not len(moved) or away[moved, order[moved]].sum() > 0.4 * away[moved, moved].sum():
-        return experiment, ""
-
-    def right(trial: Trial) -> Trial:
-        if trial.recording is None:
-            return trial
-        return dataclasses.replace(
-            trial, recording=dataclasses.replace(trial.recording, place=trial.recording.place[:, order])
-        )
-
-    names = ", ".join(setup.markers[i].name for i in moved)
-    put = dataclasses.replace(
-        experiment, trials=tuple(map(right, experiment.trials)), heldout=tuple(map(right, experiment.heldout))
-    )
-    return put, f"columns of {names} were confused"
-
-
-def estimate_noise(recordings: Sequence[Recording]) -> float:
-    """Standard deviation of the noise [m], from third differences of the quieter half of the samples.
-
-    Motion that is smooth over four samples drops out of a third difference, noise does not: its variance is 20 times
-    that of a sample.
-    """
-    found = []
-    for r in recordings:
-        third = np.diff(r.place, 3, axis=0)
-        third = third[np.isfinite(third)]
-        if len(third):
-            found.append(np.abs(third))
-    pooled = np.sort(np.concatenate(found))
-    # Where a normal distribution has its lower quartile of absolute values; motion fills the upper part.
-    return float(np.quantile(pooled, 0.25)) / 0.3186 / math.sqrt(20.0)

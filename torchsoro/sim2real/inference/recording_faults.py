@@ -1,0 +1,85 @@
+"""Faults of a recording that are found before and beside a fit: markers that slip, and columns that are confused."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from torchsoro.sim2real.data.experiment import Experiment, Trial
+from torchsoro.sim2real.inference.noise import NoiseModel
+from torchsoro.sim2real.inference.observation import MarkerSlip
+
+
+def find_slips(
+    trials: Sequence[Trial], noise_models: Sequence[NoiseModel], left: Sequence[np.ndarray]
+) -> list[MarkerSlip]:
+    """The marker whose slipping would explain most of what is left, if that is half of it all.
+
+    Args:
+        trials: With recordings.
+        noise_models: How far residuals may be off, of each trial.
+        left: Residuals of each trial [T, M, A] m, not whitened.
+    """
+    markers = left[0].shape[1]
+    gains = np.zeros((len(trials), markers))
+    starts = np.zeros((len(trials), markers))
+    excess = 0.0
+    for i, (trial, noise_model, r) in enumerate(zip(trials, noise_models, left, strict=True)):
+        assert trial.recording is not None
+        time = trial.recording.time
+        tried = np.linspace(time[0], time[-1], 62)[1:-1]
+        courses = np.stack([MarkerSlip(trial=trial.name, marker=0, start=t).course(time) for t in tried], -1)
+        found = np.zeros((markers, len(tried)))
+        for rows, pairs, inverse in noise_model.channels:
+            steps = inverse @ courses[rows]
+            ones = (inverse @ np.ones(len(rows)))[:, None]
+            # Apart from where the marker is from the start on.
+            steps = steps - ones * (ones.T @ steps) / float((ones**2).sum())
+            for m, a in pairs:
+                white = inverse @ r[rows, m, a]
+                excess += float(white @ white) - len(rows)
+                white = white - ones[:, 0] * float(ones[:, 0] @ white) / float((ones**2).sum())
+                found[m] += (steps.T @ white) ** 2 / ((steps**2).sum(0) + 1e-9)
+        gains[i], starts[i] = found.max(1), tried[found.argmax(1)]
+    marker = int(gains.sum(0).argmax())
+    if gains[:, marker].sum() < max(100.0, 0.5 * excess):
+        return []
+    return [
+        MarkerSlip(trial=t.name, marker=marker, start=float(starts[i, marker]) - 0.005)
+        for i, t in enumerate(trials)
+        if gains[i, marker] > 30
+    ]
+
+
+def reordered(experiment: Experiment) -> tuple[Experiment, str]:
+    """The experiment with the columns of markers that were confused put right, and what was, in words.
+
+    Only where recordings begin with the body as it is stated, and the stated order is far off.
+    """
+    setup = experiment.setup
+    recordings = [t.recording for t in experiment.trials if t.recording is not None]
+    stated = np.array([m.at for m in setup.markers])[:, list(setup.axes)]
+    first = [np.nanmean(r.place[:5], axis=0) for r in recordings if np.isfinite(r.place[:5]).any(0).all()]
+    if not first:
+        return experiment, ""
+    away = np.linalg.norm(stated[:, None] - np.mean(first, axis=0)[None], axis=-1)
+    _, order = linear_sum_assignment(away)
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    if not len(moved) or away[moved, order[moved]].sum() > 0.4 * away[moved, moved].sum():
+        return experiment, ""
+
+    def right(trial: Trial) -> Trial:
+        if trial.recording is None:
+            return trial
+        return dataclasses.replace(
+            trial, recording=dataclasses.replace(trial.recording, place=trial.recording.place[:, order])
+        )
+
+    names = ", ".join(setup.markers[i].name for i in moved)
+    put = dataclasses.replace(
+        experiment, trials=tuple(map(right, experiment.trials)), heldout=tuple(map(right, experiment.heldout))
+    )
+    return put, f"columns of {names} were confused"

@@ -1,0 +1,74 @@
+"""How fine a twin a budget allows: cells of the twin in use, and of the one that corrects it."""
+
+from __future__ import annotations
+
+import math
+
+from torchsoro.sim2real.data.experiment import Setup
+from torchsoro.sim2real.twin.ensemble import safety
+from torchsoro.sim2real.twin.twin import Twin
+
+SPEED = 6e7  # points times variations times time steps that one thread simulates in a second, about
+CORES = 2  # processor cores that a budget is stated for, wherever it is spent, so that the twin is the same everywhere
+WALLS = 1  # cells through each wall, at least: a cell can bend by itself
+SIMULATIONS = 400  # of each trial, that an explanation takes, about
+SLOW = 64.0  # reserve of the budget for searches that go on for long, and for slow machines
+SLOW_WITH_PLANES = 24.0  # the same of a body that meets planes, where sliding makes a fine twin worth the time
+# Cells along an axis of the twin that corrects, over those of the twin in use: the first that its time allows.
+FINER = (2.0, 1.5)
+
+
+def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
+    """Seconds that an explanation takes on two cores, about."""
+    s = twin.setup
+    speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
+    factor = math.sqrt(1 + sum(g for g, _ in s.prony) / 2)
+    steep = math.sqrt(max(a.steep for a in twin.grid.axes))
+    steps = s.duration * steep * speed * factor / (2 * safety(twin.grid))
+    return twin.count * steps * trials * simulations / SPEED / CORES
+
+
+def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS) -> Twin:
+    """The finest twin with which an explanation takes about the budget.
+
+    Args:
+        setup: Of the experiment.
+        trials: To simulate.
+        budget: On two cores [s].
+        walls: Cells through each wall, at least.
+
+    Raises:
+        ValueError: if the coarsest takes more than three times the budget.
+    """
+    thin, long = min(setup.size), max(setup.size)
+    chambers = bool(setup.cavities)
+    edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
+    twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
+    for twin in twins:
+        if cost(twin, trials) <= budget / (SLOW_WITH_PLANES if setup.planes else SLOW):
+            return twin
+    needed = cost(twins[-1], trials)
+    if needed > 3 * budget:
+        raise ValueError(
+            f"budget: {budget / 60:.3g} minutes, wanted {needed / 60:.3g} or more: a twin with {walls} cells "
+            "through each wall takes as long; a coarser one would be further from the truth than what is to be found"
+        )
+    return twins[-1]
+
+
+def finer(twin: Twin, trials: int, seconds: float) -> Twin:
+    """A twin with smaller cells, that simulates trials once in about so long.
+
+    Args:
+        twin: The one in use.
+        trials: To simulate.
+        seconds: On one thread; the least fine of those thought of takes as long as it takes.
+    """
+    least = min(a.cells for a in twin.grid.axes)
+    for share in FINER:
+        walls, across = math.ceil(share * twin.walls), math.ceil(share * least)
+        fine = Twin(twin.setup, edge=twin.edge / share, walls=walls, across=across)
+        # A group of lanes takes as long with one trial as with sixteen.
+        if cost(fine, trials, 16 / trials * CORES) <= seconds:
+            break
+    return fine

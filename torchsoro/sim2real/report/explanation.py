@@ -1,0 +1,204 @@
+"""An explanation: what was found, and as the content of ``explanation.json``."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from torchsoro.sim2real.inference.discretization import DiscretizationError
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.force_map import ForceMap
+from torchsoro.sim2real.inference.heldout import Prediction
+from torchsoro.sim2real.inference.isolability import Isolability
+from torchsoro.sim2real.inference.next_experiment import Proposal
+from torchsoro.sim2real.inference.phases import Mismatch
+from torchsoro.sim2real.inference.ranking import correlation
+from torchsoro.sim2real.inference.verdict import Verdict
+
+LEVEL = 0.9
+PLACE = 0.07  # of the body's size, that a place may be off, as ``Hypothesis.form`` of a parameter
+BROKEN = 1e3  # error on trials left out over that without an effect, where that breaks down: JSON knows no infinity
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Explanation:
+    """All that was found out about an experiment.
+
+    Attributes:
+        problem: Recordings and twin.
+        numerics: The twin's own error.
+        verdict: What can be said.
+        before: All trials as believed, those that were fitted first.
+        after: The same with the best effect, or with nothing where nothing is missing.
+        heldout: Names of the trials that were only predicted.
+        seconds: It took.
+        isolability: What the experiment can tell, if that was asked.
+        following: What could be recorded next, best first, where effects are not told apart.
+        mismatches: Where and when each trial and its simulation part.
+        forces: That would be needed where no effect fits.
+    """
+
+    problem: FitProblem
+    discretization: DiscretizationError
+    verdict: Verdict
+    before: tuple[Prediction, ...]
+    after: tuple[Prediction, ...]
+    heldout: tuple[str, ...]
+    seconds: float
+    isolability: Isolability | None = None
+    following: tuple[Proposal, ...] = ()
+    mismatches: tuple[Mismatch, ...] = ()
+    forces: ForceMap | None = None
+
+    @property
+    def best(self) -> Fit:
+        """The fit that is shown: of the best effect, or of nothing."""
+        return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.null_model
+
+
+def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, Any]]:
+    """The effects of a fit, as in explanation.json; intervals by the law of errors, within bounds."""
+    wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
+    spread, size = max(1.0, fit.chi2 / fit.samples) * correlation(fit), np.array(problem.twin.setup.size)
+    for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
+        count = len(effect.quantities)
+        scenario = next(s for s in problem.scenarios if effect.applies(s, problem.twin))
+        logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
+        own = np.where(logarithm, 1.0, values[:count])
+        whole = spread * covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)
+        steps = 1e-4 * np.array([q.scale for q in effect.quantities])
+        told = effect.reported(values[:count], scenario)
+        ahead = [effect.reported(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
+        parameters = {}
+        for name, (value, unit) in told.items():
+            slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
+            half = wide * math.sqrt(max(float(slope @ whole @ slope), 0.0))
+            parameters[name] = {"value": value, "low": value - half, "high": value + half, "unit": unit}
+            for quantity in effect.quantities:
+                if quantity.name == name:
+                    parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
+        place = effect.place(values, problem.twin)
+        within = wide * np.sqrt(spread * np.diag(covariance)[count:] + (PLACE * size[: 3 * effect.local]) ** 2)
+        rows.append(
+            {
+                "name": effect.name,
+                "parameters": parameters,
+                "confidence": weight,
+                "location_m": None if place is None else [float(v) for v in place],
+                "location_within_m": [float(v) for v in within] or None,
+                "time_window_s": None,
+            }
+        )
+    return rows
+
+
+def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The content of explanation.json."""
+    v, problem = e.verdict, e.problem
+    scores = np.array([c.score for c in v.chosen])
+    weights = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum() if len(scores) else scores
+    names = [m.name for m in problem.experiment.setup.markers]
+
+    def errors(predictions: Sequence[Prediction]) -> dict[str, Any]:
+        return {p.trial: {"all": p.total, **dict(zip(names, map(float, p.error), strict=True))} for p in predictions}
+
+    return {
+        "verdict": v.kind,
+        "effects": effect_rows(v.chosen[0].fit, float(weights[0]), problem) if v.chosen else [],
+        "set": [c.fit.name for c in v.chosen],
+        "ranking": [
+            {
+                "name": c.fit.name,
+                "score": c.score,
+                "explained": c.explained,
+                "misfit": c.fit.chi2,
+                "samples": c.fit.samples,
+                "unknowns": c.fit.unknowns,
+                "gain": c.gain,
+                "alike": correlation(c.fit),
+                "heldout_over_nothing": None if math.isnan(c.heldout_ratio) else min(c.heldout_ratio, BROKEN),
+                "effects": effect_rows(c.fit, 0.0, problem),
+            }
+            for c in v.ranking
+        ],
+        "noise": {
+            "standard_deviation_m": problem.noise,
+            "numerics_m": {
+                t.name: float(np.sqrt((n**2).mean()))
+                for t, n in zip(problem.trials, problem.discretization, strict=True)
+            },
+            "edges_m": list(e.discretization.edges),
+            "cells_through_thinnest_wall": list(e.discretization.walls),
+            "excess": v.excess,
+            "nothing": {
+                "misfit": v.null_model.chi2,
+                "samples": v.null_model.samples,
+                "alike": correlation(v.null_model),
+            },
+        },
+        "nuisance": {
+            "ln_modulus": float(e.best.ln_factors[0]),
+            **({"ln_pressure": float(e.best.ln_factors[1])} if len(e.best.ln_factors) > 1 else {}),
+            **dict(zip(problem.observation.names, map(float, e.best.errors), strict=True)),
+        },
+        "error_before": errors(e.before),
+        "error_after": errors(e.after),
+        "mismatch": {m.trial: _parted(m) for m in e.mismatches},
+        "force_map": None if e.forces is None else _needed(e.forces),
+        "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
+        "isolability": None if e.isolability is None else e.isolability.as_json(),
+        "next": [{"record": p.words, "alike": p.alike, "distance": p.distance} for p in e.following],
+        "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
+        "version": version("torchsoro"),
+        "settings": dict(settings),
+    }
+
+
+def _parted(m: Mismatch) -> dict[str, Any]:
+    """A trial's mismatch, as in explanation.json; in units of what noise and numerics explain."""
+
+    def numbers(row: np.ndarray) -> dict[str, float | None]:
+        return {name: None if math.isnan(v) else float(v) for name, v in zip(m.markers, row, strict=True)}
+
+    return {
+        "starts_s": m.start,
+        "phase": None if m.phase is None else m.phase.name,
+        "worst_marker": m.marker,
+        "phases": [
+            {"name": p.name, "start_s": p.start, "end_s": p.end, "before": numbers(b), "after": numbers(a)}
+            for p, b, a in zip(m.phases, m.by_phase(), m.by_phase(after=True), strict=True)
+        ],
+    }
+
+
+def _needed(f: ForceMap) -> dict[str, Any]:
+    """A force map, as in explanation.json; no deviation where a patch was not needed."""
+    deviations = f.deviations.astype(object)
+    deviations[~np.isfinite(f.deviations)] = None
+    return {
+        "trials": list(f.trials),
+        "places_m": f.places.tolist(),
+        "windows_s": f.windows.tolist(),
+        "forces_n": f.forces.tolist(),
+        "deviations_n": deviations.tolist(),
+        "misfit_of_each_place": f.chi2s.tolist(),
+        "share": f.share,
+        "simulated_share": f.simulated,
+        "needed": [
+            {
+                "trial": n.trial,
+                "place_m": n.place.tolist(),
+                "force_n": n.force.tolist(),
+                "start_s": n.start,
+                "end_s": n.end,
+            }
+            for n in f.needed
+        ],
+        "words": str(f),
+    }
