@@ -11,13 +11,13 @@ Every number of the settings can be overridden: --help lists them. The loop is `
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import CLIMBER
+from torchsoro.design.reading import from_command_line
 from torchsoro.design.robot import climber
-from torchsoro.design.settings import Settings, from_command_line
+from torchsoro.design.settings import Settings
 from torchsoro.output.delivery import design, report
 
 
@@ -29,8 +29,13 @@ def main(settings: Settings) -> dict[str, float]:
 
     Returns:
         See :func:`torchsoro.output.delivery.design`.
+
+    Raises:
+        ValueError: for the settings of another robot.
     """
-    return design(climber(dataclasses.replace(settings, robot="climber")), "climber")
+    if settings.robot != "climber":
+        raise ValueError(f"robot = {settings.robot!r}: wanted 'climber'; recipes/walker.py designs a walker")
+    return design(climber(settings), "climber")
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:

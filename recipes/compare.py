@@ -25,10 +25,11 @@ import tyro
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.objective import mean_stride
+from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Outcome, Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
-from torchsoro.output.archive import find, kept_iterations, load_design, load_shape, read_settings
+from torchsoro.output.archive import find, kept_iterations, load_design, load_shape
 from torchsoro.storage import atomic_write
 
 LONG = 2.0  # s of actuation, where a robot is watched for an extended time

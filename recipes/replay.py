@@ -21,6 +21,7 @@ import torch
 import tyro
 
 from torchsoro.command_line import plain_errors
+from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.output import archive
 from torchsoro.output.delivery import show
@@ -64,7 +65,7 @@ def main(options: Options) -> dict[str, float]:
     if options.archive is not None:
         if options.name in ("", "..") or Path(options.name).name != options.name:
             raise ValueError(f"name = {options.name!r}: wanted a plain name to keep {options.archive} under")
-        domain = build(archive.read_settings(options.archive / "settings.json", device="cpu")).domain
+        domain = build(read_settings(options.archive / "settings.json", device="cpu")).domain
         archive.archive(options.archive, archive.DESIGNS / options.name, domain, KEPT)
         print(f"kept as {archive.DESIGNS / options.name}")
         return {}
@@ -74,7 +75,7 @@ def main(options: Options) -> dict[str, float]:
     begin = time.perf_counter()
     folder = archive.find(options.robot)
     designed = archive.read_result(folder)
-    base = archive.read_settings(folder / "settings.json", device=options.device, frames=options.frames)
+    base = read_settings(folder / "settings.json", device=options.device, frames=options.frames)
     duration = round(options.cycles / base.frequency / base.sample_every) * base.sample_every
     settle = options.settle if base.settle > 0 else 0.0
     robot = build(dataclasses.replace(base, duration=duration, settle=settle))

@@ -12,13 +12,13 @@ Every number of the settings can be overridden: --help lists them. The loop is `
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import WALKER
+from torchsoro.design.reading import from_command_line
 from torchsoro.design.robot import walker
-from torchsoro.design.settings import Settings, from_command_line
+from torchsoro.design.settings import Settings
 from torchsoro.output.delivery import design, report
 
 
@@ -30,8 +30,13 @@ def main(settings: Settings) -> dict[str, float]:
 
     Returns:
         See :func:`torchsoro.output.delivery.design`.
+
+    Raises:
+        ValueError: for the settings of another robot.
     """
-    return design(walker(dataclasses.replace(settings, robot="walker")), "walker")
+    if settings.robot != "walker":
+        raise ValueError(f"robot = {settings.robot!r}: wanted 'walker'; recipes/climber.py designs a climber")
+    return design(walker(settings), "walker")
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:

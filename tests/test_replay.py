@@ -15,9 +15,10 @@ import trimesh
 from tiny import TINY
 
 from torchsoro.design.objective import intermediate_density
+from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Robot, build
 from torchsoro.output import archive
-from torchsoro.output.archive import DESIGNS, load_design, load_shape, read_settings
+from torchsoro.output.archive import DESIGNS, load_design, load_shape
 from torchsoro.output.delivery import print_part
 
 

@@ -145,7 +145,7 @@ def test_the_actuation_starts_after_settling(tmp_path):
     assert modelled.at(torch.tensor([0.0, 0.0099, 0.012], dtype=torch.float64)).tolist()[:2] == [0, 0]
     assert 0.5 < float(modelled.at(torch.tensor([0.012], dtype=torch.float64))) / TINY.pressure < 0.7  # 1 - 1/e
     file = tmp_path / "measured.csv"
-    file.write_text("time_s,pressure_pa\n3.0,0\n3.01,50e3\n3.02,10e3\n")
+    file.write_text("time_s,pressure_pa\n0,0\n0.01,50e3\n0.02,10e3\n")
     measured = walker(tiny(pressure_file=file)).pressure
     assert measured.time.tolist() == pytest.approx([0.01, 0.02, 0.03])
     assert measured.pressure.tolist() == [0, 50e3, 10e3]
@@ -202,7 +202,7 @@ def test_a_simulation_that_diverges_is_tried_again_with_half_the_step(monkeypatc
         ({"power": -3.0}, "power = -3.0"),
         ({"friction": -0.1}, "friction = -0.1"),
         ({"dt": 1e-3}, r"dt = 0.001 s: above the limit of about 0.000\d+ s, set by \w+"),
-        ({"wall": 0.0}, "a chamber without wall"),
+        ({"wall": 0.0}, "wall = 0.0"),
         ({"wall": 0.003}, "wall face"),
         ({"chamber": (0.04375,) * 3}, "leaves the body"),
         ({"particles": (8, 8, 9)}, "particles"),
@@ -224,6 +224,9 @@ def test_settings_that_do_not_fit_are_refused_before_any_simulation(changes, mes
         (None, "existing CSV file"),
         ("time_s,bar\n0,0\n1,1\n", "pressure_pa"),
         ("time_s,pressure_pa\n0,0\n1,1\n0.5,2\n", "line 4.*increasing"),
+        ("time_s,pressure_pa\n0,0\n0.01,5e4\n", r"measured.csv: from 0 to 0.01 s, wanted .* duration of 0.02 s"),
+        ("time_s,pressure_pa\n3,0\n3.03,5e4\n", r"measured.csv: from 3 to 3.03 s, wanted .* at 0"),
+        ("time_s,pressure_pa\n0,0\n0.03,50\n", r"measured.csv, largest = 50 Pa: wanted from 440 to .* 80 kPa is 80000"),
     ],
 )
 def test_a_bad_pressure_file_is_refused_before_any_simulation(text, message, tmp_path):

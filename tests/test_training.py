@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,7 @@ def test_settings_must_be_a_mapping(tmp_path):
 
 def test_an_existing_run_is_not_overwritten(tmp_path):
     RunFolder(tmp_path, SETTINGS).close()
-    with pytest.raises(ValueError, match="already holds a run; resume it, or choose another folder"):
+    with pytest.raises(ValueError, match=r"already holds a run; resume it .*, start again in it .*, or choose another"):
         RunFolder(tmp_path, SETTINGS)
 
 
@@ -178,10 +179,21 @@ def test_nothing_to_resume_is_refused(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_file_in_place_of_the_folder_is_refused(tmp_path):
+@pytest.mark.parametrize("below", ["", "a/b"])
+def test_a_folder_that_is_a_file_or_lies_under_one_is_refused(tmp_path, below):
     (tmp_path / "run").write_text("")
-    with pytest.raises(ValueError, match="is a file, wanted a folder"):
+    with pytest.raises(ValueError, match=r"out = .*run.* is a file, wanted a folder"):
+        RunFolder(tmp_path / "run" / below, SETTINGS)
+
+
+def test_a_folder_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
+    def refuse(**_: Any) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", refuse)
+    with pytest.raises(ValueError, match=r"out = .*: not writable \(Permission denied\)"):
         RunFolder(tmp_path / "run", SETTINGS)
+    assert not list(tmp_path.iterdir())
 
 
 def test_other_settings_are_refused_with_both_values(tmp_path):
@@ -269,7 +281,11 @@ def test_a_checkpoint_of_other_settings_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("file", "content"),
-    [("settings.json", b"{"), ("checkpoint.pt", b"broken"), ("checkpoint.pt", b""), ("metrics.csv", b"iteration\nx\n")],
+    [
+        *[("settings.json", bad) for bad in (b"{", b"[1]", b"\xff")],
+        *[("checkpoint.pt", bad) for bad in (b"broken", b"")],
+        *[("metrics.csv", bad) for bad in (b"iteration\nx\n", b"\xff\xfe\n")],
+    ],
 )
 def test_damaged_files_are_named(tmp_path, file, content):
     with RunFolder(tmp_path, SETTINGS) as run:
@@ -279,11 +295,79 @@ def test_damaged_files_are_named(tmp_path, file, content):
         RunFolder(tmp_path, SETTINGS, resume=True)
 
 
-def test_a_foreign_checkpoint_is_named(tmp_path):
-    RunFolder(tmp_path, SETTINGS).close()
-    torch.save({"weights": torch.zeros(2)}, tmp_path / "checkpoint.pt")
-    with pytest.raises(ValueError, match="not a checkpoint of a run"):
+class Foreign:
+    """Something that torch would unpickle only without its safeguard."""
+
+
+@pytest.mark.parametrize(
+    ("payload", "seen"),
+    [
+        ({"weights": torch.zeros(2)}, "it lacks iteration, settings, rng_cpu"),
+        ([1, 2], "it holds a list"),
+        ({"iteration": 1, "items": Foreign()}, "more than tensors, numbers, text"),
+    ],
+)
+def test_a_checkpoint_of_something_else_is_refused_without_advice_to_load_it_unsafely(tmp_path, payload, seen):
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.save(0)
+    torch.save(payload, tmp_path / "checkpoint.pt")
+    with pytest.raises(ValueError, match=rf"checkpoint\.pt is not a checkpoint of a run: .*{seen}") as error:
         RunFolder(tmp_path, SETTINGS, resume=True)
+    assert "weights_only" not in str(error.value)
+
+
+def test_a_flipped_bit_of_a_checkpoint_is_refused_or_changes_nothing(tmp_path):
+    field = torch.rand(400)
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.log(0, {"mass": 1.0})
+        run.save(0, field=field)
+        path = tmp_path / "checkpoint.pt"
+        whole, refused = path.read_bytes(), 0
+        at = whole.index(field.numpy().tobytes()) + 40
+        for place in (at, *range(0, len(whole), 101)):
+            path.write_bytes(whole[:place] + bytes([whole[place] ^ 4]) + whole[place + 1 :])
+            try:
+                assert torch.equal(run.load()["field"], field), place
+            except ValueError as error:
+                refused += 1
+                assert "checkpoint.pt is" in str(error)
+    assert refused > 5
+
+
+def test_a_run_that_fails_before_its_first_checkpoint_leaves_the_folder_as_it_was(tmp_path, at_once):
+    (tmp_path / "held").mkdir()
+    (tmp_path / "held" / "note.txt").write_text("mine")
+    for name in ("new", "held"):
+        for error in (RuntimeError, KeyboardInterrupt):
+            with pytest.raises(error), RunFolder(tmp_path / name, SETTINGS) as run:
+                run.log(0, {"mass": 1.0})
+                raise error
+    assert not (tmp_path / "new").exists()
+    assert [file.name for file in (tmp_path / "held").iterdir()] == ["note.txt"]
+    RunFolder(tmp_path / "held", {**SETTINGS, "seed": 2}).close()
+
+
+def test_a_run_that_fails_after_a_checkpoint_keeps_it(tmp_path):
+    with pytest.raises(RuntimeError), RunFolder(tmp_path, SETTINGS) as run:
+        run.log(0, {"mass": 1.0})
+        run.save(0)
+        raise RuntimeError
+    assert RunFolder(tmp_path, SETTINGS, resume=True).start == 1
+
+
+def test_overwrite_deletes_the_files_of_the_run_and_no_others(tmp_path, at_once):
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.log(0, {"mass": 1.0})
+        run.save(0)
+    (tmp_path / "shapes").mkdir()
+    for name in ("design.npz", "walker.mp4", "other.mp4", "shapes/00000.npz", "note.txt"):
+        (tmp_path / name).write_text("held")
+    with RunFolder(tmp_path, {**SETTINGS, "seed": 2}, overwrite=True) as run:
+        assert run.start == 0 and run.metrics == {"iteration": []}
+        run.save(0)
+    left = {file.name for file in tmp_path.iterdir() if "tfevents" not in file.name}
+    assert left == {"settings.json", "metrics.csv", "checkpoint.pt", "shapes", "other.mp4", "note.txt"}
+    assert len(list(tmp_path.glob("*tfevents*"))) == 1 and not list((tmp_path / "shapes").iterdir())
 
 
 def test_a_half_written_last_row_is_dropped(tmp_path):
@@ -299,14 +383,17 @@ def test_a_half_written_last_row_is_dropped(tmp_path):
     assert table.read_text() == whole
 
 
-def test_a_deleted_table_starts_again(tmp_path):
+@pytest.mark.parametrize(("left", "seen"), [(None, "is missing"), (1, "ends with iteration 0")])
+def test_metrics_that_lack_iterations_of_the_checkpoint_are_refused_on_resume(tmp_path, left, seen):
     with RunFolder(tmp_path, SETTINGS) as run:
-        run.log(0, {"mass": 1.0})
-        run.save(0)
-    (tmp_path / "metrics.csv").unlink()
-    with RunFolder(tmp_path, SETTINGS, resume=True) as run:
-        run.log(1, {"mass": 2.0})
-        assert run.metrics == {"iteration": [1], "mass": [2.0]}
+        for iteration in range(3):
+            run.log(iteration, {"mass": 1.0})
+            run.save(iteration)
+    table = tmp_path / "metrics.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.unlink() if left is None else table.write_text("".join(lines[: 1 + left]))
+    with pytest.raises(ValueError, match=rf"metrics\.csv {seen}, wanted all up to 2"):
+        RunFolder(tmp_path, SETTINGS, resume=True)
 
 
 def test_a_second_log_of_an_iteration_joins_its_row(tmp_path):

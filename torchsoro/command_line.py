@@ -1,21 +1,109 @@
-"""What every command line shares: errors told in a line."""
+"""What every command line shares: options that are checked when they are made, and errors told in a line."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator
+from typing import Annotated, Any, TypeVar, dataclass_transform
+
+import pydantic
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from torchsoro.errors import SimulationDiverged
+
+# Numbers of options. Strict: neither text nor a truth value counts as a number.
+Positive = Annotated[float, Field(strict=True, gt=0, allow_inf_nan=False)]
+AtLeastZero = Annotated[float, Field(strict=True, ge=0, allow_inf_nan=False)]
+Share = Annotated[float, Field(strict=True, gt=0, lt=1)]
+Count = Annotated[int, Field(strict=True, ge=1, le=10**6)]
+CountOrZero = Annotated[int, Field(strict=True, ge=0, le=10**6)]
+
+Options = TypeVar("Options", bound=type)
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
+def options(plain: Options) -> Options:
+    """Make a class a frozen dataclass whose values pydantic checks against their annotations.
+
+    Text below a field becomes its description. The class may check in ``__post_init__`` what concerns several fields.
+
+    Args:
+        plain: Class of annotated fields with defaults.
+
+    Returns:
+        The dataclass; making one with a value out of its range raises a ``ValueError`` that names field, value and
+        what is wanted.
+    """
+    config = pydantic.ConfigDict(extra="forbid", use_attribute_docstrings=True)
+    made: Any = dataclass(frozen=True, kw_only=True, config=config)(plain)
+    unexplained = made.__init__
+
+    @functools.wraps(unexplained)
+    def __init__(self: Any, **values: Any) -> None:
+        try:
+            unexplained(self, **values)
+        except pydantic.ValidationError as error:
+            raise ValueError(complaint(error)) from None
+
+    made.__init__ = __init__
+    return made
+
+
+def complaint(error: pydantic.ValidationError) -> str:
+    """What pydantic found, as ``name = value: wanted ...``; several faults are joined by semicolons."""
+    faults: dict[str, tuple[Any, list[str]]] = {}
+    own: list[str] = []
+    for one in error.errors(include_url=False):
+        # The place is a name and indices; branches of a union, which pydantic adds, are left out.
+        name, *inner = one["loc"] or ("",)
+        if one["type"] == "value_error" and not name:
+            own.append(str(one.get("ctx", {})["error"]))
+            continue
+        place = f"{name}{''.join(f'[{i}]' for i in inner if isinstance(i, int))}"
+        wanted = faults.setdefault(place, (one["input"], []))[1]
+        if (phrase := _wanted(one["type"], one["msg"], one.get("ctx", {}))) not in wanted:
+            wanted.append(phrase)
+    return "; ".join(
+        [*own, *(f"{name} = {value!r}: wanted {' or '.join(wanted)}" for name, (value, wanted) in faults.items())]
+    )
+
+
+def _wanted(kind: str, message: str, numbers: dict[str, Any]) -> str:
+    """What a field wants, in words."""
+    limits = {"greater_than": "gt", "greater_than_equal": "ge", "less_than": "lt", "less_than_equal": "le"}
+    words = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+    if kind in limits:
+        key = limits[kind]
+        return "finite and positive" if (key, numbers[key]) == ("gt", 0) else f"{words[key]} {numbers[key]:g}"
+    others = {
+        "finite_number": "a finite number",
+        "float_type": "a number",
+        "int_type": "a whole number",
+        "unexpected_keyword_argument": "no such name",
+        "bool_type": "true or false",
+        "tuple_type": "a list",
+        "too_long": f"{numbers.get('max_length')} values",
+        "missing": "one more value",
+    }
+    if kind == "literal_error":
+        return str(numbers["expected"])
+    return others.get(kind) or message[:1].lower() + message[1:]
 
 
 @contextlib.contextmanager
 def plain_errors() -> Iterator[None]:
-    """End the process with a line instead of a traceback: on bad input, a simulation that diverged, and Ctrl-C."""
+    """End the process with a line instead of a traceback.
+
+    Exit code 2 for bad input; 1 for a simulation that diverged, a file that cannot be read or written, and too little
+    memory; 130 for Ctrl-C.
+    """
     try:
         yield
-    except (ValueError, SimulationDiverged) as error:
-        print(f"error: {error}", file=sys.stderr)
+    except (ValueError, SimulationDiverged, OSError, MemoryError) as error:
+        print(f"error: {error or 'not enough memory'}", file=sys.stderr)
         raise SystemExit(2 if isinstance(error, ValueError) else 1) from error
     except KeyboardInterrupt:
         raise SystemExit(130) from None

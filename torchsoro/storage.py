@@ -7,9 +7,11 @@ import csv
 import dataclasses
 import enum
 import io
+import json
 import math
 import os
 import tempfile
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -154,7 +156,10 @@ def read_metrics(path: Path, start: int) -> tuple[list[str], list[dict[str, floa
     """
     if not path.exists():
         return [], []
-    text = path.read_text(encoding="utf-8")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"path: {path} is damaged ({error}); choose another folder") from error
     header, *lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1]))) or [[]]
     rows: list[dict[str, float]] = []
     for number, line in enumerate(lines, start=2):
@@ -166,6 +171,58 @@ def read_metrics(path: Path, start: int) -> tuple[list[str], list[dict[str, floa
         if iteration < start:
             rows.append({"iteration": iteration, **values})
     return header, rows
+
+
+def read_json(path: Path, kind: type) -> Any:
+    """Read a JSON file of a run.
+
+    Args:
+        path: The file.
+        kind: ``dict`` or ``list``, what it has to hold.
+
+    Raises:
+        ValueError: If it holds something else, or cannot be read.
+    """
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"path: {path} is damaged ({error}); choose another folder") from error
+    if not isinstance(found, kind):
+        seen = type(found).__name__
+        raise ValueError(f"path: {path} is damaged (holds a {seen}, wanted a {kind.__name__}); choose another folder")
+    return found
+
+
+def read_checkpoint(path: Path, parts: Mapping[str, type]) -> dict[str, Any]:
+    """Read what ``torch.save`` wrote, after a look at the checksums of the zip format, which torch passes over.
+
+    Args:
+        path: The file.
+        parts: Names and types that it has to hold.
+
+    Returns:
+        The parts, with tensors on the CPU.
+
+    Raises:
+        ValueError: If the file is damaged, lacks a part, or holds more than tensors, numbers, text and containers.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+    except Exception as error:  # a damaged archive can fail in any way
+        raise ValueError(f"path: {path} is damaged ({error}); choose another folder") from error
+    if broken is not None:
+        raise ValueError(f"path: {path} is damaged (checksum of {broken}); choose another folder")
+    foreign = f"path: {path} is not a checkpoint of a run"
+    try:
+        payload = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # not quoted: torch advises to read what is not safe to read
+        raise ValueError(f"{foreign}: it holds more than tensors, numbers, text and containers") from error
+    if not isinstance(payload, dict):
+        raise ValueError(f"{foreign}: it holds a {type(payload).__name__}")
+    if wrong := [name for name, kind in parts.items() if not isinstance(payload.get(name), kind)]:
+        raise ValueError(f"{foreign}: it lacks {', '.join(wrong)}")
+    return payload
 
 
 def plain_settings(settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -33,9 +33,10 @@ from experiment_files import Files, fresh, setup, write
 
 from torchsoro.command_line import plain_errors
 from torchsoro.design.density import without_void
+from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Robot, build
 from torchsoro.design.settings import Settings
-from torchsoro.output.archive import find, load_design, read_settings
+from torchsoro.output.archive import find, load_design
 from torchsoro.output.fabricate import surface
 from torchsoro.simulation.loads import Drag, Load, PointMass, Spring
 from torchsoro.simulation.material import Body, Prony

@@ -24,8 +24,9 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 
 from torchsoro.command_line import plain_errors
+from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
-from torchsoro.output.archive import load_design, read_settings
+from torchsoro.output.archive import load_design
 from torchsoro.output.delivery import drawn_planes
 from torchsoro.output.page import Motion, Page, curve, curve_axes, legend, motion_of, pressure_trace
 from torchsoro.output.scene import FULL, INK, REST, Camera, Scene, Shape, bounds_of

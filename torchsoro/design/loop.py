@@ -7,10 +7,12 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from torchsoro.design.field import DesignField
 from torchsoro.design.lagrangian import AugmentedLagrangian
 from torchsoro.design.robot import Outcome, Robot
 from torchsoro.design.training import RunFolder
@@ -77,6 +79,46 @@ class Optimized:
     metrics: dict[str, list[float]]
 
 
+def restore(
+    state: dict[str, Any],
+    field: DesignField,
+    adam: torch.optim.Adam,
+    lagrangian: AugmentedLagrangian,
+    path: Path,
+) -> tuple[bool, dict[str, Any] | None, torch.Tensor]:
+    """Put a checkpoint's state into field, optimizer and schedule.
+
+    Args:
+        state: As saved by :func:`optimize`.
+        field: The design field.
+        adam: The optimizer of its parameter.
+        lagrangian: The schedule.
+        path: Folder of the run, for messages.
+
+    Returns:
+        Whether the run has stopped; the best design so far; the last one that did not break down.
+
+    Raises:
+        ValueError: if a part is missing, or of another shape than the lattice.
+    """
+    where = f"path: {path / 'checkpoint.pt'}"
+    wanted = ("field", "adam", "lagrangian", "stopped", "best", "good")
+    if missing := [name for name in wanted if name not in state]:
+        raise ValueError(f"{where} lacks {', '.join(missing)}, wanted the state of a design run; start another folder")
+    try:
+        moments = [value for own in state["adam"]["state"].values() for value in own.values() if value.ndim]
+        best = state["best"]
+        designs = [state["field"]["phi"], state["good"], *moments, *([] if best is None else [best["phi"]])]
+        if wrong := [tuple(one.shape) for one in designs if one.shape != field.phi.shape]:
+            raise ValueError(f"a design of shape {wrong[0]}, wanted {tuple(field.phi.shape)}")
+        field.load_state_dict(state["field"])
+        adam.load_state_dict(state["adam"])
+        lagrangian.load_state_dict(state["lagrangian"])
+    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise ValueError(f"{where} does not fit the run ({error}); start another folder") from error
+    return bool(state["stopped"]), best, state["good"]
+
+
 def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
@@ -110,12 +152,10 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     stopped = False
     good = field.phi.detach().clone()
     best: dict[str, Any] | None = None
-    with RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, free=s.free, amend=s.amend) as run:
+    folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
+    with folder as run:
         if state := run.load():
-            field.load_state_dict(state["field"])
-            adam.load_state_dict(state["adam"])
-            lagrangian.load_state_dict(state["lagrangian"])
-            stopped, best, good = state["stopped"], state["best"], state["good"]
+            stopped, best, good = restore(state, field, adam, lagrangian, run.path)
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             gamma, outcome = simulate(robot, good, s.gravity_scale(k))
@@ -128,7 +168,15 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             loss.backward()
             if not fell(robot, outcome):
                 good = field.phi.detach().clone()
-            norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf, error_if_nonfinite=True)
+            norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
+            if not bool(norm.isfinite()):
+                raise SimulationDiverged(
+                    step=0,
+                    time=0.0,
+                    particle=None,
+                    quantity=f"gradient of norm {float(norm)} in iteration {k}",
+                    remedy="a smaller step (dt), a lower pressure, or smaller weights (penalty, upright)",
+                )
             if s.gravity_scale(k) == 1.0 and better(worth.item(), violation.item(), best, lagrangian):
                 best = {
                     "iteration": k,

@@ -12,7 +12,7 @@ from torchsoro.design.density import AIR, fill, without_void
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
-from torchsoro.design.settings import Settings
+from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 from torchsoro.simulation.contact import Plane, ground
@@ -67,6 +67,7 @@ class Robot(nn.Module):
     ) -> None:
         super().__init__()
         s = self.settings = settings
+        s.check_memory()
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
         center = (0.0, 0.0, s.size[2] / 2)
@@ -86,7 +87,7 @@ class Robot(nn.Module):
         if s.material is not None:
             found = read_material(s.material)
             self.solid, self.prony = found.solid, found.prony
-        self.pressure = _pressure(s)
+        self.pressure = _pressure(s, self.solid.youngs_modulus)
         angle = math.atan(s.slope)
         # Uphill along +x, with the ground kept level: gravity leans back instead.
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
@@ -94,7 +95,7 @@ class Robot(nn.Module):
         self.wall = self.domain.wall.to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
-        self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every)
+        s.check_memory(self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every))
 
     def forward(
         self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False, void: bool = True
@@ -220,9 +221,11 @@ def climber(settings: Settings) -> Robot:
     return Robot(settings, planes=planes, direction=(0.0, 0.0, 1.0), symmetry=("x", "y"))
 
 
-def _pressure(s: Settings) -> Waveform:
+def _pressure(s: Settings, modulus: float) -> Waveform:
     """Gauge pressure from the start of the simulation: at rest while it settles, then measured or modelled."""
     if s.pressure_file is None:
+        if s.material is not None:
+            check_pressure("pressure", s.pressure, modulus)
         return square_wave(
             amplitude=s.pressure,
             frequency=s.frequency,
@@ -233,4 +236,11 @@ def _pressure(s: Settings) -> Waveform:
             end=s.settle + s.duration,
         )
     measured = read_pressure_csv(s.pressure_file)
+    begin, end = float(measured.time[0]), float(measured.time[-1])
+    if abs(begin) > s.sample_every or end < s.duration - s.sample_every:
+        raise ValueError(
+            f"pressure_file = {s.pressure_file}: from {begin:g} to {end:g} s, wanted times that begin with the "
+            f"actuation, at 0, and last for its duration of {s.duration:g} s"
+        )
+    check_pressure(f"pressure_file = {s.pressure_file}, largest", float(measured.pressure.abs().max()), modulus)
     return Waveform(time=measured.time - measured.time[0] + s.settle, pressure=measured.pressure)

@@ -1,20 +1,30 @@
-"""Every number of a design run in one place, and the command line that is made of it."""
+"""Every number of a design run in one place, checked one by one and together."""
 
 from __future__ import annotations
 
-import argparse
-import dataclasses
 import math
-import re
-from collections.abc import Mapping, Sequence
+import os
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
-import tyro
+from pydantic import Field
+
+from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options
+
+_SOFTEST = 1e3  # Pa; below the softest gels, so that a smaller modulus is one in another unit
+_STEEPEST = 2.0  # rise over run, 63 degrees; a larger slope is one in percent or degrees
+_LEAST_STRAIN = 1e-3  # pressure over modulus, below which nothing moves that could be seen
+_LEAST_SAMPLES = 2  # of a cycle
+# Memory of a run, for an estimate [bytes]: of a particle (state, density filter, fields), of a recorded position and
+# velocity and what is drawn from them, of a substep (times, pressure, gravity).
+_PARTICLE, _FRAME, _STEP = 1024, 48, 64
+
+_Length = Annotated[float, Field(strict=True, ge=1e-6, le=1e3)]
+_Density = Annotated[float, Field(strict=True, ge=0, le=1)]
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@options
 class Settings:
     """Settings of a design run; SI units, z up. The defaults are the paper's walker."""
 
@@ -26,156 +36,203 @@ class Settings:
     """Folder of the run."""
     resume: bool = False
     """Continue the run in the folder."""
+    overwrite: bool = False
+    """Start again in a folder that holds a run, whose files are deleted."""
     amend: bool = False
     """Let settings differ from the run's on resume; what changed, and when, is noted in ``amendments.json``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
-    iterations: int = 400
+    iterations: Count = 400
     """Most iterations; the stopping rule may end earlier."""
 
-    size: tuple[float, float, float] = (0.035, 0.035, 0.035)
+    size: tuple[_Length, _Length, _Length] = (0.035, 0.035, 0.035)
     """Edges of the body [m]."""
-    particles: tuple[int, int, int] = (40, 40, 40)
+    particles: tuple[Count, Count, Count] = (40, 40, 40)
     """Particles along the edges; a grid cell is two particle spacings."""
-    chamber: tuple[float, float, float] = (0.0175, 0.0175, 0.0175)
+    chamber: tuple[_Length, _Length, _Length] = (0.0175, 0.0175, 0.0175)
     """Outer edges of the air chamber in the middle [m]."""
-    wall: float = 0.00175
+    wall: _Length = 0.00175
     """Thickness of the chamber wall [m]."""
-    room: float = 0.07
+    room: AtLeastZero = 0.07
     """Space around the body in the analysis box [m]."""
 
-    youngs_modulus: float = 0.44e6
+    youngs_modulus: Annotated[float, Field(strict=True, gt=0, le=1e12)] = 0.44e6
     """Equilibrium Young's modulus [Pa]."""
-    poisson_ratio: float = 0.4
+    poisson_ratio: Annotated[float, Field(strict=True, ge=0, lt=0.5)] = 0.4
     """Poisson ratio."""
-    density: float = 1070.0
+    density: Annotated[float, Field(strict=True, ge=1, le=1e5)] = 1070.0
     """Density of the solid [kg/m3]."""
-    elements: int = 3
+    elements: Annotated[int, Field(strict=True, ge=0, le=5)] = 3
     """Maxwell elements of the paper's Table S1, 0 to 5."""
     material: Path | None = None
     """Another solid instead, Maxwell elements and all: a material.toml, as recipes/material.py writes."""
-    epsilon: float = 1e-5
+    epsilon: Share = 1e-5
     """What the void keeps of the solid's mass and stiffness."""
-    power: float = 3.0
+    power: Positive = 3.0
     """Exponent of the interpolation between void and solid."""
-    air_stiffness: float = 0.14e6
+    air_stiffness: AtLeastZero = 0.14e6
     """Air spring of the chamber [Pa]; 0 for a regulated supply."""
-    air_viscosity: float = 1.83e-5
+    air_viscosity: AtLeastZero = 1.83e-5
     """Shear viscosity of the air [Pa s]."""
-    air_density: float | Literal["auto"] = "auto"
+    air_density: Positive | Literal["auto"] = "auto"
     """Density of the air [kg/m3]; auto: 3, but in the updated formulation the paper's 100, artificially high."""
 
-    pressure: float = 80e3
+    pressure: Positive = 80e3
     """Supply pressure while the valve is open [Pa]."""
-    frequency: float = 5.0
+    frequency: Positive = 5.0
     """Cycles per second [Hz]."""
-    duty: float = 0.5
+    duty: Share = 0.5
     """Part of a cycle with the valve open."""
-    rise: float = 0.015
+    rise: Positive = 0.015
     """Time constant of filling [s]."""
-    fall: float = 0.025
+    fall: Positive = 0.025
     """Time constant of venting [s]."""
     pressure_file: Path | None = None
     """Measured pressure instead: CSV with columns time_s and pressure_pa, from the start of the actuation."""
 
-    gravity: float = 9.8
+    gravity: AtLeastZero = 9.8
     """[m/s2]."""
-    slope: float = 0.0
+    slope: AtLeastZero = 0.0
     """Uphill slope as a fraction: 0.3 is 30 %."""
-    friction: Literal["stick"] | float = "stick"
+    friction: Literal["stick"] | AtLeastZero = "stick"
     """Ground and walls hold what is pressed on them, or a Coulomb coefficient."""
-    wall_distance: float = 0.035
+    wall_distance: _Length = 0.035
     """Distance between the climber's walls [m]."""
-    gravity_steps: int = 0
+    gravity_steps: CountOrZero = 0
     """Raise gravity from zero in so many steps (the climber's continuation); 0 for full gravity from the start."""
-    gravity_every: int = 20
+    gravity_every: Count = 20
     """Iterations between two steps of gravity."""
 
-    dt: float | Literal["auto"] = "auto"
+    dt: Positive | Literal["auto"] = "auto"
     """Substep [s]; auto takes the largest that is stable. The paper's is 1e-5."""
-    halvings: int = 2
+    halvings: Annotated[int, Field(strict=True, ge=0, le=10)] = 2
     """How often a design on which the simulation breaks down is tried again with half the substep."""
-    settle: float = 0.25
+    settle: AtLeastZero = 0.25
     """Time before the actuation starts, to come to rest [s]."""
-    duration: float = 0.5
+    duration: Positive = 0.5
     """Time of actuation [s]."""
-    sample_every: float = 0.0025
+    sample_every: Positive = 0.0025
     """Time between two recorded samples [s]."""
     formulation: Literal["total", "updated"] = "total"
     """Total-Lagrangian, several times faster and without losses; or updated MLS-MPM, the paper's."""
     transfer: Literal["apic", "flip"] = "apic"
     """Transfer between particles and grid, of the updated formulation."""
-    void_range: tuple[float, float] = (0.1, 0.3)
+    void_range: tuple[_Density, _Density] = (0.1, 0.3)
     """Densities between which stress goes over from a law of void, which stands being crushed, to the solid's."""
-    memory: float = 0.0
+    memory: AtLeastZero = 0.0
     """Memory for the gradient [GiB]; 0 for 2 on a CPU and 16 on a GPU."""
 
-    filter_radius: float = 0.00525
+    filter_radius: _Length = 0.00525
     """Radius of the density filter [m]."""
-    beta: float = 8.0
+    beta: Positive = 8.0
     """Sharpness of the projection."""
     counted: Literal["design", "body"] = "design"
     """Whose centre of gravity travels: the design domain's (the paper's) or the chamber wall's, too."""
-    upright: float = 0.0
+    upright: AtLeastZero = 0.0
     """Weight of falling over against travel; 0 in the paper, whose longer runs punish a fall by themselves."""
-    sink: float = 0.02
+    sink: AtLeastZero = 0.02
     """What the centre of gravity may sink before it counts as falling, in heights of the body."""
-    learning_rate: float = 0.02
+    learning_rate: Positive = 0.02
     """Of Adam."""
-    clip: float = 3.0
+    clip: AtLeastZero = 3.0
     """Largest norm of the gradient; 0 for any. A tumble has one of hundreds, which Adam would remember for long."""
-    c_max: float = 0.0125
+    c_max: Annotated[float, Field(strict=True, gt=0, lt=0.25)] = 0.0125
     """Largest allowed intermediate density C."""
-    penalty: float = 1e-3
+    penalty: Positive = 1e-3
     """First penalty on C."""
-    growth: float = 10.0
+    growth: Annotated[float, Field(strict=True, gt=1, allow_inf_nan=False)] = 10.0
     """Factor by which the penalty grows at a plateau."""
-    window: int = 4
+    window: Count = 4
     """Iterations in each mean of the plateau and stopping rule."""
-    tolerance: float = 1e-3
+    tolerance: Positive = 1e-3
     """Relative change of the mean loss that counts as a plateau."""
-    patience: int = 0
+    patience: CountOrZero = 0
     """Iterations after which the penalty grows without a plateau, too, while C is above its limit; 0: never."""
-    picture_every: int = 5
+    picture_every: Count = 5
     """Iterations between two pictures in TensorBoard."""
-    shape_every: int = 10
+    shape_every: Count = 10
     """Iterations between two designs that are kept in the folder's shapes."""
-    frames: int = 60
+    frames: Count = 60
     """Pictures in the movie."""
-    offset: float = 0.0
+    offset: AtLeastZero = 0.0
     """Thickness added to the outer surface of the printed part [m]."""
-    port: float = 0.0
+    port: AtLeastZero = 0.0
     """Diameter of the air port [m]; 0 for two fifths of the cavity's edge."""
 
     def __post_init__(self) -> None:
-        """Refuse what no module checks by itself."""
-        for name in ("upright", "sink", "gravity", "slope", "settle", "room", "memory", "offset", "port", "clip"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} = {value}: wanted finite and at least 0")
-        for name in ("duration", "frequency", "learning_rate", "wall_distance", "dt", "pressure", "sample_every"):
-            value = getattr(self, name)
-            if value != "auto" and not (math.isfinite(value) and value > 0):
-                raise ValueError(f"{name} = {value}: wanted finite and positive")
+        """Refuse values that do not fit together, and such that are most likely in another unit."""
+        self._check_units()
+        self._check_times()
+        if not self.void_range[0] < self.void_range[1]:
+            raise ValueError(f"void_range = {self.void_range}: wanted two increasing densities from 0 to 1")
+        if self.offset > 0.25 * min(self.size):
+            raise ValueError(
+                f"offset = {self.offset:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
+            )
+        cavity = min(self.chamber) - 2 * self.wall
+        if self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
+            low = 0.05 * cavity
+            raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
+        for flags in (("resume", "overwrite"), ("amend", "overwrite")):
+            if all(getattr(self, flag) for flag in flags):
+                raise ValueError(f"{' and '.join(flags)}: wanted one of them, to go on with a run or to start again")
+        if self.device == "cuda" and not torch.cuda.is_available():
+            raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
+
+    def _check_units(self) -> None:
+        """Refuse what is far from any elastomer and any slope that is walked on."""
+        if self.youngs_modulus < _SOFTEST:
+            raise ValueError(
+                f"youngs_modulus = {self.youngs_modulus:g} Pa: wanted at least {_SOFTEST:g} Pa; 0.44 MPa is 440000"
+            )
+        if self.material is None:
+            check_pressure("pressure", self.pressure, self.youngs_modulus)
+        if self.slope > _STEEPEST:
+            raise ValueError(
+                f"slope = {self.slope:g}: wanted rise over run, at most {_STEEPEST:g}; "
+                "30 % is 0.3, 30 degrees are 0.577"
+            )
+
+    def _check_times(self) -> None:
+        """Refuse times that are no whole number of the shorter ones, and cycles too short to be sampled."""
         whole = [("settle", "sample_every"), ("duration", "sample_every")]
         if self.dt != "auto":
             whole = [("settle", "dt"), ("duration", "dt"), ("sample_every", "dt"), *whole[:1]]
         for name, unit in whole:
             value, part = getattr(self, name), getattr(self, unit)
+            if value > 1e9 * part:
+                raise ValueError(f"{name} = {value:g} s: wanted at most 1e9 times {unit} = {part:g} s")
             if abs(round(value / part) * part - value) > 1e-6 * value:
                 raise ValueError(f"{name} = {value:g} s: wanted a whole number of {unit} = {part:g} s")
-        for name in ("iterations", "window", "gravity_every", "picture_every", "shape_every", "frames"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 1")
-        for name in ("gravity_steps", "halvings", "patience"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name} = {getattr(self, name)}: wanted at least 0")
-        if not 0 <= self.void_range[0] < self.void_range[1] <= 1:
-            raise ValueError(f"void_range = {self.void_range}: wanted two increasing densities from 0 to 1")
-        if not 0 < self.c_max < 0.25:
-            raise ValueError(f"c_max = {self.c_max}: wanted more than 0 and less than 0.25")
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
+        if self.frequency * self.sample_every * _LEAST_SAMPLES > 1:
+            raise ValueError(
+                f"frequency = {self.frequency:g} Hz: wanted at most {1 / (_LEAST_SAMPLES * self.sample_every):g} Hz, "
+                f"{_LEAST_SAMPLES} samples of sample_every = {self.sample_every:g} s in each cycle"
+            )
+
+    def check_memory(self, dt: float | None = None) -> None:
+        """Refuse a run that the device cannot hold.
+
+        Args:
+            dt: Substep [s], once it is known.
+
+        Raises:
+            ValueError: if an estimate of its memory is more than the device has.
+        """
+        nx, ny, nz = self.particles
+        time = self.settle + self.duration
+        need = nx * ny * nz * (_PARTICLE + _FRAME * time / self.sample_every) + (0 if dt is None else _STEP * time / dt)
+        if self.target.type == "cuda":
+            have = torch.cuda.get_device_properties(self.target).total_memory
+        else:
+            have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
+        if need > have:
+            steps = "" if dt is None else f", {time / dt:.3g} substeps of {dt:.3g} s"
+            raise ValueError(
+                f"particles = {self.particles}, duration = {self.duration:g} s: about {need / 2**30:.3g} GiB "
+                f"({nx * ny * nz} particles, {time / self.sample_every:.3g} samples{steps}); "
+                f"wanted at most the {have / 2**30:.3g} GiB of this {self.target.type}"
+            )
 
     def gravity_scale(self, iteration: int) -> float:
         """Share of gravity in an iteration (the climber's continuation): min(1, floor(k / every) / steps)."""
@@ -192,31 +249,24 @@ class Settings:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
-        here = ("out", "resume", "amend", "iterations", "device", "memory")
+        here = ("out", "resume", "amend", "overwrite", "iterations", "device", "memory")
         return (*here, "picture_every", "shape_every", "frames", "offset", "port")
 
 
-def from_command_line(
-    presets: Mapping[str, Settings], *, description: str | None, arguments: Sequence[str] | None = None
-) -> Settings:
-    """Read settings from the command line: a preset, and any of its numbers overridden.
+def check_pressure(name: str, largest: float, modulus: float) -> None:
+    """Refuse a pressure that does not deform the body, or that no elastomer of this modulus would stand.
 
     Args:
-        presets: Named settings; without ``--preset``, "paper" is taken on CUDA and "desk" elsewhere.
-        description: Text on top of ``--help``.
-        arguments: Instead of the process's own.
+        name: How to call it in the message.
+        largest: Largest magnitude of the pressure [Pa].
+        modulus: Young's modulus of the solid [Pa].
 
-    Returns:
-        The settings; ends the process with a message if a flag is unknown or a value out of range.
+    Raises:
+        ValueError: if pressure over modulus is below 0.001 or above 100.
     """
-    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    first.add_argument("--preset", default=None)
-    first.add_argument("--device", default="auto")
-    known, _ = first.parse_known_args(arguments)
-    gpu = known.device == "cuda" or (known.device == "auto" and torch.cuda.is_available())
-    name = known.preset or ("paper" if gpu else "desk")
-    # Of a preset that does not exist, tyro says so.
-    default = presets.get(name, presets["desk"])
-    # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
-    text = re.sub(r"\n *(?=(?:python|tensorboard) )", "\n$ ", description or "")
-    return tyro.cli(Settings, args=arguments, default=default, description=text)
+    low, high = _LEAST_STRAIN * modulus, 100 * modulus
+    if not low <= largest <= high:
+        raise ValueError(
+            f"{name} = {largest:g} Pa: wanted from {low:.3g} to {high:.3g} Pa on a Young's modulus of {modulus:g} Pa; "
+            "80 kPa is 80000, 0.44 MPa is 440000"
+        )

@@ -20,6 +20,7 @@ Tags that every recipe shares: ``objective/L``, ``constraint/C``, ``mass``, ``co
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import signal
@@ -36,23 +37,38 @@ import torch
 from torch.utils.tensorboard.writer import SummaryWriter
 from tqdm import tqdm
 
-from torchsoro.storage import MetricsFile, atomic_write, check_storable, plain_settings, read_metrics
+from torchsoro.storage import (
+    MetricsFile,
+    atomic_write,
+    check_folder,
+    check_storable,
+    plain_settings,
+    read_checkpoint,
+    read_json,
+    read_metrics,
+)
 
 _ABSENT = "absent"
 _EVENTS = "events.out.tfevents.*"
+_WRITTEN = ("settings.json", "metrics.csv", "checkpoint.pt", "amendments.json", _EVENTS)
+# What is delivered and kept of a run beside that, to be deleted before another one.
+_DELIVERED = ("result.json", "design.npz", "summary.png", "shape.stl", "shape.json", "walker.mp4", "climber.mp4")
+_PARTS = {"iteration": int, "settings": dict, "rng_cpu": torch.Tensor, "rng_cuda": list, "items": dict}
 
 
 class RunFolder:
     """A folder that holds one optimization run, and continues it exactly.
 
     Files: ``settings.json``, ``metrics.csv``, ``checkpoint.pt`` and the TensorBoard events. Use it as a context
-    manager: SIGTERM then ends the block like Ctrl-C does, abandoning the iteration, and the events are flushed.
+    manager: SIGTERM then ends the block like Ctrl-C does, abandoning the iteration, and the events are flushed; a block
+    that fails before its first ``save`` leaves no files of the run, so that corrected settings can start there.
 
     Args:
         path: The folder; created if missing.
         settings: Resolved settings of the run: nested mappings or dataclasses of numbers, strings, paths, lists.
         resume: Continue the run that the folder holds. Metrics and events after its checkpoint are dropped; without
             a checkpoint (killed in the first iteration) it starts again from iteration 0.
+        overwrite: Start again in a folder that holds a run, whose files are deleted.
         free: Names of settings that may change on resume, such as the number of iterations or the folder itself;
             nested names are joined with dots, and the name of a group frees all of it.
         amend: Let other settings change on resume, too; each change is noted in ``amendments.json`` with the iteration
@@ -64,8 +80,9 @@ class RunFolder:
         start: First iteration to compute, 0 for a new run.
 
     Raises:
-        ValueError: If the folder holds a run and ``resume`` is false, if it holds none and ``resume`` is true, if
-            the settings differ from the run's (names each key with both values), or if a file of it is damaged.
+        ValueError: If the folder holds a run and neither ``resume`` nor ``overwrite`` is set, if it holds none and
+            ``resume`` is true, if it cannot be written, if the settings differ from the run's (names each key with both
+            values), or if a file of it is damaged or missing.
     """
 
     def __init__(
@@ -74,6 +91,7 @@ class RunFolder:
         settings: Mapping[str, Any],
         *,
         resume: bool = False,
+        overwrite: bool = False,
         free: Collection[str] = (),
         amend: bool = False,
     ) -> None:
@@ -83,16 +101,20 @@ class RunFolder:
         rows: list[dict[str, float]] = []
         columns: list[str] = []
         changed: dict[str, tuple[Any, Any]] = {}
-        self._refuse_wrong_folder(resume)
+        self._refuse_wrong_folder(resume, overwrite)
+        self._new = not self.path.exists()
+        if overwrite:
+            self._delete(*_WRITTEN, *_DELIVERED, "shapes/[0-9]*.npz")
         if resume:
-            changed = self._differences(self._read_settings(), free)
+            changed = self._differences(read_json(self.path / "settings.json", dict), free)
             self._refuse(changed, amend, "settings.json")
             if self._checkpoint.exists():
-                payload = self._read_checkpoint()
+                payload = read_checkpoint(self._checkpoint, _PARTS)
                 changed = self._differences(payload["settings"], free)
                 self._refuse(changed, amend, "checkpoint.pt")
                 self.start = payload["iteration"] + 1
             columns, rows = read_metrics(self.path / "metrics.csv", self.start)
+            self._refuse_short_table(columns, rows)
         self.path.mkdir(parents=True, exist_ok=True)
         for file in ("checkpoint.pt", "metrics.csv", "settings.json", "amendments.json"):
             (self.path / f"{file}.tmp").unlink(missing_ok=True)  # a killed process may have left one
@@ -232,7 +254,7 @@ class RunFolder:
         """
         if not self._checkpoint.exists():
             return {}
-        payload = self._read_checkpoint()
+        payload = read_checkpoint(self._checkpoint, _PARTS)
         torch.set_rng_state(payload["rng_cpu"])
         if torch.cuda.is_available():
             for device, state in enumerate(payload["rng_cuda"][: torch.cuda.device_count()]):
@@ -284,9 +306,18 @@ class RunFolder:
             signal.signal(signal.SIGTERM, self._old_handler)
             self._old_handler = None
         self.close()
+        if kind is not None and self._saved < 0:
+            self._delete(*_WRITTEN)
+            if self._new:
+                with contextlib.suppress(OSError):  # something else lies there
+                    self.path.rmdir()
         if kind is not None and issubclass(kind, KeyboardInterrupt):
-            kept = f"{self._saved + 1} iterations are saved in {self.path}"
-            print(f"interrupted: {kept}; resume to continue", file=sys.stderr)
+            kept = f"{self._saved + 1} iterations are saved in {self.path}; resume to continue"
+            print(f"interrupted: {kept if self._saved >= 0 else 'no iteration was complete'}", file=sys.stderr)
+
+    def _delete(self, *patterns: str) -> None:
+        for path in [path for pattern in patterns for path in self.path.glob(pattern)]:
+            path.unlink()
 
     def _wait_for_next_second(self) -> None:
         # TensorBoard reads event files by name, which holds the second of their making and then the process: one that
@@ -296,33 +327,26 @@ class RunFolder:
         if seconds and int(now) == max(seconds):
             time.sleep(max(seconds) + 1 - now)
 
-    def _refuse_wrong_folder(self, resume: bool) -> None:
-        if self.path.exists() and not self.path.is_dir():
-            raise ValueError(f"path: {self.path} is a file, wanted a folder for the run")
+    def _refuse_wrong_folder(self, resume: bool, overwrite: bool) -> None:
+        check_folder("out", self.path)
         settings = self.path / "settings.json"
         held = settings.exists() or self._checkpoint.exists() or any(self.path.glob(_EVENTS))
-        if held and not resume:
-            raise ValueError(f"path: {self.path} already holds a run; resume it, or choose another folder")
+        if held and not (resume or overwrite):
+            raise ValueError(
+                f"path: {self.path} already holds a run; resume it (--resume), start again in it (--overwrite), "
+                "or choose another folder"
+            )
         if resume and not settings.exists():
             raise ValueError(f"path: {self.path} holds no run (no settings.json); start without resume")
 
-    def _read_settings(self) -> dict[str, Any]:
-        try:
-            return json.loads((self.path / "settings.json").read_text(encoding="utf-8"))
-        except ValueError as error:
+    def _refuse_short_table(self, columns: list[str], rows: list[dict[str, float]]) -> None:
+        """Refuse metrics that lack iterations which the checkpoint has; without any, none was logged."""
+        if self.start > 0 and (not columns or (rows and rows[-1]["iteration"] < self.start - 1)):
+            seen = f"ends with iteration {rows[-1]['iteration']}" if columns else "is missing"
             raise ValueError(
-                f"path: {self.path / 'settings.json'} is damaged ({error}); choose another folder"
-            ) from error
-
-    def _read_checkpoint(self) -> dict[str, Any]:
-        try:
-            payload = torch.load(self._checkpoint, map_location="cpu", weights_only=True)
-            missing = {"iteration", "settings", "rng_cpu", "rng_cuda", "items"} - set(payload)
-        except Exception as error:  # a damaged pickle can fail in any way
-            raise ValueError(f"path: {self._checkpoint} is damaged ({error}); choose another folder") from error
-        if missing:
-            raise ValueError(f"path: {self._checkpoint} lacks {sorted(missing)}, it is not a checkpoint of a run")
-        return payload
+                f"path: {self.path / 'metrics.csv'} {seen}, wanted all up to {self.start - 1}, that of checkpoint.pt; "
+                "restore it, or choose another folder"
+            )
 
     def _differences(self, held: Mapping[str, Any], free: Collection[str]) -> dict[str, tuple[Any, Any]]:
         """What the run has and what is wanted now, of each setting that differs and is not free."""
@@ -345,7 +369,7 @@ class RunFolder:
     def _note(self, changed: Mapping[str, tuple[Any, Any]]) -> None:
         """Add to the amendments, and drop those from this iteration on, which were never used."""
         path = self.path / "amendments.json"
-        held = json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+        held = read_json(path, list) if path.exists() else []
         noted = [one for one in held if one["iteration"] < self.start]
         if changed:
             noted.append({"iteration": self.start, "changes": {name: list(pair) for name, pair in changed.items()}})

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import math
-import typing
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.design.domain import Domain
-from torchsoro.design.settings import Settings
+from torchsoro.design.reading import read_settings
 from torchsoro.storage import atomic_write
 
 DESIGNS = Path(__file__).resolve().parents[1] / "designs"  # robots that come with the package
@@ -146,40 +144,6 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
     with atomic_write(folder / "shapes.npz") as file:
         gamma = np.stack([(255 * g).round().to(torch.uint8).numpy() for g in early]) if early else np.zeros((0, 0))
         np.savez_compressed(file, iteration=np.array(kept, dtype=np.int64), gamma=gamma)
-
-
-def read_settings(path: Path, **changes: object) -> Settings:
-    """Read the settings of a run.
-
-    Args:
-        path: Its ``settings.json``.
-        **changes: Settings to replace.
-
-    Returns:
-        The settings; names that the file does not have keep their defaults.
-
-    Raises:
-        ValueError: if there is no such file, it is damaged, or a name in it is none of the settings.
-    """
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        assert isinstance(found, dict)
-    except (OSError, ValueError, AssertionError) as error:
-        raise ValueError(f"path: {path} holds no settings ({error}), wanted the settings.json of a run") from error
-    kinds = typing.get_type_hints(Settings)
-    unknown = sorted(set(found) - set(kinds))
-    if unknown:
-        raise ValueError(f"path: {path} has {', '.join(unknown)}, wanted names of the settings only")
-    values = {name: _typed(kinds[name], value) for name, value in found.items()}
-    return dataclasses.replace(Settings(), **{**values, **changes})
-
-
-def _typed(kind: object, value: object) -> object:
-    """What JSON keeps of a value, in its own type."""
-    if isinstance(value, list):
-        return tuple(value)
-    options = (kind, *typing.get_args(kind))
-    return Path(value) if isinstance(value, str) and Path in options else value
 
 
 def find(robot: str) -> Path:

@@ -1,0 +1,105 @@
+"""Where settings come from: a command line over a preset, or the file that a run has left."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import tyro
+
+from torchsoro.design.settings import Settings
+
+# Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
+GROUPS = {
+    "robot": "run",
+    "size": "body",
+    "youngs_modulus": "material",
+    "pressure": "actuation",
+    "gravity": "surroundings",
+    "dt": "simulation",
+    "filter_radius": "optimization",
+    "picture_every": "output",
+}
+
+
+def from_command_line(
+    presets: Mapping[str, Settings], *, description: str | None, arguments: Sequence[str] | None = None
+) -> Settings:
+    """Read settings from the command line: a preset, and any of its numbers overridden.
+
+    Args:
+        presets: Named settings; without ``--preset``, "paper" is taken on CUDA and "desk" elsewhere.
+        description: Text on top of ``--help``.
+        arguments: Instead of the process's own.
+
+    Returns:
+        The settings; ends the process with a message if a flag is unknown or a value of the wrong kind.
+
+    Raises:
+        ValueError: if a value is out of its range.
+    """
+    first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    first.add_argument("--preset", default=None)
+    first.add_argument("--device", default="auto")
+    known, _ = first.parse_known_args(arguments)
+    gpu = known.device == "cuda" or (known.device == "auto" and torch.cuda.is_available())
+    name = known.preset or ("paper" if gpu else "desk")
+    # A preset that does not exist is refused by tyro.
+    default = presets.get(name, presets["desk"])
+    # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
+    text = re.sub(r"\n *(?=(?:python|tensorboard) )", "\n$ ", description or "")
+    groups = tyro.cli(_grouped(default), args=arguments, description=text, config=(tyro.conf.OmitArgPrefixes,))
+    chosen = {name: value for group in vars(groups).values() for name, value in vars(group).items()}
+    return Settings(**chosen)
+
+
+def _grouped(default: Settings) -> type[Any]:
+    """The settings as a dataclass of groups, each of which is a dataclass of fields without checks."""
+    members: dict[str, list[tuple[str, Any, Any]]] = {}
+    title = ""
+    described: Any = Settings
+    for name, field in described.__pydantic_fields__.items():
+        title = GROUPS.get(name, title)
+        kind = Annotated[field.annotation, tyro.conf.arg(help=field.description)]
+        member = (name, kind, dataclasses.field(default=getattr(default, name)))
+        members.setdefault(title, []).append(member)
+    groups = []
+    for title, fields in members.items():
+        group = dataclasses.make_dataclass(title, fields, frozen=True)
+        groups.append((group.__name__, group, dataclasses.field(default_factory=group)))
+    return dataclasses.make_dataclass("Groups", groups, frozen=True)
+
+
+def read_settings(path: Path, **changes: object) -> Settings:
+    """Read the settings of a run.
+
+    Args:
+        path: Its ``settings.json``.
+        **changes: Settings to replace.
+
+    Returns:
+        The settings; names that the file does not have keep their defaults.
+
+    Raises:
+        ValueError: if there is no such file, it is damaged, a name in it is none of the settings, or a value is out of
+            its range.
+    """
+    wanted = "wanted the settings.json of a run"
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"path: {path} holds no settings ({error}), {wanted}") from error
+    if not isinstance(found, dict):
+        raise ValueError(f"path: {path} holds a {type(found).__name__}, {wanted}")
+    if unknown := sorted(set(found) - {field.name for field in dataclasses.fields(Settings)}):
+        raise ValueError(f"path: {path} has {', '.join(unknown)}, wanted names of the settings only")
+    try:
+        return Settings(**{**found, **changes})
+    except ValueError as error:
+        raise ValueError(f"path: {path}: {error}") from error
