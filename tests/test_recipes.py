@@ -154,7 +154,7 @@ def command(settings: Settings) -> list[str]:
     flags = ["--resume"] if settings.resume else []
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        if field.name not in ("resume", "amend") and value is not None:
+        if not isinstance(value, bool) and value is not None:
             flags.append("--" + field.name.replace("_", "-"))
             flags += map(str, value) if isinstance(value, tuple) else [str(value)]
     return [sys.executable, str(RECIPES / "walker.py"), *flags]
