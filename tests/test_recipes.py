@@ -197,7 +197,9 @@ def test_a_bad_schedule_is_refused_before_the_folder_is_made(recipes, tmp_path):
 
 
 def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_path):
-    settings = tiny(tmp_path / "run", iterations=2, settle=0.0, gravity_steps=1, gravity_every=1, frames=2)
+    settings = tiny(
+        tmp_path / "run", iterations=2, settle=0.0, gravity_steps=1, gravity_every=1, frames=2, robot="climber"
+    )
     result = recipes["climber"].main(settings)
     assert result["iterations"] == 2
     names = {file.name for file in settings.out.iterdir() if not file.name.startswith("events")}
