@@ -364,8 +364,9 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     assert answer["force_map"] is None and answer["mismatch"]["b"]["phase"].endswith("swing")
     assert answer["error_after"]["a"]["all"] < 0.5 * answer["error_before"]["a"]["all"]
     page = (tmp_path / "out" / "report.html").read_text()
-    parting = r"Simulation and recording part in trial [ab] at [\d.]+ s, in the \w+ swing, most at marker \w+\. "
-    assert re.search(parting + r"Missing is drag: density drag \d+ kg/m3 \(90 %: ", page)
+    assert re.search(
+        r'<p class="lead">Missing from the setup is drag [^:]*: [^:]* \d+ kg/m³ \(90 %: \d+ to \d+ kg/m³', page
+    )
     assert page.count("data:image/png") == 5
     folder = tmp_path / "new"
     folder.mkdir()

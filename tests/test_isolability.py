@@ -22,9 +22,9 @@ from torchsoro.sim2real.inference.likelihood import Tolerances
 from torchsoro.sim2real.inference.next_experiment import REPEAT, Proposal, advice, next_experiment
 from torchsoro.sim2real.inference.ranking import Candidate
 from torchsoro.sim2real.inference.verdict import Verdict
-from torchsoro.sim2real.report.drawings import draw_alike
+from torchsoro.sim2real.report.drawings import draw_cosines
 from torchsoro.sim2real.report.explanation import Explanation, as_json
-from torchsoro.sim2real.report.sentences import lead
+from torchsoro.sim2real.report.sentences import evidence
 from torchsoro.sim2real.twin.scenario import Scenario
 
 # A chain: four masses between springs, from a wall on; two of them are seen. ----------------------------------------
@@ -195,11 +195,11 @@ def screened(problem):
 def test_effects_that_are_the_same_are_alike(screened):
     at = {name: i for i, name in enumerate(screened.effects)}
     density, twice = at["density"], at["twice"]
-    assert screened.alike[density, twice] == pytest.approx(1.0, abs=1e-6)
-    assert screened.alike[twice, density] == pytest.approx(1.0, abs=1e-6)
+    assert screened.cosines[density, twice] == pytest.approx(1.0, abs=1e-6)
+    assert screened.cosines[twice, density] == pytest.approx(1.0, abs=1e-6)
     assert ("density", "twice") in screened.confused()
-    np.testing.assert_array_equal(np.diag(screened.alike), 1.0)
-    assert (screened.alike >= 0).all() and (screened.alike <= 1 + 1e-9).all()
+    np.testing.assert_array_equal(np.diag(screened.cosines), 1.0)
+    assert (screened.cosines >= 0).all() and (screened.cosines <= 1 + 1e-9).all()
 
 
 def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than_like_drag(problem):
@@ -210,10 +210,10 @@ def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than
     )
     modulus, density, mass, drag = range(4)
     found = isolability(sure, [effect(name) for name in names])
-    assert found.alike[density, modulus] > 0.97 and found.alike[modulus, density] > 0.97
+    assert found.cosines[density, modulus] > 0.97 and found.cosines[modulus, density] > 0.97
     assert ("density", "modulus") in found.confused()
-    assert found.alike[mass, density] > found.alike[mass, drag] + 0.05
-    assert found.alike[mass, drag] < 0.97
+    assert found.cosines[mass, density] > found.cosines[mass, drag] + 0.05
+    assert found.cosines[mass, drag] < 0.97
 
 
 def test_what_changes_nothing_or_breaks_down_is_never_seen(screened):
@@ -221,10 +221,10 @@ def test_what_changes_nothing_or_breaks_down_is_never_seen(screened):
     assert np.isinf(screened.detectable[[idle, broken]]).all()
     assert np.isfinite(np.delete(screened.detectable, [idle, broken])).all()
     for k in (idle, broken):
-        assert not np.delete(screened.alike[k], k).any() and not np.delete(screened.alike[:, k], k).any()
+        assert not np.delete(screened.cosines[k], k).any() and not np.delete(screened.cosines[:, k], k).any()
     answer = json.loads(json.dumps(screened.as_json()))
     assert answer["detectable"][idle]["value"] is None and answer["effects"][idle] == "idle"
-    draw_alike(screened)
+    draw_cosines(screened)
 
 
 def test_recorded_places_do_not_count(problem, screened):
@@ -244,10 +244,10 @@ def test_a_known_pull_tells_density_from_modulus(problem):
     assert problem.tally.simulations - before < 64
     same = next(p for p in proposals if p.words == REPEAT)
     best = proposals[0]
-    assert same.alike > 0.97 and same.distance < 10
-    assert "pull" in best.words and best.alike < 0.9 and best.distance > 100
+    assert same.cosine > 0.97 and same.distance < 10
+    assert "pull" in best.words and best.cosine < 0.9 and best.distance > 100
     assert advice(proposals).startswith("To tell them apart, record next: the same with a pull of")
-    assert advice([Proposal(words=REPEAT, alike=1.0, distance=0.0)]).startswith("None of the trials")
+    assert advice([Proposal(words=REPEAT, cosine=1.0, distance=0.0)]).startswith("None of the trials")
     assert not advice([])
 
 
@@ -267,11 +267,11 @@ def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(pro
         seconds=1.0,
         isolability=screened,
         following=(
-            Proposal(words="the same for 9 s", alike=0.5, distance=900.0),
-            Proposal(words=REPEAT, alike=1.0, distance=0.0),
+            Proposal(words="the same for 9 s", cosine=0.5, distance=900.0),
+            Proposal(words=REPEAT, cosine=1.0, distance=0.0),
         ),
     )
-    assert "record next: the same for 9 s; there they differ by 30 standard deviations" in lead(found)
+    assert any(s.startswith("To tell them apart, record next: the same for 9 s;") for s in evidence(found))
     assert as_json(found, {})["next"][0] == {"record": "the same for 9 s", "alike": 0.5, "distance": 900.0}
     explained = dataclasses.replace(found, verdict=dataclasses.replace(verdict, kind="explained"))
-    assert "record next" not in lead(explained)
+    assert not any("record next" in s for s in evidence(explained))

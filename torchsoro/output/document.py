@@ -3,37 +3,26 @@
 from __future__ import annotations
 
 import base64
-import html
 import io
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jinja2
 from matplotlib.figure import Figure
 
 from torchsoro.storage import atomic_write
 
-LONG = 40  # characters of a cell, from which on it is broken into lines
+LONG = 40  # characters of a cell, above which its column is kept wide enough for whole phrases
 
-_STYLE = """
-:root { color-scheme: light; }
-body { font: 16px/1.55 system-ui, sans-serif; color: #1f2933; }
-body { max-width: 62rem; margin: 2.5rem auto; padding: 0 1.2rem; }
-h1 { font-size: 1.7rem; line-height: 1.25; margin: 0 0 .8rem; }
-h2 { font-size: 1.2rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #dde3ea; padding-bottom: .25rem; }
-p.lead { font-size: 1.08rem; background: #f2f6fa; border-left: 4px solid #396ba3; padding: .8rem 1rem; }
-table { border-collapse: collapse; margin: .8rem 0 1.2rem; font-size: .9rem; display: block; overflow-x: auto; }
-th, td { padding: .3rem .75rem; text-align: right; border-bottom: 1px solid #e4e9ef; white-space: nowrap; }
-th { background: #f7f9fb; font-weight: 600; white-space: normal; }
-th:first-child, td:first-child { text-align: left; }
-td.long { text-align: left; white-space: normal; min-width: 14rem; }
-figure { margin: 1rem 0 1.4rem; }
-img { max-width: 100%; height: auto; }
-figcaption, caption { color: #5b6875; font-size: .9rem; text-align: left; caption-side: top; padding: .2rem 0; }
-pre { background: #f7f9fb; padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; }
-@media print { body { margin: 0; } figure, table { break-inside: avoid; } }
-"""
+_TEMPLATES = jinja2.Environment(
+    loader=jinja2.PackageLoader("torchsoro.output"),
+    autoescape=True,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    undefined=jinja2.StrictUndefined,
+)
 
 
 class Document:
@@ -45,23 +34,34 @@ class Document:
     """
 
     def __init__(self, title: str, lead: str) -> None:
-        self._title = title
-        self._parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead)}</p>']
+        self._title, self._lead = title, lead
+        self._parts: list[dict[str, Any]] = []
 
     def section(self, heading: str) -> None:
         """Begin a section."""
-        self._parts.append(f"<h2>{html.escape(heading)}</h2>")
+        self._add("section", text=heading)
 
     def text(self, paragraph: str) -> None:
         """A paragraph."""
-        self._parts.append(f"<p>{html.escape(paragraph)}</p>")
+        self._add("text", text=paragraph)
+
+    def points(self, lines: Sequence[str]) -> None:
+        """A list of sentences; nothing if there is none."""
+        if lines:
+            self._add("points", lines=list(lines))
 
     def code(self, lines: str) -> None:
         """Lines as they are, such as a command or a file."""
-        self._parts.append(f"<pre>{html.escape(lines)}</pre>")
+        self._add("code", text=lines)
 
-    def table(self, rows: Sequence[Mapping[str, Any]], caption: str = "") -> None:
-        """Rows; their keys become the head. Numbers with four digits; what is missing, NaN or None as a dash.
+    def table(self, rows: Sequence[Mapping[str, Any]], caption: str = "", *, folded: str = "") -> None:
+        """A table.
+
+        Args:
+            rows: Their keys become the head. Numbers are shown with four digits; what is missing, NaN or None, as a
+                dash. A column of numbers is aligned to the right.
+            caption: Above the table.
+            folded: A line that the reader has to open to see the table; it is always seen if empty.
 
         Raises:
             ValueError: without rows.
@@ -69,44 +69,35 @@ class Document:
         if not rows:
             raise ValueError("rows: wanted at least one")
         keys = list(dict.fromkeys(key for row in rows for key in row))
-        head = "".join(f"<th>{html.escape(str(key))}</th>" for key in keys)
-        body = "".join("<tr>" + "".join(_cell(shown(row.get(key))) for key in keys) + "</tr>" for row in rows)
-        title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
-        self._parts.append(f"<table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>")
+        columns = [{"name": str(key), "number": _numbers([row.get(key) for row in rows])} for key in keys]
+        cells = [[shown(row.get(key)) for key in keys] for row in rows]
+        self._add("table", columns=columns, rows=cells, caption=caption, folded=folded)
 
-    def figure(self, figure: Figure, caption: str) -> None:
-        """A Matplotlib figure, as a picture inside the page."""
+    def figure(self, figure: Figure, caption: str, *, folded: str = "") -> None:
+        """A Matplotlib figure, as a picture inside the page; ``folded`` as in :meth:`table`."""
         stream = io.BytesIO()
         figure.savefig(stream, format="png", dpi=150)
-        self.picture(stream.getvalue(), caption)
+        self.picture(stream.getvalue(), caption, folded=folded)
 
-    def picture(self, png: bytes, caption: str) -> None:
-        """A PNG, inside the page."""
-        data = base64.b64encode(png).decode("ascii")
-        text = html.escape(caption)
-        self._parts.append(
-            f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
-        )
+    def picture(self, png: bytes, caption: str, *, folded: str = "") -> None:
+        """A PNG, inside the page; ``folded`` as in :meth:`table`."""
+        self._add("picture", data=base64.b64encode(png).decode("ascii"), caption=caption, folded=folded)
 
     def save(self, path: Path) -> Path:
         """Write the page; it is there whole or not at all."""
-        head = f'<meta charset="utf-8"><title>{html.escape(self._title)}</title><style>{_STYLE}</style>'
-        lines = [
-            "<!doctype html>",
-            f'<html lang="en"><head>{head}</head>',
-            "<body>",
-            *self._parts,
-            "</body></html>",
-            "",
-        ]
+        template = _TEMPLATES.get_template("document.html")
+        page = template.render(title=self._title, lead=self._lead, parts=self._parts, long=LONG)
         with atomic_write(path) as file:
-            file.write("\n".join(lines).encode())
+            file.write(page.encode())
         return path
 
+    def _add(self, kind: str, *, folded: str = "", **content: Any) -> None:
+        self._parts.append({"kind": kind, "folded": folded, **content})
 
-def _cell(text: str) -> str:
-    kind = ' class="long"' if len(text) > LONG else ""
-    return f"<td{kind}>{html.escape(text)}</td>"
+
+def _numbers(values: Sequence[Any]) -> bool:
+    """Whether all values of a column are numbers, or missing."""
+    return all(v is None or (isinstance(v, int | float) and not isinstance(v, bool)) for v in values)
 
 
 def shown(value: Any) -> str:

@@ -17,7 +17,7 @@ from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.discretization import DiscretizationError, measure
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
-from torchsoro.sim2real.inference.heldout import Prediction, predict
+from torchsoro.sim2real.inference.heldout import Prediction, at_clocks_of, predict
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
@@ -185,6 +185,7 @@ def explain(options: Options) -> Explanation | None:
         verdict=verdict,
         before=before,
         after=after,
+        drawn=tuple(at_clocks_of(problem, best, everything, before, after)),
         heldout=tuple(t.name for t in kept),
         mismatches=tuple(mismatches(known, verdict.null_model, everything, after)),
         forces=forces,

@@ -19,6 +19,7 @@ class Modulus(Hypothesis):
     """The solid is stiffer or softer than believed."""
 
     name, affected_quantity = "modulus", "Young's modulus"
+    ratios = frozenset({"factor"})
     quantities = (Quantity("ln_factor", "1", 0.1, -12.0, 12.0),)
     starts = ((1.0,), (-1.0,), (2.5,), (-2.5,), (5.0,), (-5.0,))
 
@@ -35,6 +36,7 @@ class Viscoelastic(Hypothesis):
     """A Maxwell element is missing."""
 
     name, affected_quantity, model_form_deviation = "viscoelastic", "Prony series", LAW
+    ratios, nonnegative = frozenset({"time_s"}), frozenset({"viscosity_pa_s"})
     quantities = (
         Quantity("modulus_over_equilibrium", "1", 0.2, 0.0, 100.0),
         Quantity("ln_time", "ln s", 1.0, -9.0, 1.5),
@@ -91,6 +93,7 @@ class Density(Hypothesis):
     """The solid is heavier or lighter than believed."""
 
     name, affected_quantity, model_form_deviation = "density", "density", 0.2
+    ratios = frozenset({"factor"})
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
 
@@ -107,6 +110,7 @@ class SoftSide(Hypothesis):
     """Young's modulus grows evenly across the body, along x, y and z."""
 
     name, affected_quantity, model_form_deviation = "soft_side", "Young's modulus over the body", LAW
+    nonnegative = frozenset({"fraction"})
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 

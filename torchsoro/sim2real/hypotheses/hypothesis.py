@@ -66,6 +66,8 @@ class Hypothesis(nn.Module):
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
     mass: ClassVar[int | None] = None
+    ratios: ClassVar[frozenset[str]] = frozenset()
+    nonnegative: ClassVar[frozenset[str]] = frozenset()
     model_form_deviation: ClassVar[float] = 0.1
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:

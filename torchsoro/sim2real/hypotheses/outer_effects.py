@@ -156,6 +156,7 @@ class Sliding(Hypothesis):
     """Planes that were believed to stick let the body slide, with a Coulomb coefficient of 1/a."""
 
     name, affected_quantity = "friction", "friction of the planes"
+    ratios = frozenset({"coefficient"})
     quantities = (Quantity("inverse_coefficient", "1", 1.0, 0.0, 50.0),)
     starts = ((1.0,), (2.0,), (4.0,), (8.0,))
 
@@ -179,6 +180,7 @@ class Friction(Hypothesis):
     """Planes are more or less slippery than believed."""
 
     name, affected_quantity = "friction", "friction of the planes"
+    ratios = frozenset({"coefficient"})
     quantities = (Quantity("ln_factor", "1", 0.1, -40.0, 40.0),)
     starts = ((2.0,), (-2.0,), (6.0,), (-6.0,), (11.0,), (-15.0,))
 
@@ -201,6 +203,7 @@ class Adhesion(Hypothesis):
     """Planes hold the body back as it lifts off, with the same traction as far as they reach (Dugdale)."""
 
     name, affected_quantity, model_form_deviation = "adhesion", "adhesion of the planes", LAW
+    ratios, nonnegative = frozenset({"reach_m"}), frozenset({"energy_j_m2"})
     quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0), Quantity("ln_reach", "ln m", 1.0, -11.5, -5.0))
     starts = ((2.0, -8.5), (8.0, -8.5), (30.0, -8.5), (8.0, -7.0))
 
@@ -248,6 +251,7 @@ class GravityTilt(Hypothesis):
     """The body stands at an angle: gravity is turned about two axes."""
 
     name, affected_quantity, model_form_deviation = "gravity_tilt", "direction of gravity", 0.2
+    nonnegative = frozenset({"angle_rad"})
     quantities = (Quantity("about_first", "rad", 0.03, -20.0, 20.0), Quantity("about_second", "rad", 0.03, -20.0, 20.0))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
@@ -269,6 +273,7 @@ class InitialMotion(Hypothesis):
     """The body is not at rest, or moves otherwise, at the start."""
 
     name, affected_quantity, model_form_deviation = "initial_motion", "velocity at the start", LAW
+    nonnegative = frozenset({"speed_m_s"})
     quantities = tuple(Quantity(f"velocity_{axis}", "m/s", 0.02, -50.0, 50.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
@@ -305,6 +310,7 @@ class InitialTilt(Hypothesis):
     """A free body is turned at the start."""
 
     name, affected_quantity = "initial_tilt", "direction of the body at the start"
+    nonnegative = frozenset({"angle_rad"})
     quantities = tuple(Quantity(f"about_{axis}", "rad", 0.03, -20.0, 20.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 

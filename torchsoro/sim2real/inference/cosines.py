@@ -143,7 +143,7 @@ def compare(
         that effect i makes then effect j can imitate [E, E].
     """
     count = len(responses)
-    detectable, alike = np.full(count, np.inf), np.eye(count)
+    detectable, cosines = np.full(count, np.inf), np.eye(count)
     for i, mine in enumerate(responses):
         seen = [first_seen(*path, common, prior_residual, score) for path in mine.paths]
         if not seen:
@@ -157,5 +157,5 @@ def compare(
             signs = (1, -1) if mine.either or other.either else (1,)
             for directions, free in other.cones if j != i else ():
                 cone = cleared(directions, common, slopes)
-                alike[i, j] = max(alike[i, j], *(imitation(sign * left, cone, free) for sign in signs))
-    return detectable, alike
+                cosines[i, j] = max(cosines[i, j], *(imitation(sign * left, cone, free) for sign in signs))
+    return detectable, cosines

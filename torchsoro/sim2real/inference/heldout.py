@@ -10,10 +10,10 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.observation import LATE
+from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
-ROUNDS = 10  # in which a trial's clock is found
+ROUNDS = 10  # Gauss-Newton steps in which the clock of one trial is fitted
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,22 +25,29 @@ class Prediction:
         seen: Predicted recording [T, M, A] m.
         error: Root mean square of each marker [M] m, over all axes.
         total: The same over all markers [m].
+        clock: Offset of the trial's clock with which it was predicted [s].
+        motion: The simulated motion.
     """
 
     trial: str
     seen: np.ndarray
     error: np.ndarray
     total: float
+    clock: float
+    motion: MarkerMotion
 
 
 def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
-    """Predict trials with the parameters and measurement errors of a fit; only each trial's clock is found anew.
+    """Predict trials with the parameters and measurement errors of a fit; only the clock of each trial is fitted.
 
     Args:
         problem: The fit's.
         fit: What was found.
         trials: With recordings; those of the problem or others.
-        believed: Simulate the setup as it is believed, but see it with the fit's measurement errors.
+        believed: Simulate the setup as it is stated, but with the measurement errors of the fit.
+
+    Returns:
+        A prediction of each trial; empty where the simulation of one breaks down.
     """
     return predict_all(problem, [fit], trials, believed=believed)[0]
 
@@ -48,25 +55,48 @@ def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed:
 def predict_all(
     problem: FitProblem, fits: Sequence[Fit], trials: Sequence[Trial], *, believed: bool = False
 ) -> list[list[Prediction]]:
-    """:func:`predict` for several fits, simulated together; nothing is predicted where it breaks down."""
+    """:func:`predict` for several fits, simulated together."""
     there = problem.only(trials, slips=())
     still = np.zeros((1, len(there.common)))
     simulated = there.simulate([((), still) if believed else (fit.effects, fit.point[None]) for fit in fits])
     return [
-        _seen(problem, there, fit, motions) if all(m.sound.all() for m in motions) else []
+        _predicted(problem, there, fit, motions) if all(m.sound.all() for m in motions) else []
         for fit, motions in zip(fits, simulated, strict=True)
     ]
 
 
-def _seen(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerMotion]) -> list[Prediction]:
+def at_clocks_of(
+    problem: FitProblem, fit: Fit, trials: Sequence[Trial], predictions: Sequence[Prediction], of: Sequence[Prediction]
+) -> list[np.ndarray]:
+    """Predicted recordings [T, M, A] m of the same motions, with the clocks of other predictions.
+
+    The clock of a motion that is far from the recording is fitted far from the truth, and such a motion would not be
+    seen to begin where the body is at the start.
+    """
+    there = problem.only(trials, slips=())
+    found = []
+    for i, (prediction, other) in enumerate(zip(predictions, of, strict=True)):
+        errors = _errors(problem, there, fit)
+        errors[i] = other.clock
+        found.append(there.observation.observe(prediction.motion, i, errors))
+    return found
+
+
+def _errors(problem: FitProblem, there: FitProblem, fit: Fit) -> np.ndarray:
+    """Measurement errors of a fit for other trials, whose clocks are right."""
     count = len(there.trials)
     known = fit.errors[len(problem.trials) :][: len(there.observation.deviations) - count]
+    return np.concatenate([np.zeros(count), known])
+
+
+def _predicted(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerMotion]) -> list[Prediction]:
     found = []
     for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
         assert trial.recording is not None
         one = motion.alone()
-        errors = np.concatenate([np.zeros(count), known])
-        weight, most = (problem.noise / there.observation.deviations[i]) ** 2, LATE * there.observation.deviations[i]
+        errors = _errors(problem, there, fit)
+        deviation = there.observation.deviations[i]
+        weight, most = (problem.noise / deviation) ** 2, CLOCK_LIMIT * deviation
         clock, least, step = 0.0, math.inf, 0.0
         for _ in range(ROUNDS):
             seen, by = there.observation.linearise(one, i, errors)
@@ -78,14 +108,14 @@ def _seen(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[Ma
                 step = (float((left[good] * slope[good]).sum()) - weight * clock) / (
                     float((slope[good] ** 2).sum()) + weight
                 )
-            else:  # too far
+            else:  # the step was too long
                 step /= 4
-            # A simulation that is far off would otherwise bend the clock without end.
+            # The fit of a simulation that is far off would otherwise move the clock without limit.
             errors[i] = np.clip(clock + step, -most, most)
         errors[i] = clock
         seen = there.observation.observe(one, i, errors)
         square = (trial.recording.place - seen) ** 2
         error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
         total = float(np.sqrt(np.nanmean(square.sum(-1))))
-        found.append(Prediction(trial=trial.name, seen=seen, error=error, total=total))
+        found.append(Prediction(trial=trial.name, seen=seen, error=error, total=total, clock=clock, motion=one))
     return found

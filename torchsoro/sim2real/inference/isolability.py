@@ -37,17 +37,17 @@ class Isolability:
         effects: Names of E effects.
         quantities: First quantity of each, and its unit.
         detectable: Strength at which each stands out, in that unit [E]; infinite if never.
-        alike: How much of effect i's change, where it first stands out, effect j can imitate [E, E].
+        cosines: How much of the change by effect i, where it is first detectable, effect j can imitate [E, E], 0 to 1.
     """
 
     effects: tuple[str, ...]
     quantities: tuple[tuple[str, str], ...]
     detectable: np.ndarray
-    alike: np.ndarray
+    cosines: np.ndarray
 
     def confused(self, threshold: float = SAME) -> list[tuple[str, str]]:
         """Pairs of effects, the second of which can pass for the first: this experiment cannot tell them apart."""
-        pairs = np.argwhere(self.alike - np.eye(len(self.effects)) > threshold)
+        pairs = np.argwhere(self.cosines - np.eye(len(self.effects)) > threshold)
         return [(self.effects[i], self.effects[j]) for i, j in pairs]
 
     def as_json(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class Isolability:
                 {"quantity": name, "unit": unit, "value": float(value) if math.isfinite(value) else None}
                 for (name, unit), value in zip(self.quantities, self.detectable, strict=True)
             ],
-            "alike": np.round(self.alike, 4).tolist(),
+            "alike": np.round(self.cosines, 4).tolist(),
             "score": SCORE,
         }
 
@@ -109,13 +109,13 @@ def isolability(
             free = np.ones(1, bool)
             known[id(effect)] = Response(paths=((np.ones(1), column),), cones=((column, free),), either=True)
     responses = [known[id(effect)] for effect in effects]
-    detectable, alike = compare(responses, common, prior_residual_of(problem), score)
+    detectable, cosines = compare(responses, common, prior_residual_of(problem), score)
     first = [e.quantities[0] for e in effects]
     return Isolability(
         effects=tuple(e.name for e in effects),
         quantities=tuple((q.name, q.unit) for q in first),
         detectable=detectable * np.array([q.scale for q in first]),
-        alike=alike,
+        cosines=cosines,
     )
 
 

@@ -40,7 +40,7 @@ class Proposal:
     """
 
     words: str
-    alike: float
+    cosine: float
     distance: float
 
 
@@ -114,8 +114,8 @@ def advice(proposals: Sequence[Proposal]) -> str:
         return "None of the trials that were thought of would tell them apart."
     return (
         f"To tell them apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
-        f"deviations and are {100 * best.alike:.0f} % alike, where the same trial once more gives "
-        f"{same.distance**0.5:.1f} and {100 * same.alike:.0f} %."
+        f"deviations and are {100 * best.cosine:.0f} % alike, where the same trial once more gives "
+        f"{same.distance**0.5:.1f} and {100 * same.cosine:.0f} %."
     )
 
 
@@ -220,13 +220,13 @@ def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerMotion], 
     common = still[:, 1:] / STEP
     # What each makes, and how it may still change.
     cones = [np.concatenate([b[:, :1], b[:, 1:] - b[:, :1]], 1) for b in both]
-    alike, distance = 0.0, np.inf
+    cosine, distance = 0.0, np.inf
     for mine, other in (cones, cones[::-1]):
         size, slopes = settle(mine[:, 0], common, prior_residual_of(problem))
         left = cleared(np.concatenate([mine[:, :1], other], 1), common, slopes)
         same = imitation(left[:, 0], left[:, 1:], np.ones(other.shape[1], bool))
-        alike, distance = max(alike, same), min(distance, size**2 * (1 - same**2))
-    return Proposal(words=choice.words, alike=alike, distance=distance)
+        cosine, distance = max(cosine, same), min(distance, size**2 * (1 - same**2))
+    return Proposal(words=choice.words, cosine=cosine, distance=distance)
 
 
 def _timed(trial: Trial, of: Trial) -> Trial:

@@ -11,7 +11,7 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
-LATE = 3.0  # standard deviations that a clock may be behind
+CLOCK_LIMIT = 3.0  # standard deviations of a clock offset, beyond which it is not looked for
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -89,7 +89,7 @@ class ObservationModel:
         trial, clock, rate = self.trials[number], self.deviations[number], self.deviations[len(self.trials)]
         assert trial.recording is not None
         last = float(trial.recording.time[-1])
-        return max(trial.setup.duration, (last + LATE * clock) * (1 + LATE * rate))
+        return max(trial.setup.duration, (last + CLOCK_LIMIT * clock) * (1 + CLOCK_LIMIT * rate))
 
     def observe(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> np.ndarray:
         """What trial ``number`` would have recorded.

@@ -100,8 +100,8 @@ class Mismatch:
             return f"Trial {self.trial}: recording and simulation agree throughout."
         worst = together(self.before)[self.time >= (self.start or 0.0)].max()
         return (
-            f"Trial {self.trial}: they part {self.where}; from then on they are up to {worst:.2g} times as far apart "
-            "as noise and the simulation's own error explain."
+            f"Trial {self.trial}: the recording leaves the simulation {self.where}; from then on they are up to "
+            f"{worst:.2g} standard deviations of noise and of the simulation's own error apart."
         )
 
 

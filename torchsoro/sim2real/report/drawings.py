@@ -19,40 +19,50 @@ from torchsoro.sim2real.inference.phases import BEYOND, Mismatch, together
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 PLACE, BODY = "#a3154a", "#52606d"
 EDGES = 400  # of a body, that are drawn at most
+LEAST_RANGE = 0.15  # of the widest panel's range, that any panel shows
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
 BANDS = ("#e9eef4", "#f8f4ea")  # of phases, in turn
 
 
-def draw_trial(trial: Trial, before: Prediction, after: Prediction) -> Figure:
-    """Each marker's recorded axes over time."""
+def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray) -> Figure:
+    """Each marker's recorded coordinates over time, with two simulations [T, M, A] m.
+
+    No panel shows less than a share of the widest one's range, so that noise does not look like motion.
+    """
     recording = trial.recording
     assert recording is not None
     names = [m.name for m in trial.setup.markers]
     count, axes = len(names), recording.axes
-    high = 1.2 + 1.35 * count
-    figure = Figure(figsize=(11, high))
+    high = 1.2 + 1.25 * count
+    figure = Figure(figsize=(9, high))
     panels: Any = figure.subplots(count, len(axes), sharex=True, squeeze=False)
-    # By hand: to have dozens of panels laid out takes longer than to draw them.
-    figure.subplots_adjust(left=0.065, right=0.99, bottom=0.5 / high, top=1 - 0.35 / high, wspace=0.14, hspace=0.12)
+    # By hand: the layout engine takes longer for dozens of panels than to draw them.
+    figure.subplots_adjust(left=0.085, right=0.985, bottom=0.5 / high, top=1 - 0.65 / high, wspace=0.2, hspace=0.14)
+    curves = 1e3 * np.stack([recording.place, believed, explained])
+    low, top = np.nanmin(curves, axis=(0, 1)), np.nanmax(curves, axis=(0, 1))
+    half = 0.54 * np.maximum(top - low, LEAST_RANGE * float((top - low).max()))
     for m, a in np.ndindex(count, len(axes)):
         panel: Axes = panels[m, a]
-        panel.plot(recording.time, 1e3 * recording.place[:, m, a], ".", ms=2, color=RECORDED, label="recorded")
-        panel.plot(recording.time, 1e3 * before.seen[:, m, a], "-", lw=1, color=NOMINAL, label="believed")
-        panel.plot(recording.time, 1e3 * after.seen[:, m, a], "-", lw=1, color=EXPLAINED, label="explained")
-        panel.tick_params(labelsize=7)
+        panel.plot(recording.time, curves[1, :, m, a], "-", lw=1.2, color=NOMINAL, label="believed")
+        panel.plot(recording.time, curves[2, :, m, a], "-", lw=1.6, color=EXPLAINED, label="explained")
+        panel.plot(recording.time, curves[0, :, m, a], ".", ms=2.5, color=RECORDED, label="recorded")
+        middle = (low[m, a] + top[m, a]) / 2
+        panel.set_ylim(middle - half[m, a], middle + half[m, a])
+        panel.locator_params(axis="y", nbins=4)
+        panel.tick_params(labelsize=7.5)
         if a == 0:
-            panel.set_ylabel(f"{names[m]} [mm]", fontsize=8)
+            panel.set_ylabel(f"{names[m]} [mm]", fontsize=9)
         if m == 0:
-            panel.set_title("xyz"[axes[a]], fontsize=9)
+            panel.set_title("xyz"[axes[a]], fontsize=10)
         if m == count - 1:
-            panel.set_xlabel("time [s]", fontsize=8)
-    panels[0, 0].legend(fontsize=7)
+            panel.set_xlabel("time [s]", fontsize=9)
+    figure.legend(*panels[0, 0].get_legend_handles_labels(), loc="upper right", ncols=3, fontsize=9, frameon=False)
     return figure
 
 
 def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after: str) -> Figure:
-    """Mismatch of each trial over time, phases as bands; ``after`` says what the second line is."""
-    figure = Figure(figsize=(11, 0.4 + 2.2 * len(mismatches)), layout="constrained")
+    """Distance of each trial's simulations over time, phases as bands; ``after`` names the second line."""
+    figure = Figure(figsize=(9, 0.4 + 2.1 * len(mismatches)), layout="constrained")
     panels: Any = figure.subplots(len(mismatches), 1, squeeze=False)
     for panel, m, trial in zip(panels[:, 0], mismatches, trials, strict=True):
         for k, p in enumerate(m.phases):
@@ -70,12 +80,12 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after
                     color="0.35",
                     rotation=0 if wide > 0.014 * len(p.name) / 2 else 90,
                 )
-        for values, color, label in ((m.before, NOMINAL, "before"), (m.after, EXPLAINED, after)):
+        for values, color, label in ((m.before, NOMINAL, "believed"), (m.after, EXPLAINED, after)):
             panel.plot(m.time, np.maximum(together(values), 0.1), color=color, lw=1.2, label=label)
         panel.axhline(BEYOND, color="0.5", lw=0.8, ls=":")
         if m.start is not None:
-            panel.axvline(m.start, color=PLACE, lw=1.2, label=f"they part, most at {m.marker}")
-        panel.set(ylabel="mismatch", yscale="log", xlim=(0, trial.setup.duration))
+            panel.axvline(m.start, color=PLACE, lw=1.2, label=f"departure, most at {m.marker}")
+        panel.set(ylabel="standard deviations", yscale="log", xlim=(0, trial.setup.duration))
         top = panel.get_ylim()[1]
         panel.set_ylim(0.3, 4 * max(top, 3.0))  # room for the names of the phases
         panel.set_title(f"trial {m.trial}", fontsize=9, loc="left")
@@ -101,16 +111,16 @@ def draw_body(
     forces: ForceMap | None,
     said: str,
 ) -> Figure:
-    """Markers on the body in space, coloured by mismatch, with the places of effects and of forces.
+    """Markers on the body in space, coloured by their distance from the recording, with places of effects and forces.
 
     ``said`` is what the second picture shows.
     """
-    figure = Figure(figsize=(11, 4.6), layout="constrained")
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
     at, low, size = (1e3 * np.array(v) for v in ([m.at for m in setup.markers], setup.origin, setup.size))
     values = [1e3 * np.sqrt(np.mean([p.error**2 for p in all_], axis=0)) for all_ in (before, after)]
     most = max(float(values[0].max()), float(values[1].max()), 1e-6)
     panels, points = [], None
-    for k, title in enumerate(("before", said)):
+    for k, title in enumerate(("believed", said)):
         panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
         panels.append(panel)
         panel.patch.set_visible(False)  # which would cover the other's label
@@ -143,7 +153,7 @@ def draw_body(
         if shown:
             panel.legend(fontsize=7, loc="upper left")
     assert points is not None
-    figure.colorbar(points, ax=panels, shrink=0.7, label="off by [mm]")
+    figure.colorbar(points, ax=panels, shrink=0.7, label="distance [mm]")
     return figure
 
 
@@ -194,17 +204,18 @@ def draw_forces(forces: ForceMap, setup: Setup) -> Figure:
     return figure
 
 
-def draw_alike(found: Isolability) -> Figure:
-    """A heat map of what looks alike."""
-    count = len(found.effects)
+def draw_cosines(found: Isolability) -> Figure:
+    """A heat map of how much of each effect's change another can imitate."""
+    names = [name.replace("_", " ") for name in found.effects]
+    count = len(names)
     figure = Figure(figsize=(3.2 + 0.36 * count, 2.2 + 0.3 * count), layout="constrained")
     panel: Axes = figure.subplots()
-    image = panel.imshow(found.alike, vmin=0, vmax=1, cmap="Blues", aspect="auto")
+    image = panel.imshow(found.cosines, vmin=0, vmax=1, cmap="Blues", aspect="auto")
     for i, j in np.ndindex(count, count):
-        if i != j and found.alike[i, j] > 0.5:
-            color = "white" if found.alike[i, j] > 0.7 else "black"
-            panel.text(j, i, f"{found.alike[i, j]:.2f}", ha="center", va="center", fontsize=6, color=color)
-    panel.set_xticks(range(count), found.effects, rotation=90, fontsize=7)
-    panel.set_yticks(range(count), found.effects, fontsize=7)
+        if i != j and found.cosines[i, j] > 0.5:
+            color = "white" if found.cosines[i, j] > 0.7 else "black"
+            panel.text(j, i, f"{found.cosines[i, j]:.2f}", ha="center", va="center", fontsize=7, color=color)
+    panel.set_xticks(range(count), names, rotation=90, fontsize=8)
+    panel.set_yticks(range(count), names, fontsize=8)
     figure.colorbar(image, ax=panel, shrink=0.8)
     return figure

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.discretization import DiscretizationError
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import ForceMap
@@ -21,9 +22,11 @@ from torchsoro.sim2real.inference.phases import Mismatch
 from torchsoro.sim2real.inference.ranking import correlation
 from torchsoro.sim2real.inference.verdict import Verdict
 
-LEVEL = 0.9
-PLACE = 0.07  # of the body's size, that a place may be off, as ``Hypothesis.form`` of a parameter
-BROKEN = 1e3  # error on trials left out over that without an effect, where that breaks down: JSON knows no infinity
+LEVEL = 0.9  # probability that an interval is to hold the truth
+# Standard deviation of a place by the form of the model, over the body's size; as Hypothesis.model_form_deviation of a
+# parameter.
+PLACE_DEVIATION = 0.07
+BROKEN = 1e3  # held-out error ratio of a simulation that breaks down, as JSON knows no infinity
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -32,16 +35,18 @@ class Explanation:
 
     Attributes:
         problem: Recordings and twin.
-        numerics: The twin's own error.
+        discretization: The twin's own error.
         verdict: What can be said.
-        before: All trials as believed, those that were fitted first.
-        after: The same with the best effect, or with nothing where nothing is missing.
+        before: Predictions of all trials by the setup as stated, those that were fitted first.
+        after: The same with the best effect, or by the null model where no effect is chosen.
         heldout: Names of the trials that were only predicted.
-        seconds: It took.
-        isolability: What the experiment can tell, if that was asked.
-        following: What could be recorded next, best first, where effects are not told apart.
-        mismatches: Where and when each trial and its simulation part.
-        forces: That would be needed where no effect fits.
+        seconds: Wall time of the explanation.
+        drawn: Of each trial, what the setup as stated would have recorded by the clock of ``after`` [T, M, A] m; the
+            recordings of ``before`` if empty.
+        isolability: Which effects the experiment can detect and tell apart, if that was asked.
+        following: Trials that could be recorded next, best first, where effects are not told apart.
+        mismatches: Of each trial, where and when the recording leaves the simulation.
+        forces: That would explain the difference where no effect does.
     """
 
     problem: FitProblem
@@ -51,6 +56,7 @@ class Explanation:
     after: tuple[Prediction, ...]
     heldout: tuple[str, ...]
     seconds: float
+    drawn: tuple[np.ndarray, ...] = ()
     isolability: Isolability | None = None
     following: tuple[Proposal, ...] = ()
     mismatches: tuple[Mismatch, ...] = ()
@@ -58,12 +64,22 @@ class Explanation:
 
     @property
     def best(self) -> Fit:
-        """The fit that is shown: of the best effect, or of nothing."""
+        """The fit that is shown: of the best effect, or the null model."""
         return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.null_model
 
 
 def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, Any]]:
-    """The effects of a fit, as in explanation.json; intervals by the law of errors, within bounds."""
+    """The effects of a fit, as in explanation.json.
+
+    Intervals come from the covariance of the fit, widened by the scatter and the correlation of its residuals and by
+    the model-form standard deviation, through the slopes of the reported quantities. Of a quantity that is the
+    exponential of an unknown the interval is symmetric in its logarithm; any other ends where its quantity does.
+
+    Args:
+        fit: Of one effect or several.
+        weight: Of the fit among those that are not told apart, 0 to 1.
+        problem: That was fitted.
+    """
     wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
     spread, size = max(1.0, fit.chi2 / fit.samples) * correlation(fit), np.array(problem.twin.setup.size)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
@@ -73,18 +89,18 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
         own = np.where(logarithm, 1.0, values[:count])
         whole = spread * covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)
         steps = 1e-4 * np.array([q.scale for q in effect.quantities])
-        told = effect.reported(values[:count], scenario)
+        reported = effect.reported(values[:count], scenario)
         ahead = [effect.reported(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
         parameters = {}
-        for name, (value, unit) in told.items():
+        for name, (value, unit) in reported.items():
             slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
             half = wide * math.sqrt(max(float(slope @ whole @ slope), 0.0))
-            parameters[name] = {"value": value, "low": value - half, "high": value + half, "unit": unit}
-            for quantity in effect.quantities:
-                if quantity.name == name:
-                    parameters[name]["low"] = max(value - half, quantity.least * quantity.scale)
+            low, high = _interval(effect, name, value, half)
+            parameters[name] = {"value": value, "low": low, "high": high, "unit": unit}
         place = effect.place(values, problem.twin)
-        within = wide * np.sqrt(spread * np.diag(covariance)[count:] + (PLACE * size[: 3 * effect.local]) ** 2)
+        within = wide * np.sqrt(
+            spread * np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2
+        )
         rows.append(
             {
                 "name": effect.name,
@@ -96,6 +112,17 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
             }
         )
     return rows
+
+
+def _interval(effect: Hypothesis, name: str, value: float, half: float) -> tuple[float, float]:
+    """The interval of a reported quantity, within what is possible."""
+    if name in effect.ratios and value > 0:
+        ratio = math.exp(min(half / value, 50.0))
+        return value / ratio, value * ratio
+    least = max([q.least * q.scale for q in effect.quantities if q.name == name], default=-math.inf)
+    if name in effect.nonnegative:
+        least = max(least, 0.0)
+    return max(value - half, least), value + half
 
 
 def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -153,7 +180,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "force_map": None if e.forces is None else _needed(e.forces),
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
         "isolability": None if e.isolability is None else e.isolability.as_json(),
-        "next": [{"record": p.words, "alike": p.alike, "distance": p.distance} for p in e.following],
+        "next": [{"record": p.words, "alike": p.cosine, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),
         "settings": dict(settings),

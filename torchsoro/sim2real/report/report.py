@@ -14,9 +14,17 @@ from torchsoro.output.document import Document
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.cosines import SCORE
 from torchsoro.sim2real.inference.isolability import SAME, Isolability
-from torchsoro.sim2real.report.drawings import draw_alike, draw_body, draw_forces, draw_mismatch, draw_trial
+from torchsoro.sim2real.report.drawings import draw_body, draw_cosines, draw_forces, draw_mismatch, draw_trial
 from torchsoro.sim2real.report.explanation import Explanation, as_json, effect_rows
-from torchsoro.sim2real.report.sentences import _said, lead
+from torchsoro.sim2real.report.sentences import candidate_words, evidence, verdict_sentence
+from torchsoro.sim2real.report.words import (
+    effect_words,
+    error_number,
+    error_words,
+    interval,
+    quantity_words,
+    with_unit,
+)
 from torchsoro.storage import atomic_write
 
 
@@ -27,35 +35,16 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         e: What was found.
         trials: All, in the order of ``e.before``.
         out: Folder, which exists.
-        settings: How it was asked for.
+        settings: Of the command line.
     """
     data = as_json(e, settings)
     with atomic_write(out / "explanation.json") as file:
         file.write((json.dumps(data, indent=2) + "\n").encode())
-    page = Document(e.problem.experiment.setup.title or "Explanation", lead(e))
-    page.section("Recorded, believed, explained")
-    for trial, before, after in zip(trials, e.before, e.after, strict=True):
-        kept = ", not used for the fit" if trial.name in e.heldout else ""
-        caption = f"Trial {trial.name}{kept}: markers as recorded, as believed, and as explained."
-        page.figure(draw_trial(trial, before, after), caption)
-    page.section("Where and when")
-    page.text(" ".join(map(str, e.mismatches)))
-    after = "after" if e.verdict.chosen else "fitted without an effect"
-    page.figure(
-        draw_mismatch(e.mismatches, trials, after),
-        "Mismatch over time before and after, in what noise and the simulation's own error explain, with the phases of "
-        "each trial; where a pressure is supplied it is grey.",
-    )
-    places = [
-        (row["name"], np.array(row["location_m"]))
-        for c in e.verdict.chosen
-        for row in effect_rows(c.fit, 0.0, e.problem)
-        if row["location_m"] is not None
-    ]
-    page.figure(
-        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces, after),
-        "Mismatch on the body by marker, root mean square over all trials.",
-    )
+    page = Document(e.problem.experiment.setup.title or "Explanation", verdict_sentence(e))
+    page.points(evidence(e))
+    _effects(page, e)
+    _trials(page, e, trials)
+    _mismatches(page, e, trials)
     if e.forces is not None:
         page.section("The force that would be needed")
         page.text(f"{e.forces} A force stands in for what is missing; it does not say what that is.")
@@ -63,78 +52,149 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
             draw_forces(e.forces, e.problem.experiment.setup),
             "Size of the force by place and time, and the components of the strongest, with standard deviations.",
         )
-    page.section("What was considered")
-    considered = [
-        {
-            "effect": c.fit.name,
-            "changes": " and ".join(effect.affected_quantity for effect in c.fit.effects),
-            "score": c.score,
-            "of the difference [%]": 100 * c.explained,
-            "misfit / samples": c.fit.chi2 / c.fit.samples,
-            "left out, after / before": "breaks down" if math.isinf(c.heldout_ratio) else c.heldout_ratio,
-            "parameters": _said(c, e.problem),
-        }
-        for c in e.verdict.ranking
-    ]
-    if considered:
-        page.table(
-            considered,
-            "Score: gain in ln of the likelihood, studentised, less what the parameters are worth. The highest is not "
-            "believed if it predicts trials that were left out hardly better than no effect does, or much worse than "
-            "another.",
-        )
+    _considered(page, e)
     if e.isolability is not None:
         page.section("What this experiment can tell")
         write_isolability(page, e.isolability)
-    page.section("Errors")
+    _accuracy(page, e, data)
+    page.save(out / "report.html")
+
+
+def _effects(page: Document, e: Explanation) -> None:
+    """Quantities of the effects that were chosen."""
+    rows = [
+        {
+            "effect": effect_words(row["name"]),
+            "quantity": quantity_words(row["name"], name),
+            "value": with_unit(p["value"], p["unit"], name),
+            "90 % interval": interval(p["low"], p["high"], p["unit"], name),
+        }
+        for c in e.verdict.chosen
+        for row in effect_rows(c.fit, 0.0, e.problem)
+        for name, p in row["parameters"].items()
+    ]
+    if rows:
+        page.section("What is missing")
+        page.table(rows)
+
+
+def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
+    """Markers over time; the trial that is the furthest off is open."""
+    page.section("Recorded, believed, explained")
+    page.text(
+        "Believed is the simulation of the setup as stated; explained is the same with "
+        + ("the effect above." if e.verdict.chosen else "modulus, pressure and measurement errors fitted.")
+    )
+    worst = max(e.before, key=lambda p: p.total).trial
+    drawn = e.drawn or tuple(p.seen for p in e.before)
+    for trial, before, after in zip(trials, drawn, e.after, strict=True):
+        heldout = ", not used for the fit" if trial.name in e.heldout else ""
+        caption = f"Trial {trial.name}{heldout}: coordinates of the markers."
+        folded = "" if trial.name == worst else f"Trial {trial.name}{heldout}"
+        page.figure(draw_trial(trial, before, after.seen), caption, folded=folded)
     page.table(
         [
             {
                 "trial": b.trial,
-                "before [mm]": 1e3 * b.total,
-                "after [mm]": 1e3 * a.total,
-                "used": b.trial not in e.heldout,
+                "as believed [mm]": 1e3 * b.total,
+                "as explained [mm]": 1e3 * a.total,
+                "used for the fit": b.trial not in e.heldout,
             }
             for b, a in zip(e.before, e.after, strict=True)
         ],
-        "Root mean square over markers, in space.",
+        "Distance between recording and simulation, root mean square over markers and time.",
     )
-    page.section("What is not physics")
-    noise = data["noise"]
-    page.text(
-        f"Noise {1e3 * noise['standard_deviation_m']:.3f} mm. The simulation's own error, from twins with cells of "
-        f"{', '.join(f'{1e3 * s:.2f}' for s in e.discretization.edges)} mm: "
-        + ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
-        + f". {e.discretization.walls[0]} cells through the thinnest wall, corrected by a twin with "
-        f"{e.discretization.walls[1]}."
+
+
+def _mismatches(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
+    """Where and when recordings leave the simulation."""
+    page.section("Where and when")
+    page.points([str(m) for m in e.mismatches])
+    after = "explained" if e.verdict.chosen else "fitted without an effect"
+    page.figure(
+        draw_mismatch(e.mismatches, trials, after),
+        "Distance between recording and simulation over time, in standard deviations of noise and of the simulation's "
+        "own error, over the phases of each trial. Dotted: three standard deviations. Grey: supplied pressure.",
     )
-    deviations = dict(zip(e.problem.observation.names, e.problem.observation.deviations, strict=True))
-    page.table(
-        [
-            {"measurement error": name, "fitted": value, "believed within": deviations.get(name)}
-            for name, value in data["nuisance"].items()
-        ]
+    places = [
+        (effect_words(row["name"]), np.array(row["location_m"]))
+        for c in e.verdict.chosen
+        for row in effect_rows(c.fit, 0.0, e.problem)
+        if row["location_m"] is not None
+    ]
+    page.figure(
+        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces, after),
+        "Distance between recording and simulation at each marker, root mean square over all trials.",
     )
-    page.text(f"{e.problem.tally.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")
-    page.save(out / "report.html")
+
+
+def _considered(page: Document, e: Explanation) -> None:
+    """All effects that were fitted."""
+    rows = [
+        {
+            "effect": effect_words(c.fit.name),
+            "changes": " and ".join(effect.affected_quantity for effect in c.fit.effects),
+            "score": round(c.score, 1),
+            "explains [%]": round(100 * c.explained, 1),
+            "chi² / samples": c.fit.chi2 / c.fit.samples,
+            "held-out error": "breaks down" if math.isinf(c.heldout_ratio) else c.heldout_ratio,
+            "fitted": candidate_words(c, e.problem, every=True).partition(": ")[2],
+        }
+        for c in e.verdict.ranking
+    ]
+    if rows:
+        page.section("What was considered")
+        page.table(
+            rows,
+            "Score: gain in log-likelihood over the setup without an effect, scaled by the scatter of the residuals, "
+            "less a penalty for each parameter. Held-out error: on trials left out of the fit, over that without an "
+            "effect; an effect with a value near 1, or far above another's, is not chosen.",
+        )
 
 
 def write_isolability(page: Document, found: Isolability) -> None:
-    """What would be seen, and what looks alike."""
-    alike = found.confused()
+    """Which effects would be detected, and which could be mistaken for which."""
+    confused = found.confused()
     page.table(
         [
             {
-                "effect": name,
-                "quantity": quantity,
-                "seen from": value if math.isfinite(value) else None,
-                "unit": unit,
-                "may pass for it": ", ".join(b for a, b in alike if a == name),
+                "effect": effect_words(name),
+                "quantity": quantity_words(name, quantity),
+                "detectable from": with_unit(value, unit, quantity) if math.isfinite(value) else None,
+                "may be mistaken for": ", ".join(effect_words(b) for a, b in confused if a == name),
             }
             for name, (quantity, unit), value in zip(found.effects, found.quantities, found.detectable, strict=True)
         ],
-        f"By times, markers and noise alone: the strength from which on an effect stands out (score {SCORE:g}), beside "
-        f"measurement errors, modulus and pressure; and what else can make {100 * SAME:.0f} % of its change.",
+        f"By times, markers and noise alone: the strength at which an effect is detectable (gain in chi-squared of "
+        f"{SCORE:g}) beside measurement errors, modulus and pressure, and the effects that can imitate "
+        f"{100 * SAME:.0f} % of its change.",
+        folded="Which effects this experiment can detect, and which it cannot tell apart",
     )
-    caption = "How much of the change that the effect of a row makes, that of a column can imitate."
-    page.figure(draw_alike(found), caption)
+    caption = "Cosine: how much of the change that the effect of a row makes, that of a column can imitate."
+    page.figure(draw_cosines(found), caption, folded="How much of each effect the others can imitate")
+
+
+def _accuracy(page: Document, e: Explanation, data: Mapping[str, Any]) -> None:
+    """Noise, the simulation's own error, and measurement errors."""
+    page.section("Accuracy")
+    noise, cells = data["noise"], e.discretization
+    own = ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
+    page.text(
+        f"Noise of the recordings: {1e3 * noise['standard_deviation_m']:.3f} mm (standard deviation). Error of the "
+        f"simulation itself: {own}, from cells of {' and '.join(f'{1e3 * s:.2f}' for s in cells.edges)} mm, "
+        f"{' and '.join(map(str, cells.walls))} of them through the thinnest wall."
+    )
+    names, common = e.problem.observation.names, [tolerance for _, tolerance in e.problem.common]
+    deviations = dict(zip(["ln_modulus", "ln_pressure"], common, strict=False))
+    deviations |= dict(zip(names, e.problem.observation.deviations, strict=True))
+    rows = []
+    for name, value in data["nuisance"].items():
+        words, unit = error_words(name)
+        prior = error_number(deviations[name], unit) if name in deviations else None
+        rows.append({"fitted always": words, "value": error_number(value, unit), "prior ±": prior})
+    page.table(
+        rows,
+        "Measurement errors, and what the setup's modulus and pressure are off, with their priors.",
+        folded="Measurement errors",
+    )
+    page.text(f"{e.problem.tally.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")

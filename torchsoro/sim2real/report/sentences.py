@@ -1,108 +1,126 @@
-"""What a report says, in sentences."""
+"""What a report says, in sentences: the verdict first, then what it rests on."""
 
 from __future__ import annotations
 
 import math
-import re
 
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
 from torchsoro.sim2real.inference.ranking import Candidate
-from torchsoro.sim2real.inference.verdict import number
 from torchsoro.sim2real.report.explanation import Explanation, effect_rows
+from torchsoro.sim2real.report.words import (
+    MAIN,
+    effect_words,
+    error_number,
+    error_words,
+    interval,
+    quantity_words,
+    with_unit,
+)
 
-BELIEVED = 3.0  # standard deviations of a measurement error that are believed
+BELIEVED = 3.0  # prior standard deviations, beyond which the fitted value of a measurement error is not credible
+
+
+def verdict_sentence(e: Explanation) -> str:
+    """The answer."""
+    v = e.verdict
+    if v.kind == "nothing_missing":
+        return (
+            "Nothing is missing from the setup: measurement errors, modulus and pressure within their tolerances, and "
+            "the error of the simulation itself explain the difference."
+        )
+    if v.kind == "unknown_physics":
+        return "Something is missing from the setup that is none of the known effects."
+    parts = "; ".join(candidate_words(c, e.problem) for c in v.chosen)
+    if v.kind == "cannot_distinguish":
+        return f"One of these is missing from the setup, and the recordings cannot tell which: {parts}."
+    return f"Missing from the setup is {parts}."
+
+
+def evidence(e: Explanation) -> list[str]:
+    """What the verdict rests on, and what remains open, a sentence each."""
+    v = e.verdict
+    found = [_departure(e)]
+    if v.heldout:
+        held = list(v.heldout.values())
+        before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
+        trials = f"trial{'s' if len(held) > 1 else ''} {', '.join(v.heldout)}"
+        found.append(
+            f"On {trials}, left out of the fit, the error of the prediction is {1e3 * after:.2f} mm; that of the setup "
+            f"as stated is {1e3 * before:.2f} mm."
+        )
+    if v.kind == "unknown_physics":
+        if v.ranking:
+            best = v.ranking[0]
+            found.append(
+                f"The best of the known effects, {effect_words(best.fit.name)}, explains "
+                f"{100 * best.explained:.0f} % of the difference."
+            )
+        if e.forces:
+            found.append(str(e.forces))
+    if v.kind == "cannot_distinguish":
+        found.append(advice(e.following))
+    second = next((c for c in v.ranking if c is not v.chosen[0]), None) if v.kind == "explained" else None
+    if second is not None:
+        found.append(
+            f"Next best is {effect_words(second.fit.name)}, which explains {100 * max(second.explained, 0):.0f} % of "
+            f"the difference, against {100 * v.chosen[0].explained:.0f} %, and whose chi-squared is "
+            f"{second.fit.chi2 / v.chosen[0].fit.chi2:.3g} times as large."
+        )
+    if v.chosen:
+        found.append(_incredible_errors(e))
+    return [sentence for sentence in found if sentence]
 
 
 def lead(e: Explanation) -> str:
-    """The answer in plain words."""
-    v = e.verdict
-    held = list(v.heldout.values())
-    gain = ""
-    if held:
-        before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
-        gain = (
-            f" On trials that were left out ({', '.join(v.heldout)}) the error is {1e3 * after:.2f} mm instead of "
-            f"{1e3 * before:.2f} mm."
-        )
-    if v.kind == "nothing_missing":
-        return (
-            "Nothing is missing: clock, scale, marker places, modulus and pressure within their beliefs, and the error "
-            f"of the simulation itself explain the difference.{gain}"
-        )
-    if v.kind == "unknown_physics":
-        best = v.ranking[0] if v.ranking else None
-        tried = (
-            f" The best of what is known, {_plain(best.fit.name)}, takes away {100 * best.explained:.0f} % of it."
-            if best
-            else ""
-        )
-        force = f" {e.forces}" if e.forces else ""
-        return f"{_parting(e)}Something is missing that is none of the known effects.{tried}{gain}{force}"
-    parts = "; ".join(_said(c, e.problem) for c in v.chosen)
-    if v.kind == "cannot_distinguish":
-        following = f" {advice(e.following)}".rstrip()
-        which = f"One of these is missing, and this recording cannot tell which: {parts}."
-        return f"{_parting(e)}{which}{following}{gain}{_beyond(e)}"
-    second = next((c for c in v.ranking if c is not v.chosen[0]), None)
-    lost = ""
-    if second is not None:
-        lost = (
-            f" Next best is {_plain(second.fit.name)}, which takes away {100 * max(second.explained, 0):.0f} % of the "
-            f"difference against {100 * v.chosen[0].explained:.0f} %, and leaves "
-            f"{second.fit.chi2 / v.chosen[0].fit.chi2:.3g} times the misfit."
-        )
-    return f"{_parting(e)}Missing is {parts}.{gain}{lost}{_beyond(e)}"
+    """The verdict and what it rests on, as one paragraph."""
+    return " ".join([verdict_sentence(e), *evidence(e)])
 
 
-def _plain(name: str, unit: str = "") -> str:
-    """A name without its unit and underscores."""
-    suffix = re.sub(r"[ /]", "_", unit).lower()
-    return name.removesuffix(f"_{suffix}").replace("_", " ")
-
-
-def _parting(e: Explanation) -> str:
-    """Where and when, in the trial in which it is first."""
+def _departure(e: Explanation) -> str:
+    """Where and when the recording leaves the simulation, in the trial in which that is first."""
     apart = [m for m in e.mismatches if m.where]
     if not apart:
         return ""
     first = min(apart, key=lambda m: m.start or 0.0)
-    return f"Simulation and recording part in trial {first.trial} {first.where}. "
+    return f"The recording leaves the simulation of the setup as stated first in trial {first.trial}, {first.where}."
 
 
-def _beyond(e: Explanation) -> str:
-    """Measurement errors that are larger than can be believed: something else is hidden in them."""
+def _incredible_errors(e: Explanation) -> str:
+    """Measurement errors that are fitted beyond their priors, which hides something else in them."""
     observation = e.problem.observation
     large = []
     for name, value, deviation in zip(observation.names, e.best.errors, observation.deviations, strict=True):
         if abs(value) > BELIEVED * deviation:
-            unit = next((u for u in ("rad", "m", "s") if name.endswith(f"_{u}")), "1")
-            large.append(f"{_plain(name, unit)} {number(value, unit)} (believed within {deviation:.2g})")
+            words, unit = error_words(name)
+            large.append(f"{words} {error_number(value, unit)} (prior ±{error_number(deviation, unit)})")
     if not large:
         return ""
-    told = (
-        " But the fit bends measurement errors further than can be believed, so that more is missing than this: "
-        f"{', '.join(large)}."
-    )
+    sentence = f"More is missing than this, since measurement errors are fitted beyond belief: {', '.join(large)}."
     if e.verdict.excess > 1:
-        told += (
-            f" What is left over is {e.verdict.excess:.2g} times what noise and the simulation's own error explain; "
-            "where and when is drawn below."
+        sentence += (
+            f" Chi-squared is still {e.verdict.excess:.2g} times the number of samples; where and when is drawn below."
         )
-    return told
+    return sentence
 
 
-def _said(candidate: Candidate, problem: FitProblem) -> str:
+def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = False) -> str:
+    """An effect with its place and its main quantities, or all of them if ``every``."""
     parts = []
     for row in effect_rows(candidate.fit, 0.0, problem):
-        numbers = ", ".join(
-            f"{_plain(name, p['unit'])} {number(p['value'], p['unit'])} (90 %: {p['low']:.3g} to {p['high']:.3g})"
+        main = MAIN.get(row["name"], ())
+        numbers = [
+            f"{quantity_words(row['name'], name)} {with_unit(p['value'], p['unit'], name)} "
+            f"(90 %: {interval(p['low'], p['high'], p['unit'], name)})"
             for name, p in row["parameters"].items()
-        )
-        place = ""
-        if row["location_m"] is not None:
-            within = [f" ± {1e3 * w:.0f}" for w in row["location_within_m"] or []] or [""] * 3
-            at = [f"{1e3 * x:.0f}{w}" for x, w in zip(row["location_m"], within, strict=True)]
-            place = f" at ({', '.join(at)}) mm"
-        parts.append(f"{_plain(row['name'])}{place}: {numbers}")
+            if every or not main or name in main
+        ]
+        parts.append(f"{effect_words(row['name'])}{_place(row)}: {', '.join(numbers)}")
     return " and ".join(parts)
+
+
+def _place(row: dict) -> str:
+    if row["location_m"] is None:
+        return ""
+    within = [f" ± {1e3 * w:.0f}" for w in row["location_within_m"] or []] or [""] * 3
+    return f" at ({', '.join(f'{1e3 * x:.0f}{w}' for x, w in zip(row['location_m'], within, strict=True))}) mm"
