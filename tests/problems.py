@@ -12,7 +12,7 @@ from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fi
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.rollout import initial_state, rollout
-from torchsoro.simulation.ops.segment import Inputs, Scene
+from torchsoro.simulation.ops.scene import Inputs, Scene
 
 H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
 DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s

@@ -12,8 +12,8 @@ from problems import DT, H, block, problem, rotations, simulator
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers, spline
-from torchsoro.simulation.ops.segment import Inputs
-from torchsoro.simulation.ops.total import TotalMarch
+from torchsoro.simulation.ops.scene import Inputs
+from torchsoro.simulation.ops.total import TotalSegmentIntegrator
 
 SHAPES = st.tuples(*[st.sampled_from([2, 4, 6, 8])] * 3)
 CELLS = st.floats(1e-3, 10.0)
@@ -249,9 +249,9 @@ def test_the_constants_of_the_layout_agree_with_its_names():
 def test_a_segment_lays_its_quantities_where_the_constants_say():
     p = problem(formulation="total", batch=2)
     t = {name: value for name, value in p.tensors.items() if name not in ("state", "weight")}
-    march = TotalMarch(p.scene, Inputs(**t), first=0, samples=())
-    ints = march._ints([march.fixed, march.supply, march.kept, march.scratch])
-    lat = march.lattice
+    integrator = TotalSegmentIntegrator(p.scene, Inputs(**t), first=0, samples=())
+    ints = integrator._ints([integrator.fixed, integrator.supply, integrator.kept, integrator.scratch])
+    lat = integrator.lattice
     sizes = {
         **{"BATCH": 2, "NX": 4, "NY": 4, "NZ": 4, "ELEMENTS": 2, "CHAMBERS": 2, "GROUPS": 2, "PLANES": 3},
         **{"SPRINGS": 1, "VISCOUS": 1, "STEPS": 6},
@@ -261,21 +261,21 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
     laid = {
         (ints, layout.KIND): p.scene.kind,
         (ints, layout.PLANE_KIND): p.scene.plane_kind,
-        (march.fixed.buffer, layout.NUMBERS): torch.tensor(numbers(lat, p.scene.dt), dtype=torch.float64),
-        (march.fixed.buffer, layout.COEFFICIENT): t["coefficients"],
-        (march.fixed.buffer, layout.ELEMENT): t["prony"],
-        (march.fixed.buffer, layout.PLANE_NUMBERS): t["planes"],
-        (march.fixed.buffer, layout.NODES): march.nodal,
-        (march.fixed.buffer, layout.CHAMBER_NUMBERS): march.chamber,
-        (march.fixed.buffer, layout.SHARE): p.scene.share,
-        (march.supply.buffer, layout.PRESSURE): t["pressure"],
-        (march.supply.buffer, layout.GRAVITY): t["gravity"],
-        (march.supply.buffer, layout.FORCE): t["force"],
+        (integrator.fixed.buffer, layout.NUMBERS): torch.tensor(numbers(lat, p.scene.dt), dtype=torch.float64),
+        (integrator.fixed.buffer, layout.COEFFICIENT): t["coefficients"],
+        (integrator.fixed.buffer, layout.ELEMENT): t["prony"],
+        (integrator.fixed.buffer, layout.PLANE_NUMBERS): t["planes"],
+        (integrator.fixed.buffer, layout.NODES): integrator.nodal,
+        (integrator.fixed.buffer, layout.CHAMBER_NUMBERS): integrator.chamber,
+        (integrator.fixed.buffer, layout.SHARE): p.scene.share,
+        (integrator.supply.buffer, layout.PRESSURE): t["pressure"],
+        (integrator.supply.buffer, layout.GRAVITY): t["gravity"],
+        (integrator.supply.buffer, layout.FORCE): t["force"],
     }
     for (buffer, constant), wanted in laid.items():
         start = int(ints[constant])
         assert torch.equal(buffer[start : start + wanted.numel()], wanted.detach().reshape(-1)), constant
-    table = march.fixed.buffer[: layout.LATTICE_NUMBERS]
+    table = integrator.fixed.buffer[: layout.LATTICE_NUMBERS]
     weight, _, slope = spline(2, QUADRATURE)
     assert float(table[layout.STEP_SIZE]) == p.scene.dt
     assert float(table[layout.EDGE]) == lat.cell

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import backward, forward, layout, total, total_adjoint
 from torchsoro.simulation.ops.rollout import rollout
-from torchsoro.simulation.ops.segment import Inputs
+from torchsoro.simulation.ops.scene import Inputs
 
 HERE = Path(__file__).parent
 FORMS = {"apic": {"blend": 0.0}, "mixed": {"blend": 0.7}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}
@@ -179,15 +179,6 @@ def test_gradients_do_not_depend_on_which_are_wanted(form):
         torch.testing.assert_close(alone, every[name], rtol=1e-13, atol=1e-13)
     # Nor are kernels compiled anew, half a minute each, for every choice of tensors that require gradients.
     assert [len(k) for k in kernels] == variants
-
-
-@forms("apic", "total")
-def test_second_derivatives_are_refused(form):
-    p = problem(**form)
-    x = p.tensors["gravity"].clone().requires_grad_()
-    (g,) = torch.autograd.grad(combined(p.run({"gravity": x})).square(), [x], create_graph=True)
-    with pytest.raises(RuntimeError, match="once_differentiable"):
-        g.sum().backward()
 
 
 @forms("apic", "total")

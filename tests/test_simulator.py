@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsoro import Plane, Prony, Waveform, ground, stable_step
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops import segment as march_module
+from torchsoro.simulation.ops import segment
 from torchsoro.simulation.simulator import plan_checkpoints
 
 FREE = (0.0, 0.0, 0.0)
@@ -89,7 +89,7 @@ def test_mass_is_conserved_on_the_grid(dtype, monkeypatch):
     _, body = block((4, 4, 6), air=True, dtype=dtype)
     body = replace(body, velocity=(0.3 * noise(96, 3)).to(dtype), mass=body.mass.clone().requires_grad_())
     totals = []
-    forward = march_module.March.forward
+    forward = segment.SegmentIntegrator.forward
 
     def watch(self, *arguments, **keywords):
         states = forward(self, *arguments, **keywords)
@@ -99,7 +99,7 @@ def test_mass_is_conserved_on_the_grid(dtype, monkeypatch):
             totals.append(nodes[..., layout.NODE_MASS].double().sum(1))
         return states
 
-    monkeypatch.setattr(march_module.March, "forward", watch)
+    monkeypatch.setattr(segment.SegmentIntegrator, "forward", watch)
     simulator()(body, duration=100 * DT, gravity=FREE)
     total = torch.cat(totals)
     assert len(total) == 100

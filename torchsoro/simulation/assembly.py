@@ -12,7 +12,7 @@ from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached
 from torchsoro.simulation.material import Body
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.segment import Inputs, Scene
+from torchsoro.simulation.ops.scene import Inputs, Scene
 
 MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # bytes that a rollout may keep for its gradient, by device
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import atexit
+import functools
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
@@ -12,6 +14,9 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
 
 import taichi as ti
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
+
+P = ParamSpec("P")
+T = TypeVar("T")
 
 _started: str | None = None
 
@@ -70,3 +75,21 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
         options["saturating_grid_dim"] = 4 * torch.cuda.get_device_properties(0).multi_processor_count
     ti.init(arch=ti.cuda if kind == "cuda" else ti.cpu, offline_cache=True, log_level=ti.WARN, **options)
     _started = kind
+
+
+def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
+    """A function that ``torch.compile`` does not trace, at the price of graph breaks.
+
+    As ``torch.compiler.disable``, but that imports ``torch._dynamo`` (1.5 to 3 s) also where nothing is compiled.
+    """
+    disabled: list[Any] = []
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        if not torch.compiler.is_compiling():
+            return function(*args, **kwargs)
+        if not disabled:
+            disabled.append(torch.compiler.disable(function, reason="the simulator checks values before it runs"))
+        return disabled[0](*args, **kwargs)
+
+    return call

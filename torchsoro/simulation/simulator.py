@@ -27,9 +27,10 @@ from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Load, attach
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.ops.affine import velocity_gradient
-from torchsoro.simulation.ops.rollout import initial_state, rollout
-from torchsoro.simulation.ops.segment import Inputs, Scene
+from torchsoro.simulation.ops.rollout import initial_state, refuse_transforms, rollout
+from torchsoro.simulation.ops.scene import Inputs, Scene
 from torchsoro.simulation.ops.total import total_state
+from torchsoro.simulation.runtime import uncompiled
 from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
 
 TRANSFERS = {"apic": 0.0, "flip": 1.0}
@@ -180,6 +181,7 @@ class Simulator(nn.Module):
         how = f"transfer={self.transfer!r}" if self.formulation == "updated" else "formulation='total'"
         return f"cell={self.cell:g} m, dt={self.dt} s, {how}"
 
+    @uncompiled
     def forward(
         self,
         body: Body,
@@ -219,6 +221,7 @@ class Simulator(nn.Module):
             ValueError: for bad input, before any work; also if dt is above the limit of the fastest wave.
             SimulationDiverged: if a particle leaves the box, collapses or is no longer finite.
         """
+        refuse_transforms()
         x = body.position
         like = {"dtype": x.dtype, "device": x.device}
         if self.dt != "auto":

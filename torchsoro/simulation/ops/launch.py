@@ -1,8 +1,8 @@
 """Launching a Taichi kernel many times with the same arguments.
 
-A plain call of a kernel with torch tensors costs over a hundred microseconds, most of it spent on looking at its
-arguments again. Here they are fixed once and the launch repeated from there, at a few microseconds each; kernels read
-what changes (the number of the substep) from a buffer that they count up themselves.
+A plain call of a kernel with torch tensors costs over a hundred microseconds, most of it spent on checking its
+arguments. Here they are fixed once and the launch is repeated, at a few microseconds each; kernels read the number of
+the substep from a buffer and increment it themselves.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ import taichi as ti
 from taichi.lang import impl
 from torch import Tensor
 
-# What a kernel was compiled to; asking Taichi again takes milliseconds. Kernel and program are kept, so that no other
-# can take their place in memory.
+# Compiled kernels, as a lookup in Taichi takes milliseconds. The key is an address, so that kernel and program are kept
+# alive.
 _compiled: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
 
 

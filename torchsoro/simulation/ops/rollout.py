@@ -1,19 +1,51 @@
-"""The differentiable operator: a segment of many substeps as one ``torch.autograd.Function``."""
+"""The differentiable operator ``torch.ops.torchsoro.rollout``: a segment of many substeps.
+
+Adjoint and memory are explicit: the rollout returns, beside its results, the record that its adjoint
+``torch.ops.torchsoro.rollout_backward`` reads. The scene is passed by its handle. Operators are registered by
+``torch.library.define``: ``torch.library.custom_op`` makes the same of a function, but imports ``torch._dynamo`` at its
+first call (1.5 to 3 s) in programs that compile nothing.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import fields
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
+from torch._C._functorch import peek_interpreter_stack
+from torch.autograd import forward_ad
 
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.segment import Inputs, March, Scene
-from torchsoro.simulation.ops.total import TotalMarch, total_observe
+from torchsoro.simulation.ops.observation import observe, observe_adjoint
+from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
+from torchsoro.simulation.ops.segment import SegmentIntegrator, empty_record
+from torchsoro.simulation.ops.total import TotalSegmentIntegrator
 
 _INPUTS = tuple(f.name for f in fields(Inputs))
-_OBSERVED = 6
+_TENSORS = ("state", "weight", *_INPUTS)
+_OBSERVATIONS = ("position", "velocity", "center", "center_velocity", "chamber_volume", "chamber_pressure")
+_RECORD = ("states", "nodes", "befores", "orders", "chunks")
+
+
+def _define(name: str, *arguments: str, results: int) -> str:
+    torch.library.define(name, f"({', '.join(arguments)}) -> ({', '.join(['Tensor'] * results)})")
+    return name
+
+
+_ARGUMENTS = [f"Tensor {name}" for name in _TENSORS]
+_SETTINGS = ["int scene", "int first", "int[] samples", "bool keep"]
+_ROLLOUT = _define("torchsoro::rollout", *_ARGUMENTS, *_SETTINGS, results=1 + len(_OBSERVATIONS) + len(_RECORD))
+_BACKWARD = _define(
+    "torchsoro::rollout_backward",
+    *_ARGUMENTS,
+    *(f"Tensor {name}" for name in _RECORD),
+    *(f"Tensor? {name}_bar" for name in ("end", *_OBSERVATIONS)),
+    *_SETTINGS,
+    "bool[] wanted",
+    results=len(_TENSORS),
+)
 
 
 def initial_state(x: Tensor, v: Tensor, elements: int, affine: Tensor | None = None) -> Tensor:
@@ -35,108 +67,146 @@ def initial_state(x: Tensor, v: Tensor, elements: int, affine: Tensor | None = N
     return torch.cat([x.transpose(1, 2), v.transpose(1, 2), C, F, H], dim=1)
 
 
-def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene) -> tuple[Tensor, ...]:
-    """What is recorded of a state; plain torch operations, so that torch differentiates it.
+def _integrator(
+    scene: Scene, inputs: Inputs, first: int, samples: Sequence[int]
+) -> SegmentIntegrator | TotalSegmentIntegrator:
+    kind = SegmentIntegrator if scene.lattice is None else TotalSegmentIntegrator
+    return kind(scene, inputs, first=first, samples=tuple(samples))
 
-    Args:
-        state: [B, S, N], or [B, L] of the total-Lagrangian form.
-        weight: Particle weights of the centre of gravity [B, N].
-        coefficients: [B, COEFFICIENTS, N].
-        pressure: Supply pressure of each chamber now [B, chambers] in Pa.
-        scene: For the chambers and the probes.
 
-    Returns:
-        Positions and velocities of the probes [B, P, 3] (m, m/s), position and velocity of the centre of gravity
-        [B, 3], volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa.
-    """
-    if scene.lattice is not None:
-        return total_observe(state, weight, coefficients, pressure, scene)
-    x, v = state[:, : layout.VELOCITY], state[:, layout.VELOCITY : layout.AFFINE]
-    share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
-    volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
-    for c in range(pressure.shape[1]):
-        gas = (scene.kind == c).nonzero().squeeze(1)
-        J = state[:, layout.DEFORMATION, gas]
-        parts = coefficients[:, layout.VOLUME, gas] * J
-        local = coefficients[:, layout.BULK, gas] * (1 - J) + pressure[:, c : c + 1]
-        volumes.append(parts.sum(-1, keepdim=True))
-        means.append((parts * local).sum(-1, keepdim=True) / volumes[-1])
-    return (
-        x[:, :, scene.probes].transpose(1, 2),
-        v[:, :, scene.probes].transpose(1, 2),
-        (share * x).sum(-1),
-        (share * v).sum(-1),
-        torch.cat(volumes, -1),
-        torch.cat(means, -1),
+def _parts(arguments: Sequence[Any]) -> tuple[Tensor, Tensor, Inputs, Scene, list[Any]]:
+    """State, weight, inputs and scene of an operator's arguments, and those that follow."""
+    state, weight, *inputs = arguments[: len(_TENSORS)]
+    handle, *rest = arguments[len(_TENSORS) :]
+    return state, weight, Inputs(**dict(zip(_INPUTS, inputs, strict=True))), scene_of(handle), rest
+
+
+@torch.library.impl(_ROLLOUT, "default")
+def _forward(*arguments) -> tuple[Tensor, ...]:
+    state, weight, inputs, scene, (first, samples, keep) = _parts(arguments)
+    seen: list[tuple[Tensor, ...]] = []
+    integrator = _integrator(scene, inputs, first, samples)
+    states = integrator.forward(
+        state,
+        keep=keep,
+        observe=lambda k, s: seen.append(observe(s, weight, inputs.coefficients, inputs.pressure[k], scene)),
+    )
+    end = states[integrator.steps % states.shape[0]].clone()
+    shapes = _observed(scene, inputs, samples)
+    observed = map(torch.stack, zip(*seen, strict=True)) if seen else (state.new_empty(shape) for shape in shapes)
+    return end, *observed, *(integrator.record(states) if keep else empty_record(state))
+
+
+@torch.library.register_fake(_ROLLOUT)
+def _forward_fake(*arguments) -> tuple[Tensor, ...]:
+    state, _, inputs, scene, (_, samples, keep) = _parts(arguments)
+    observed = (state.new_empty(shape) for shape in _observed(scene, inputs, samples))
+    record = list(empty_record(state))
+    if keep:
+        steps, batch = inputs.gravity.shape[0], state.shape[0]
+        size = torch.library.get_ctx().new_dynamic_size
+        record[:2] = state.new_empty(steps + 1, *state.shape), state.new_empty(size())
+        if scene.lattice is None:
+            record[2] = state.new_empty(size() if scene.blend > 0 else 0)
+            record[3] = record[3].new_empty(size() if state.is_cuda else 0)
+            record[4] = record[4].new_empty(size(), 5 + 3 * batch)
+    return torch.empty_like(state), *observed, *record
+
+
+def _observed(scene: Scene, inputs: Inputs, samples: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Shapes of the observations over all samples."""
+    batch, chambers = inputs.pressure.shape[1:]
+    at_probes, center, gas = (batch, len(scene.probes), 3), (batch, 3), (batch, chambers)
+    return tuple((len(samples), *shape) for shape in (at_probes, at_probes, center, center, gas, gas))
+
+
+def _setup(ctx, inputs, output) -> None:
+    scene = scene_of(inputs[len(_TENSORS)])
+    record = output[1 + len(_OBSERVATIONS) :]
+    ctx.settings, ctx.scene = inputs[len(_TENSORS) :], scene  # a handle is valid as long as the scene exists
+    ctx.save_for_backward(*inputs[: len(_TENSORS)], *record)
+    ctx.mark_non_differentiable(*record)
+    ctx.set_materialize_grads(False)
+
+
+def _formula(ctx, *bars):
+    seen = bars[: 1 + len(_OBSERVATIONS)]
+    wanted = list(ctx.needs_input_grad[: len(_TENSORS)])
+    found = torch.ops.torchsoro.rollout_backward(*ctx.saved_tensors, *seen, *ctx.settings, wanted)
+    return *found, *(None for _ in ctx.settings)
+
+
+torch.library.register_autograd(_ROLLOUT, _formula, setup_context=_setup)
+
+
+@torch.library.impl(_BACKWARD, "default")
+def _backward(*arguments) -> tuple[Tensor, ...]:
+    head = len(_TENSORS) + len(_RECORD)
+    record, bars = arguments[len(_TENSORS) : head], arguments[head : head + 1 + len(_OBSERVATIONS)]
+    settings = arguments[head + len(bars) :]
+    state, weight, inputs, scene, (first, samples, keep, wanted) = _parts((*arguments[: len(_TENSORS)], *settings))
+    end_bar, *seen_bar = bars
+    integrator = _integrator(scene, inputs, first, samples if keep else ())
+    if keep:
+        states = integrator.restore(record)
+    else:
+        states = integrator.forward(state, keep=True, observe=lambda k, s: None)
+        integrator.samples = tuple(samples)
+    bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
+    weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(inputs.coefficients)
+    pressure_bar = torch.zeros_like(inputs.pressure)
+
+    def add(k: int, bar: Tensor) -> None:
+        at = samples.index(k)
+        arguments = states[k], weight, inputs.coefficients, inputs.pressure[k]
+        given = [zero if g is None else g[at] for g, zero in zip(seen_bar, nothing, strict=True)]
+        parts = observe_adjoint(arguments, given, scene)
+        for total, part in zip((bar, weight_bar, coefficients_bar, pressure_bar[k]), parts, strict=True):
+            total += part
+
+    nothing = [state.new_zeros(shape[1:]) for shape in _observed(scene, inputs, ())]
+    observed = any(g is not None for g in seen_bar)
+    names = frozenset(name for name, needed in zip(_TENSORS, wanted, strict=True) if needed)
+    sums = integrator.backward(states, bar, add if observed else lambda k, s: None, wanted=names)
+    sums["coefficients"] += coefficients_bar
+    sums["pressure"] += pressure_bar
+    return bar, weight_bar, *(sums[name] for name in _INPUTS)
+
+
+@torch.library.register_fake(_BACKWARD)
+def _backward_fake(*arguments) -> tuple[Tensor, ...]:
+    return tuple(torch.empty_like(t) for t in arguments[: len(_TENSORS)])
+
+
+def _refuse_second(ctx, *bars):
+    raise RuntimeError(
+        "second derivative through the simulator: its adjoint is not differentiable, wanted first derivatives only "
+        "(no create_graph=True before another backward, no nested torch.autograd.grad)"
     )
 
 
-def _march(scene: Scene, inputs: Inputs, first: int, samples: tuple[int, ...]) -> March | TotalMarch:
-    kind = March if scene.lattice is None else TotalMarch
-    return kind(scene, inputs, first=first, samples=samples)
+# The operator of the adjoint takes all tensors of the rollout, so that its gradients depend on every one of them and no
+# second backward passes it by.
+torch.library.register_autograd(_BACKWARD, _refuse_second)
 
 
-class _Rollout(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, scene: Scene, first: int, samples: tuple[int, ...], keep: bool, state, weight, *inputs):
-        named = Inputs(**dict(zip(_INPUTS, inputs, strict=True)))
-        seen: list[tuple[Tensor, ...]] = []
-        march = _march(scene, named, first, samples)
-        states = march.forward(
-            state,
-            keep=keep,
-            look=lambda k, s: seen.append(observe(s, weight, named.coefficients, named.pressure[k], scene)),
+def refuse_transforms(*tensors: Tensor) -> None:
+    """Refuse forward-mode derivatives and ``torch.func`` (grad, vmap, jvp, ...).
+
+    Raises:
+        RuntimeError: inside of a transform of ``torch.func``, or if a tensor carries a forward-mode tangent.
+    """
+    transform = peek_interpreter_stack()
+    if transform is not None:
+        raise RuntimeError(
+            f"torch.func ({transform.key().name.lower()}) through the simulator: wanted torch.autograd.grad or "
+            "backward() for gradients, and leading axes of the tensors for a batch"
         )
-        ctx.scene, ctx.first, ctx.samples = scene, first, samples
-        ctx.march, ctx.states = (march, states) if keep else (None, None)
-        ctx.save_for_backward(state, weight, *inputs)
-        ctx.set_materialize_grads(False)
-        end = states[march.steps % states.shape[0]].clone()
-        if not seen:
-            empty = observe(state, weight, named.coefficients, named.pressure[0], scene)
-            return end, *(e.new_zeros(0, *e.shape) for e in empty)
-        return end, *(torch.stack(each) for each in zip(*seen, strict=True))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, end_bar, *seen_bar):
-        state, weight, *inputs = ctx.saved_tensors
-        named = Inputs(**dict(zip(_INPUTS, inputs, strict=True)))
-        march, states = ctx.march, ctx.states
-        if march is None:
-            march = _march(ctx.scene, named, ctx.first, ())
-            states = march.forward(state, keep=True, look=lambda k, s: None)
-            march.samples = ctx.samples
-        bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
-        weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(named.coefficients)
-        pressure_bar = torch.zeros_like(named.pressure)
-
-        def add(k: int, bar: Tensor) -> None:
-            wanted = [None if g is None else g[ctx.samples.index(k)] for g in seen_bar]
-            leaves = [t.detach().requires_grad_() for t in (states[k], weight, named.coefficients, named.pressure[k])]
-            with torch.enable_grad():
-                seen = observe(leaves[0], leaves[1], leaves[2], leaves[3], ctx.scene)
-            pairs = [(s, g) for s, g in zip(seen, wanted, strict=True) if g is not None and s.requires_grad]
-            if pairs:
-                outputs, gradients = zip(*pairs, strict=True)
-                by_state, by_weight, by_coefficients, by_pressure = torch.autograd.grad(
-                    outputs, leaves, gradients, allow_unused=True
-                )
-                for total, part in (
-                    (bar, by_state),
-                    (weight_bar, by_weight),
-                    (coefficients_bar, by_coefficients),
-                    (pressure_bar[k], by_pressure),
-                ):
-                    if part is not None:
-                        total += part
-
-        wanted = frozenset(n for n, needed in zip(_INPUTS, ctx.needs_input_grad[6:], strict=True) if needed)
-        sums = march.backward(states, bar, add, wanted=wanted)
-        ctx.march, ctx.states = None, None
-        sums["coefficients"] += coefficients_bar
-        sums["pressure"] += pressure_bar
-        return None, None, None, None, bar, weight_bar, *(sums[name] for name in _INPUTS)
+    if any(forward_ad.unpack_dual(t).tangent is not None for t in tensors):
+        raise RuntimeError(
+            "forward-mode derivative through the simulator: only reverse mode is implemented, wanted "
+            "torch.autograd.grad or backward()"
+        )
 
 
 def rollout(
@@ -165,10 +235,12 @@ def rollout(
         The last state, and the outcomes of :func:`observe` stacked over the samples.
 
     Raises:
-        ValueError: for a wrong shape, dtype, device or layout of any tensor.
+        ValueError: for a wrong shape, dtype or device of any tensor.
+        RuntimeError: inside of ``torch.func`` or forward-mode differentiation; a second derivative raises in backward.
         SimulationDiverged: if a particle leaves the analysis box, collapses or is no longer finite.
     """
     tensors = {name: getattr(inputs, name) for name in _INPUTS}
+    refuse_transforms(state, weight, *tensors.values())
     batch, _, count = inputs.coefficients.shape
     elements, steps = inputs.prony.shape[1], inputs.gravity.shape[0]
     chambers, groups, planes = inputs.pressure.shape[-1], scene.share.shape[0], scene.plane_kind.shape[0]
@@ -193,10 +265,11 @@ def rollout(
         if tensor.dtype != state.dtype or tensor.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name}: dtype {tensor.dtype}, wanted {state.dtype} (float32 or float64)")
         if tensor.device != state.device:
-            raise ValueError(f"{name}: on {tensor.device}, wanted {state.device}, where the state is")
+            raise ValueError(f"{name}: on {tensor.device}, wanted {state.device}, the device of the state")
     if int(scene.kind.max()) >= chambers:
         raise ValueError(f"kind: chamber {int(scene.kind.max())}, wanted less than the {chambers} of pressure")
     if list(samples) != sorted(set(samples)) or (samples and not 0 <= samples[0] <= samples[-1] <= steps):
         raise ValueError(f"samples = {samples}: wanted increasing substeps from 0 to {steps}")
-    values = [tensors[name].contiguous() for name in _INPUTS]
-    return _Rollout.apply(scene, first, samples, keep, state.contiguous(), weight.contiguous(), *values)
+    values = [t.contiguous() for t in (state, weight, *tensors.values())]
+    results = torch.ops.torchsoro.rollout(*values, scene.handle, first, list(samples), keep)
+    return results[: 1 + len(_OBSERVATIONS)]

@@ -1,12 +1,12 @@
-"""Marching a segment of substeps forward and back: buffers, active boxes, launches, and what went wrong where.
+"""Time integration of a segment of the updated form and its adjoint: buffers, active boxes, launches, divergence.
 
 A segment is cut into chunks of at most 64 substeps. Each has one active box, the nodes that its particles can reach,
-so that only those nodes are touched; where a particle leaves the box early, the chunk is done again step by step.
+so that only those nodes are computed; where a particle leaves the box early, the chunk is repeated step by step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,73 +15,15 @@ from torch import Tensor
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.kernels import backward, forward, layout
 from torchsoro.simulation.kernels.warp import WARP
-from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.launch import capture
+from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.runtime import init
 
-CHUNK = 64  # substeps between two looks at where the particles are
+CHUNK = 64  # most substeps of an active box
 MARGIN = 2  # cells around the particles' nodes in the active box
 GPU_ROWS = 256  # rows that GPU threads share for sums over particles or nodes
 CPU_LANES = 8  # over all simulations; fixed, so that the bits do not depend on the number of cores
-FEW_NODES = 20_000  # so many nodes are passed over before a second thread is awake
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Scene:
-    """What a segment needs to know besides its differentiable tensors.
-
-    Attributes:
-        dt: Substep [s].
-        cell: Grid cell [m].
-        blend: 0 for APIC, 1 for affine FLIP, between them a mixture.
-        low: Lower corner of the analysis box [m].
-        high: Upper corner of the analysis box [m].
-        kind: int32 [N], -1 for solid, else the number of the gas chamber.
-        share: [groups, N], each particle's share of its group's force.
-        plane_kind: int32 [planes, 3]: axis, side (+1 or -1), 1 for stick or 0 for Coulomb.
-        springs: Whether any particle has a spring or drag, be it of zero.
-        viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
-        stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
-        probes: int64 [P], particles whose motion is recorded.
-        lattice: Of the total-Lagrangian form; None for the updated form.
-    """
-
-    dt: float
-    cell: float
-    blend: float
-    low: tuple[float, float, float]
-    high: tuple[float, float, float]
-    kind: Tensor
-    share: Tensor
-    plane_kind: Tensor
-    springs: bool
-    viscous: bool
-    stiffens: bool
-    probes: Tensor
-    lattice: Lattice | None = None
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Inputs:
-    """The differentiable tensors of a segment of T substeps, one row per simulation.
-
-    Attributes:
-        coefficients: [B, COEFFICIENTS, N], see ``kernels.layout``.
-        prony: [B, elements, 3]: decay, gain, modulus of each Maxwell element.
-        pressure: [T + 1, B, chambers] supply pressure at each substep and after the last [Pa].
-        gravity: [T, B, 3] [m/s2].
-        force: [T, B, groups, 3] [N].
-        planes: [B, planes, 3]: offset [m], Coulomb coefficient, adhesive traction [Pa].
-        origin: [B, 3] a grid node [m].
-    """
-
-    coefficients: Tensor
-    prony: Tensor
-    pressure: Tensor
-    gravity: Tensor
-    force: Tensor
-    planes: Tensor
-    origin: Tensor
+FEW_NODES = 20_000  # one thread passes over so many nodes in the time that it takes to wake a second
 
 
 @dataclass(eq=False)
@@ -105,17 +47,20 @@ class Chunk:
         return self.size[0] * self.size[1] * self.size[2]
 
 
-Look = Callable[[int, Tensor], None]
+def empty_record(like: Tensor) -> tuple[Tensor, ...]:
+    """A record of nothing, in the types of :meth:`SegmentIntegrator.record`."""
+    nothing = (like.new_empty(0) for _ in range(3))
+    return *nothing, like.new_empty(0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
 
 
-class March:
+class SegmentIntegrator:
     """One segment: ``forward`` from a state to all states (or the last two), ``backward`` along the kept ones.
 
     Args:
-        scene: What stays the same.
+        scene: Constant data.
         inputs: The segment's tensors.
         first: Number of the first substep in the whole run, for messages.
-        samples: Substeps to look at, counted within the segment.
+        samples: Substeps to observe, counted within the segment.
     """
 
     def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
@@ -137,13 +82,13 @@ class March:
         self.zeroed: dict[str, Tensor] = {}
         self.chunks: list[Chunk] = []
 
-    def forward(self, start: Tensor, *, keep: bool, look: Look) -> Tensor:
+    def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
         """Advance the state [B, S, N] over the segment.
 
         Args:
             start: State before the first substep.
-            keep: Keep all states (and what the adjoint needs of the nodes) instead of the last two.
-            look: Called with each sampled substep and the state then.
+            keep: Keep all states and the adjoint's nodal quantities instead of the last two states.
+            observe: Called with each sampled substep and its state.
 
         Returns:
             States [T + 1, B, S, N], or [2, B, S, N] of which ``T % 2`` is the last.
@@ -155,7 +100,7 @@ class March:
         states = start.new_empty(ring, *start.shape)
         states[0] = start
         if 0 in self.samples:
-            look(0, states[0])
+            observe(0, states[0])
         if not self._inside(states[0]):
             self._report(0, states[0], states[0])
         first, single_until = 0, 0
@@ -166,7 +111,7 @@ class March:
             whole = self._advance(chunk, states, lambda k, state, seen=seen: seen.append((k, state.clone())))
             if whole:
                 for k, state in seen:
-                    look(k, state)
+                    observe(k, state)
                 if keep:
                     self.chunks.append(chunk)
                 first += chunk.steps
@@ -177,13 +122,50 @@ class March:
                 single_until = first + chunk.steps
         return states
 
-    def backward(self, states: Tensor, bar: Tensor, add: Look, *, wanted: frozenset[str]) -> dict[str, Tensor]:
+    def record(self, states: Tensor) -> tuple[Tensor, ...]:
+        """The memory of ``forward(keep=True)``, which :meth:`restore` takes, as five tensors.
+
+        They are the states, the node velocities of all chunks, those before forces (FLIP), the order of particles
+        (CUDA), and a table of integers on the CPU: first substep, steps, size, and lowest nodes of each chunk.
+        """
+        chunks = [self.chunks.pop(0) for _ in range(len(self.chunks))]
+        empty, order = states.new_empty(0), self.flags[:0]
+        table = [[c.first, c.steps, *c.size, *c.low.flatten().tolist()] for c in chunks]
+        return (
+            states,
+            torch.cat([empty, *(c.node for c in chunks)]),
+            torch.cat([empty, *(c.before for c in chunks)]),
+            torch.cat([order, *(c.order.flatten() for c in chunks)]),
+            torch.tensor(table, dtype=torch.int64).reshape(len(chunks), 5 + 3 * self.batch),
+        )
+
+    def restore(self, record: Sequence[Tensor]) -> Tensor:
+        """Take over what another integrator of the same segment recorded, for ``backward``; returns all states."""
+        states, nodes, befores, orders, table = record
+        at = [0, 0, 0]
+        for first, steps, nx, ny, nz, *low in table.tolist():
+            size = steps * self.batch * nx * ny * nz
+            lengths = (
+                size * layout.NODE,
+                size * layout.BEFORE if self.scene.blend > 0 else 0,
+                self.batch * self.lanes if self.gpu else 0,
+            )
+            node, before, order = (
+                whole[start : start + length]
+                for whole, start, length in zip((nodes, befores, orders), at, lengths, strict=True)
+            )
+            at = [start + length for start, length in zip(at, lengths, strict=True)]
+            corner = self.flags.new_tensor(low).view(self.batch, 3)
+            self.chunks.append(Chunk(first, steps, corner, (nx, ny, nz), node, before, order))
+        return states
+
+    def backward(self, states: Tensor, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> dict[str, Tensor]:
         """Carry the gradient by the last state back to the first, in place.
 
         Args:
             states: All states, from ``forward(keep=True)``.
             bar: Gradient by the last state [B, S, N]; holds the one by the first state afterwards.
-            add: Called with each sampled substep and ``bar``, to add the gradient by what was seen there.
+            add: Called with each sampled substep and ``bar``, to add the gradient by its observations.
             wanted: Names of the inputs whose gradient is wanted; that by the Maxwell elements costs extra.
 
         Returns:
@@ -251,7 +233,7 @@ class March:
             *(int(self.scene.springs), planes, *chunk.size, chunk.first, chunk.steps),
         ]
 
-    def _advance(self, chunk: Chunk, states: Tensor, look: Look) -> bool:
+    def _advance(self, chunk: Chunk, states: Tensor, observe: Observe) -> bool:
         """Run a chunk; False if a particle left the active box or the analysis box, collapsed or is not finite."""
         parts = 1 if self.gpu else self.lanes
         scratch = self._zeros("grid", parts * self.batch * chunk.nodes * layout.NODE)
@@ -272,7 +254,7 @@ class March:
             launch(stop - done)
             done = stop
             if stop in wanted:
-                look(chunk.first + stop, states[(chunk.first + stop) % states.shape[0]])
+                observe(chunk.first + stop, states[(chunk.first + stop) % states.shape[0]])
         last = states[(chunk.first + chunk.steps) % states.shape[0]]
         if not bool(self.flags.any()) and bool(torch.isfinite(last).all()) and self._inside(last):
             return True
@@ -281,7 +263,7 @@ class March:
         return False
 
     def _retreat(
-        self, chunk: Chunk, states: Tensor, bar: Tensor, sums: dict[str, Tensor], add: Look, prony: bool
+        self, chunk: Chunk, states: Tensor, bar: Tensor, sums: dict[str, Tensor], add: Observe, prony: bool
     ) -> None:
         parts = 1 if self.gpu else self.lanes
         scratch = self._zeros("adjoint", parts * self.batch * chunk.nodes * layout.ADJOINT_NEW)
@@ -318,7 +300,7 @@ class March:
         return bool(((x > low) & (x < high)).all())
 
     def _report(self, first: int, before: Tensor, after: Tensor) -> None:
-        """Say which particle of ``after`` is wrong, and how."""
+        """Raise ``SimulationDiverged`` for the first particle of ``after`` that violates a bound."""
         x = after[:, : layout.VELOCITY]
         finite = torch.isfinite(after).all(1)
         F = after[:, layout.DEFORMATION : layout.HISTORY].reshape(self.batch, 3, 3, self.count).permute(0, 3, 1, 2)
@@ -328,7 +310,7 @@ class March:
         moved = (x - before[:, : layout.VELOCITY]).abs().amax(1) / self.scene.cell
         smaller = "a smaller time step, a lower pressure or stiffer void (epsilon)"
         larger = "a larger analysis box, or a shorter run"
-        # What the kernel's rounding called collapsed and torch's does not is the most compressed particle.
+        # If only the kernel's rounding finds J <= 0, and torch's does not, the most compressed particle is reported.
         lowest = torch.zeros_like(finite).view(-1).index_fill(0, J.view(-1).argmin(), True).view_as(finite)
         cases = (
             (~finite, "the state is not finite", "J", J, smaller),

@@ -1,10 +1,10 @@
-"""Marching a segment of the total-Lagrangian form forward and back: its state, its buffers, its launches."""
+"""Time integration of a segment of the total-Lagrangian form and its adjoint: state, buffers, launches."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Sequence
 from weakref import WeakKeyDictionary
 
 import torch
@@ -12,12 +12,13 @@ from torch import Tensor
 
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.kernels import layout, total, total_adjoint
-from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers, spline
+from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice, numbers, spline
 from torchsoro.simulation.ops.launch import capture
-from torchsoro.simulation.ops.segment import Inputs, Look, Scene
+from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
+from torchsoro.simulation.ops.segment import empty_record
 from torchsoro.simulation.runtime import init
 
-CHUNK = 1024  # substeps between two looks at whether all is well
+CHUNK = 1024  # substeps between two checks for divergence
 REPEATS = 2  # substeps in a launch on a GPU, forward; backward a launch takes less time than the substep
 TALLIES = 64  # shares in which sums over all nodes or points are taken
 _NEVER = 2**31 - 1
@@ -42,39 +43,6 @@ def total_state(lattice: Lattice, x: Tensor, v: Tensor, present: Tensor, element
     return torch.cat([d.flatten(1), lattice.project(v, present).flatten(1), rest], 1)
 
 
-def total_observe(
-    state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene
-) -> tuple[Tensor, ...]:
-    """What is recorded of a state, as ``rollout.observe``, of which it is the twin."""
-    lattice = scene.lattice
-    assert lattice is not None
-    batch, nodes = state.shape[0], lattice.nodes
-    d, v = state[:, : 3 * nodes].view(batch, 3, nodes), state[:, 3 * nodes : 6 * nodes].view(batch, 3, nodes)
-    places = lattice.places.to(state)
-    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
-    share = weight / weight.sum(-1, keepdim=True)
-    # With the weights of the nodes' masses, so that momentum is what forces gave it.
-    nodal = lattice.to_nodes(share).unsqueeze(1)
-    volumes, means = [state.new_zeros(batch, 0)], [state.new_zeros(batch, 0)]
-    for c in range(pressure.shape[1]):
-        gas = (scene.kind == c).nonzero().squeeze(1)
-        where, _, slopes = _stencil(scene, f"chamber {c}", lambda gas=gas: gas, QUADRATURE, state)
-        gradient = torch.einsum("bcpn,pan->bpca", d[:, :, where], slopes)
-        J = torch.linalg.det(gradient + torch.eye(3).to(state))
-        V = coefficients[:, layout.VOLUME, gas]
-        k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
-        volumes.append((V * J).sum(-1, keepdim=True))
-        means.append((pressure[:, c] - k * (volumes[-1][:, 0] / V.sum(-1) - 1)).unsqueeze(-1))
-    return (
-        places[scene.probes] + (d[:, :, at] * how).sum(-1).transpose(1, 2),
-        (v[:, :, at] * how).sum(-1).transpose(1, 2),
-        share @ places + (nodal * d).sum(-1),
-        (nodal * v).sum(-1),
-        torch.cat(volumes, -1),
-        torch.cat(means, -1),
-    )
-
-
 _SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")
 
 
@@ -89,29 +57,36 @@ class Arena:
     """
 
     def __init__(self, name: str, *tensors: Tensor) -> None:
-        self.name = name
-        assert len(tensors) == len(layout.BUFFERS[name])
-        ends = list(itertools.accumulate(t.numel() for t in tensors))
-        self.offsets = [0, *ends[:-1]]
-        self.buffer = torch.cat([*(t.detach().reshape(-1) for t in tensors), tensors[0].new_zeros(1)])
+        buffer = torch.cat([*(t.detach().reshape(-1) for t in tensors), tensors[0].new_zeros(1)])
+        self._divide(name, buffer, [t.shape for t in tensors])
+
+    @classmethod
+    def zeros(cls, name: str, like: Tensor, *shapes: Sequence[int]) -> Arena:
+        """Tensors of zeros of these shapes, and of the type of ``like``."""
+        return cls.over(name, like.new_zeros(sum(map(math.prod, shapes)) + 1), *shapes)
+
+    @classmethod
+    def over(cls, name: str, buffer: Tensor, *shapes: Sequence[int]) -> Arena:
+        """The tensors of these shapes in a buffer that exists."""
+        arena = cls.__new__(cls)
+        arena._divide(name, buffer, shapes)
+        return arena
+
+    def _divide(self, name: str, buffer: Tensor, shapes: Sequence[Sequence[int]]) -> None:
+        assert len(shapes) == len(layout.BUFFERS[name])
+        ends = list(itertools.accumulate(math.prod(shape) for shape in shapes))
+        self.name, self.buffer, self.offsets = name, buffer, [0, *ends[:-1]]
         self.views = [
-            self.buffer[start : start + t.numel()].view(t.shape) for start, t in zip(self.offsets, tensors, strict=True)
+            buffer[start:end].view(*shape) for start, end, shape in zip(self.offsets, ends, shapes, strict=True)
         ]
 
 
-# What kernels look up, and which nodes observations need, for every scene that is in use.
-_known: WeakKeyDictionary[Scene, dict[str, Any]] = WeakKeyDictionary()
-
-
-def _tables(scene: Scene) -> Arena:
-    """What the kernels look up, in the order of ``layout.BUFFERS``."""
-    known = _known.setdefault(scene, {})
-    if "tables" not in known:
-        known["tables"] = Arena("integers", *_integers(scene))
-    return known["tables"]
+# Index tables of the kernels, computed once per scene.
+_tables: WeakKeyDictionary[Scene, Arena] = WeakKeyDictionary()
 
 
 def _integers(scene: Scene) -> list[Tensor]:
+    """In the order of ``layout.BUFFERS``."""
     assert scene.lattice is not None
     kind, (nx, ny, nz), (mx, my, mz) = scene.kind, scene.lattice.points, scene.lattice.shape
     x, y, z = torch.meshgrid(*(torch.arange(n, device=kind.device) for n in (nx, ny, nz)), indexing="ij")
@@ -120,7 +95,7 @@ def _integers(scene: Scene) -> list[Tensor]:
     members = torch.cat([kind.new_zeros(0).long(), *gas])
     rank = torch.zeros_like(kind).index_copy(0, members, torch.arange(len(members), device=kind.device).to(kind))
     filled = torch.tensor([0, *(len(g) for g in gas)]).cumsum(0)
-    # Lines, sheets and nodes that have points of a chamber beside them.
+    # Lines, sheets and nodes whose support contains points of a chamber.
     wx, wy, wz = (spline(n, QUADRATURE)[0].to(kind.device) for n in scene.lattice.points)
     near = [[kind.new_zeros(0, n)] for n in (nx * ny * mz, nx * my * mz, mx * my * mz)]
     for c in range(len(gas)):
@@ -132,26 +107,16 @@ def _integers(scene: Scene) -> list[Tensor]:
     return [kind, scene.plane_kind, corner.to(kind), rank, filled.to(kind), *map(torch.cat, near)]
 
 
-def _stencil(scene: Scene, name: str, points: Callable[[], Tensor], place: float, like: Tensor) -> tuple[Tensor, ...]:
-    """``Lattice.stencil``, remembered."""
-    assert scene.lattice is not None
-    known = _known.setdefault(scene, {})
-    if name not in known:
-        at, weights, slopes = scene.lattice.stencil(points(), place=place)
-        known[name] = at.to(like.device), weights.to(like), slopes.to(like)
-    return known[name]
-
-
-class TotalMarch:
+class TotalSegmentIntegrator:
     """One segment: ``forward`` from a state to all states (or the last two), ``backward`` along the kept ones.
 
-    The counterpart of ``march.March``; no sum is taken by two threads at once, so that two runs have the same bits.
+    The counterpart of ``segment.SegmentIntegrator``; the order of every sum is fixed, so that runs agree bit by bit.
 
     Args:
-        scene: What stays the same; its tensors by particle are by point of the lattice here.
+        scene: Constant data; its tensors by particle are by point of the lattice here.
         inputs: The segment's tensors, likewise.
         first: Number of the first substep in the whole run, for messages.
-        samples: Substeps to look at, counted within the segment.
+        samples: Substeps to observe, counted within the segment.
     """
 
     def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
@@ -169,36 +134,31 @@ class TotalMarch:
         nx, ny, _ = self.lattice.points
         _, my, mz = self.lattice.shape
         self.lines, self.sheets = nx * ny * mz, nx * my * mz
-        self.leaf = like.detach().requires_grad_()
-        with torch.enable_grad():
-            mass, drag = self.leaf[:, layout.MASS], self.leaf[:, layout.DRAG]
-            self.nodal, self.chamber = self.lattice.nodal(mass, drag, scene.dt), self._chamber(self.leaf)
-        self.tables = _tables(scene)
+        self.nodal = self.lattice.nodal(like[:, layout.MASS], like[:, layout.DRAG], scene.dt)
+        self.chamber = self._chamber(like)
+        if scene not in _tables:
+            _tables[scene] = Arena("integers", *_integers(scene))
+        self.tables = _tables[scene]
         self.fixed = Arena(
             "fixed",
             torch.tensor(numbers(self.lattice, scene.dt), dtype=torch.float64).to(like),
-            *(like, inputs.prony, inputs.planes, self.nodal.detach(), self.chamber.detach(), scene.share),
+            *(like, inputs.prony, inputs.planes, self.nodal, self.chamber, scene.share),
         )
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, inputs.force)
         b, c = self.batch, self.chambers
         self.gas = int((scene.kind >= 0).sum())
-        self.scratch = Arena(
-            "scratch",
-            *(like.new_zeros(shape) for shape in self._sums(b)),
-            *(like.new_zeros(shape) for shape in self._sums(b * c)),
-            *(like.new_zeros(b, n) for n in (self.gas, c * layout.CHAMBER_PARTS, c * layout.CHAMBER_GROUPS)),
-        )
-        self.kept = Arena("kept", like.new_zeros(0), like.new_zeros(0))
+        areas = ((b, n) for n in (self.gas, c * layout.CHAMBER_PARTS, c * layout.CHAMBER_GROUPS))
+        self.scratch = Arena.zeros("scratch", like, *self._sums(b), *self._sums(b * c), *areas)
+        self.kept = Arena.zeros("kept", like, (0,), (0,))
 
-    def forward(self, start: Tensor, *, keep: bool, look: Look) -> Tensor:
-        """Advance the state [B, L] over the segment; as ``March.forward``."""
+    def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
+        """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
         ring, slots = (self.steps + 1, self.steps) if keep else (2, 1)
-        # Places without a particle are never written.
+        # The kernels write no history at places without a particle.
         full = bool((self.scene.kind != layout.ABSENT).all())
         states = (start.new_empty if full else start.new_zeros)(ring, *start.shape)
         states[0] = start
-        shapes = ((slots, self.batch, self.chambers), (slots, self.batch, 3, self.nodes))
-        self.kept = Arena("kept", *(start.new_zeros(shape) for shape in shapes))
+        self.kept = Arena.zeros("kept", start, *self._kept(slots))
         ints = self._ints([self.fixed, self.supply, self.kept, self.scratch], ring=ring, kept_ring=slots)
         launch = capture(
             total.total_substep,
@@ -209,7 +169,7 @@ class TotalMarch:
             *(self.fixed.buffer, self.supply.buffer, states.view(-1), self.kept.buffer, self.scratch.buffer),
         )
         if 0 in self.samples:
-            look(0, states[0])
+            observe(0, states[0])
         now = 0
         while now < self.steps:
             before = None if keep else states[now % 2].clone()
@@ -226,32 +186,38 @@ class TotalMarch:
             if not bool(torch.isfinite(after).all()) or bool(self._outside(after).any()):
                 self._report(stop, after)
             if stop in self.samples:
-                look(stop, after)
+                observe(stop, after)
             now = stop
         return states
 
-    def backward(self, states: Tensor, bar: Tensor, add: Look, *, wanted: frozenset[str]) -> dict[str, Tensor]:
-        """Carry the gradient by the last state back to the first, in place; as ``March.backward``."""
+    def record(self, states: Tensor) -> tuple[Tensor, ...]:
+        """The memory of ``forward(keep=True)``: the states, and quantities of every substep; ``RECORD`` tensors."""
+        return states, self.kept.buffer, *empty_record(states)[2:]
+
+    def restore(self, record: Sequence[Tensor]) -> Tensor:
+        """Take over the record of another integrator of the same segment, for ``backward``; returns all states."""
+        self.kept = Arena.over("kept", record[1], *self._kept(self.steps))
+        return record[0]
+
+    def backward(self, states: Tensor, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> dict[str, Tensor]:
+        """Carry the gradient by the last state back to the first, in place; as ``SegmentIntegrator.backward``."""
         i, steps, b, nodes, points = self.inputs, self.steps, self.batch, self.nodes, self.points
         tallies = TALLIES if {"gravity", "force"} & wanted else 0
         bar[:, 6 * nodes :].view(b, 6 * self.elements, points)[..., self.scene.kind == layout.ABSENT] = 0
-        sums = Arena(
+        sums = Arena.zeros(
             "sums",
-            torch.zeros_like(i.coefficients),
-            bar.new_zeros(b, self.elements, layout.PRONY, points if "prony" in wanted else 1),
-            torch.zeros_like(i.pressure),
-            bar.new_zeros(steps, tallies, b, 3),
-            bar.new_zeros(steps, tallies, b, self.groups, 3),
-            bar.new_zeros(b, self.planes, layout.PLANE, nodes),
-            torch.zeros_like(self.nodal),
-            torch.zeros_like(self.chamber),
+            bar,
+            i.coefficients.shape,
+            (b, self.elements, layout.PRONY, points if "prony" in wanted else 1),
+            i.pressure.shape,
+            (steps, tallies, b, 3),
+            (steps, tallies, b, self.groups, 3),
+            (b, self.planes, layout.PLANE, nodes),
+            self.nodal.shape,
+            self.chamber.shape,
         )
-        back = Arena(
-            "backward",
-            *(bar.new_zeros(b, 3, nodes), bar.new_zeros(2, b, 3, nodes)),
-            *(bar.new_zeros(shape) for shape in self._sums(b * self.loaded)),
-            *(bar.new_zeros(b, self.chambers), bar.new_zeros(b, self.gas)),
-        )
+        forces, loads = ((b, 3, nodes), (2, b, 3, nodes)), self._sums(b * self.loaded)
+        back = Arena.zeros("backward", bar, *forces, *loads, (b, self.chambers), (b, self.gas))
         arenas = [self.fixed, self.supply, self.kept, self.scratch, back, sums]
         ints = self._ints(arenas, want_prony="prony" in wanted, tallies=tallies)
         launch = capture(
@@ -276,10 +242,11 @@ class TotalMarch:
         launch(1)
         *views, nodal_bar, chamber_bar = sums.views
         found: dict[str, Tensor] = dict(zip(_SUMS, views, strict=True))
-        pairs = [(t, g) for t, g in ((self.nodal, nodal_bar), (self.chamber, chamber_bar)) if t.numel()]
-        outputs, given = zip(*pairs, strict=True)
-        (derived,) = torch.autograd.grad(outputs, self.leaf, given)
-        found["coefficients"] = found["coefficients"] + derived
+        mass, drag = i.coefficients[:, layout.MASS], i.coefficients[:, layout.DRAG]
+        mass_bar, drag_bar = self.lattice.nodal_adjoint(mass, drag, self.scene.dt, nodal_bar)
+        found["coefficients"] = found["coefficients"] + self._chamber_adjoint(chamber_bar)
+        found["coefficients"][:, layout.MASS] += mass_bar
+        found["coefficients"][:, layout.DRAG] += drag_bar
         found |= {name: found[name].sum(-1) for name in ("prony", "planes")}
         found |= {name: found[name].sum(1) for name in ("gravity", "force")}
         found["pressure"] = found["pressure"].clone()
@@ -291,7 +258,7 @@ class TotalMarch:
         launch(-(-steps // (REPEATS if self.gpu else 1)))
 
     def _ints(self, arenas: list[Arena], **more: int) -> Tensor:
-        """The buffer of integers: clock, sizes, where each quantity begins, then its own quantities."""
+        """The buffer of integers: clock, sizes, offset of each quantity in its buffer, then the index tables."""
         sizes = {
             **dict(zip(("nx", "ny", "nz"), self.lattice.points, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
@@ -307,9 +274,13 @@ class TotalMarch:
         return torch.cat([self.tables.buffer.new_tensor(head), self.tables.buffer])
 
     def _sums(self, blocks: int) -> tuple[tuple[int, int, int], ...]:
-        """Shapes of what points hand on, and of its sums over lines and sheets."""
+        """Shapes of the points' contributions to nodes, and of their sums over lines and sheets."""
         pairs = ((layout.BUNDLE, self.points), (layout.LINE, self.lines), (layout.SHEET, self.sheets))
         return tuple((blocks, *pair) for pair in pairs)
+
+    def _kept(self, slots: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the quantities that are kept of every substep beside the states."""
+        return (slots, self.batch, self.chambers), (slots, self.batch, 3, self.nodes)
 
     def _chamber(self, coefficients: Tensor) -> Tensor:
         """Mean air stiffness and reference volume of each chamber [B, chambers, 2]."""
@@ -321,23 +292,35 @@ class TotalMarch:
             rows.append(torch.stack([k, V.sum(-1)], -1).unsqueeze(1))
         return torch.cat(rows, 1)
 
+    def _chamber_adjoint(self, bar: Tensor) -> Tensor:
+        """Gradient by the coefficients, from that by :meth:`_chamber`."""
+        found = torch.zeros_like(self.inputs.coefficients)
+        for c in range(self.chambers):
+            gas = self.scene.kind == c
+            V, K = self.inputs.coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
+            k, whole = self.chamber[:, c, :1], self.chamber[:, c, 1:]
+            k_bar, whole_bar = bar[:, c, :1], bar[:, c, 1:]
+            found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
+            found[:, layout.BULK, gas] = k_bar * V / whole
+        return found
+
     def _nodes(self, state: Tensor) -> Tensor:
         """Displacements [B, 3, nodes] m."""
         return state[:, : 3 * self.lattice.nodes].view(self.batch, 3, self.lattice.nodes)
 
     def _places(self, state: Tensor) -> Tensor:
-        """Where the particles are [B, 3, points] m."""
+        """Current positions of the particles [B, 3, points] m."""
         return self.lattice.to_points(self._nodes(state), "mark") + self.lattice.places.T.to(state)
 
     def _outside(self, state: Tensor) -> Tensor:
-        """Which points, but for void, are not in the analysis box [B, points]."""
+        """Points outside of the analysis box, void excepted [B, points]."""
         x = self._places(state)
         low, high = (x.new_tensor(c).view(1, 3, 1) for c in (self.scene.low, self.scene.high))
         matter = (self.scene.kind != layout.ABSENT) & (self.inputs.coefficients[:, layout.VOID_FRACTION] < 1)
         return matter & ~((x > low) & (x < high)).all(1)
 
     def _report(self, step: int, state: Tensor) -> None:
-        """Say which point is wrong after so many substeps of the segment, and how."""
+        """Raise ``SimulationDiverged`` for the first point that violates a bound after so many substeps."""
         F = self.lattice.gradient(self._nodes(state)).permute(0, 3, 1, 2) + torch.eye(3).to(state)
         J = torch.linalg.det(F)
         solid = (self.scene.kind == -1) & (self.inputs.coefficients[:, layout.VOID_FRACTION] == 0)

@@ -1,0 +1,197 @@
+"""Observations of a state of either form, and their adjoints, written out since operators run below autograd.
+
+The observations are six tensors: positions and velocities of the probes [B, P, 3] (m, m/s), position and velocity of
+the centre of gravity [B, 3], volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An
+adjoint takes the six gradients by them and returns those by state, weight, coefficients and pressure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.scene import Scene
+
+Arguments = tuple[Tensor, Tensor, Tensor, Tensor]
+
+
+def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene) -> tuple[Tensor, ...]:
+    """Observations of a state.
+
+    Args:
+        state: [B, S, N], or [B, L] of the total-Lagrangian form.
+        weight: Particle weights of the centre of gravity [B, N].
+        coefficients: [B, COEFFICIENTS, N].
+        pressure: Supply pressure of each chamber now [B, chambers] in Pa.
+        scene: For the chambers and the probes.
+
+    Returns:
+        The six observations.
+    """
+    form = _observe if scene.lattice is None else _total_observe
+    return form(state, weight, coefficients, pressure, scene)
+
+
+def observe_adjoint(arguments: Arguments, bars: Sequence[Tensor], scene: Scene) -> Arguments:
+    """Gradients by the tensors that :func:`observe` takes, from those by the six observations."""
+    form = _observe_adjoint if scene.lattice is None else _total_observe_adjoint
+    return form(*arguments, bars, scene)
+
+
+def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene):
+    x, v = state[:, : layout.VELOCITY], state[:, layout.VELOCITY : layout.AFFINE]
+    share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
+    volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
+    for c in range(pressure.shape[1]):
+        gas = (scene.kind == c).nonzero().squeeze(1)
+        J = state[:, layout.DEFORMATION, gas]
+        parts = coefficients[:, layout.VOLUME, gas] * J
+        local = coefficients[:, layout.BULK, gas] * (1 - J) + pressure[:, c : c + 1]
+        volumes.append(parts.sum(-1, keepdim=True))
+        means.append((parts * local).sum(-1, keepdim=True) / volumes[-1])
+    return (
+        x[:, :, scene.probes].transpose(1, 2),
+        v[:, :, scene.probes].transpose(1, 2),
+        (share * x).sum(-1),
+        (share * v).sum(-1),
+        torch.cat(volumes, -1),
+        torch.cat(means, -1),
+    )
+
+
+def _observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tensor], scene: Scene) -> Arguments:
+    x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
+    found = torch.zeros_like(state), *_zeros(coefficients, pressure)
+    state_bar, coefficients_bar, pressure_bar = found
+    share = weight / weight.sum(-1, keepdim=True)
+    share_bar = torch.zeros_like(weight)
+    for first, at_probes, at_center in ((0, x_bar, center_bar), (layout.VELOCITY, v_bar, drift_bar)):
+        rows = slice(first, first + 3)
+        state_bar[:, rows] += share.unsqueeze(1) * at_center.unsqueeze(-1)
+        share_bar += (state[:, rows] * at_center.unsqueeze(-1)).sum(1)
+        _add_at(state_bar[:, rows], scene.probes, at_probes.transpose(1, 2))
+    for c in range(pressure.shape[1]):
+        gas = (scene.kind == c).nonzero().squeeze(1)
+        J, V, K = state[:, layout.DEFORMATION, gas], *coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
+        parts, local = V * J, K * (1 - J) + pressure[:, c : c + 1]
+        whole = parts.sum(-1, keepdim=True)
+        mean = (parts * local).sum(-1, keepdim=True) / whole
+        by_mean = mean_bar[:, c : c + 1]
+        parts_bar = volume_bar[:, c : c + 1] + by_mean * (local - mean) / whole
+        local_bar = by_mean * parts / whole
+        state_bar[:, layout.DEFORMATION, gas] += parts_bar * V - local_bar * K
+        coefficients_bar[:, layout.VOLUME, gas] += parts_bar * J
+        coefficients_bar[:, layout.BULK, gas] += local_bar * (1 - J)
+        pressure_bar[:, c] += local_bar.sum(-1)
+    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar
+
+
+def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene):
+    lattice = scene.lattice
+    assert lattice is not None
+    d, v = _motion(state, lattice.nodes)
+    places = lattice.places.to(state)
+    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+    share = weight / weight.sum(-1, keepdim=True)
+    # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
+    nodal = lattice.to_nodes(share).unsqueeze(1)
+    volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
+    for c in range(pressure.shape[1]):
+        gas, _, _, F = _chamber(d, c, scene)
+        J, V = torch.linalg.det(F), coefficients[:, layout.VOLUME, gas]
+        k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
+        volumes.append((V * J).sum(-1, keepdim=True))
+        means.append((pressure[:, c] - k * (volumes[-1][:, 0] / V.sum(-1) - 1)).unsqueeze(-1))
+    return (
+        places[scene.probes] + (d[:, :, at] * how).sum(-1).transpose(1, 2),
+        (v[:, :, at] * how).sum(-1).transpose(1, 2),
+        share @ places + (nodal * d).sum(-1),
+        (nodal * v).sum(-1),
+        torch.cat(volumes, -1),
+        torch.cat(means, -1),
+    )
+
+
+def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tensor], scene: Scene) -> Arguments:
+    lattice = scene.lattice
+    assert lattice is not None
+    x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
+    state_bar, coefficients_bar, pressure_bar = torch.zeros_like(state), *_zeros(coefficients, pressure)
+    motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
+    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+    share = weight / weight.sum(-1, keepdim=True)
+    nodal = lattice.to_nodes(share).unsqueeze(1)
+    nodal_bar = torch.zeros_like(nodal[:, 0])
+    for field, field_bar, at_probes, at_center in zip(
+        motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
+    ):
+        field_bar += nodal * at_center.unsqueeze(-1)
+        nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
+        _add_at(field_bar, at, at_probes.transpose(1, 2).unsqueeze(-1) * how)
+    share_bar = lattice.to_points(nodal_bar) + center_bar @ lattice.places.to(state).T
+    for c in range(pressure.shape[1]):
+        gas, at, slopes, F = _chamber(motion[0], c, scene)
+        V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
+        whole = V.sum(-1, keepdim=True)
+        a, b, e = F.unbind(-2)
+        cofactor = torch.stack([torch.linalg.cross(b, e), torch.linalg.cross(e, a), torch.linalg.cross(a, b)], -2)
+        J = (a * cofactor[..., 0, :]).sum(-1)
+        k, growth = (V * K).sum(-1, keepdim=True) / whole, (V * J).sum(-1, keepdim=True) / whole - 1
+        by_mean = mean_bar[:, c : c + 1]
+        swept_bar, k_bar = volume_bar[:, c : c + 1] - by_mean * k / whole, -by_mean * growth
+        coefficients_bar[:, layout.VOLUME, gas] += (
+            swept_bar * J + (k_bar * (K - k) + by_mean * k * (growth + 1)) / whole
+        )
+        coefficients_bar[:, layout.BULK, gas] += k_bar * V / whole
+        pressure_bar[:, c] += by_mean[:, 0]
+        by_nodes = torch.einsum("bpca,pan->bcpn", (swept_bar * V)[..., None, None] * cofactor, slopes)
+        _add_at(motion_bar[0], at, by_nodes)
+    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar
+
+
+def _zeros(*tensors: Tensor) -> tuple[Tensor, ...]:
+    return tuple(torch.zeros_like(t) for t in tensors)
+
+
+def _by_weight(share: Tensor, share_bar: Tensor, weight: Tensor) -> Tensor:
+    """Gradient by weights, from that by their shares of the sum."""
+    return (share_bar - (share * share_bar).sum(-1, keepdim=True)) / weight.sum(-1, keepdim=True)
+
+
+def _add_at(target: Tensor, at: Tensor, values: Tensor) -> None:
+    """Add values [B, 3, *at] to a target [B, 3, n]; an order of the sums that CUDA keeps, unlike ``index_add_``."""
+    moved = values.flatten(2).permute(2, 0, 1)
+    target.permute(2, 0, 1).index_put_((at.flatten(),), moved, accumulate=True)
+
+
+def _motion(state: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
+    """Displacements and velocities of the nodes [B, 3, nodes] m, m/s, as parts of a state."""
+    d, v = state[:, : 6 * nodes].view(-1, 2, 3, nodes).unbind(1)
+    return d, v
+
+
+def _chamber(d: Tensor, c: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Points of a chamber, their nodes and slopes there, and their deformation gradients [B, points, 3, 3]."""
+    gas = (scene.kind == c).nonzero().squeeze(1)
+    at, _, slopes = _stencil(scene, f"chamber {c}", lambda: gas, QUADRATURE, d)
+    F = torch.einsum("bcpn,pan->bpca", d[:, :, at], slopes) + torch.eye(3).to(d)
+    return gas, at, slopes, F
+
+
+# Stencils of the probes and chambers, computed once per scene.
+_stencils: WeakKeyDictionary[Scene, dict[str, tuple[Tensor, ...]]] = WeakKeyDictionary()
+
+
+def _stencil(scene: Scene, name: str, points: Callable[[], Tensor], place: float, like: Tensor) -> tuple[Tensor, ...]:
+    """``Lattice.stencil``, computed once per scene."""
+    assert scene.lattice is not None
+    known = _stencils.setdefault(scene, {})
+    if name not in known:
+        at, weights, slopes = scene.lattice.stencil(points(), place=place)
+        known[name] = at.to(like.device), weights.to(like), slopes.to(like)
+    return known[name]
