@@ -21,22 +21,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import tyro
-from matplotlib.figure import Figure
+from tqdm import tqdm
 
 from torchsoro.command_line import plain_errors
 from torchsoro.output.document import Document
 from torchsoro.rheology.budget import Budget, budget, choose, substitutes
+from torchsoro.rheology.horizon import Solidified, solidified
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep, read
-from torchsoro.rheology.plot import draw_budget
-from torchsoro.rheology.spectrum import Spectrum, fit
-from torchsoro.rheology.superposition import Shift, arrhenius, master, superpose, wlf
+from torchsoro.rheology.plausibility import check_curves, poor
+from torchsoro.rheology.plot import draw_budget, draw_shift, draw_spectrum
+from torchsoro.rheology.superposition import SAME, Shift, arrhenius, master, superpose, wlf
 from torchsoro.simulation.material_file import Material, write_material
-from torchsoro.storage import atomic_write
+from torchsoro.storage import atomic_write, check_folder
 
 Curve = Sweep | Relaxation | Creep
 WORST = 5.0  # quality of an overlap above which two curves do not superpose
+MOST = 60  # elements of a master curve: more than any data determine
+RESULTS = ("material.toml", "report.html", "master.csv")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -80,6 +82,26 @@ class Options:
     band: tuple[float, float] = (1.0, 100.0)
     """Lowest and highest frequency that the robot sees [Hz]: from its cycle to its impacts."""
 
+    def __post_init__(self) -> None:
+        """Refuse numbers that no stage can use, before any is begun."""
+        positive = ("horizon", "density", "cell", "dt", "equilibrium")
+        for name in (*positive, "reference", "temperature"):
+            value = getattr(self, name)
+            if value in ("auto", None):
+                continue
+            low, wanted = (0.0, "positive") if name in positive else (-273.15, "above -273.15 deg C")
+            if not low < value < math.inf:
+                raise ValueError(f"{name} = {value}: wanted finite and {wanted}")
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: wanted at least 0 and less than 0.5")
+        if self.elements != "auto" and not 1 <= self.elements <= MOST:
+            raise ValueError(f"elements = {self.elements}: wanted 1 to {MOST}, or auto")
+        if not 0 < self.band[0] < self.band[1] < math.inf:
+            raise ValueError(f"band = {self.band}: wanted a lower and a higher frequency in Hz")
+        for name, parts in (("units", self.units), ("columns", self.columns)):
+            if not all(parts.values()):
+                raise ValueError(f"{name} = {parts}: wanted a name for each quantity")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Found:
@@ -88,7 +110,7 @@ class Found:
     curves: Any
     shift: Shift | None
     curve: Curve
-    spectrum: Spectrum
+    solidified: Solidified
     budget: Budget
     material: Material
 
@@ -99,104 +121,117 @@ def main(options: Options) -> Found:
     Raises:
         ValueError: for a file or an option that will not do; names it.
     """
-    curves: Any = read(
-        options.file,
-        columns=options.columns,
-        units=options.units,
-        deformation=options.deformation,
-        temperature=options.temperature,
-    )
-    shift = None
-    curve: Any = curves[0]
+    check_folder("out", options.out, RESULTS)
+    curves = curves_of(options)
+    shift, curve = None, curves[0]
     if len(curves) > 1:
-        reference = options.reference
-        if reference is None:
-            measured = [c.temperature for c in curves]
-            reference = min(max(20.0, min(measured)), max(measured))
-        shift = superpose(curves, reference=reference, vertical=options.vertical, moduli=options.moduli)
+        shift = shifted(curves, options)
         curve = master(curves, shift)
-    spectrum, remark = permanent(curve, options)
-    solid = spectrum.solid(options.poisson_ratio, options.density)
+    print(f"fitting Maxwell elements to {len(getattr(curve, curve.axis))} points", flush=True)
     band = (2 * math.pi * options.band[0], 2 * math.pi * options.band[1])
+    try:
+        solid_like = solidified(
+            curve,
+            horizon=options.horizon,
+            lowest=band[0],
+            elements=options.elements,
+            equilibrium=options.equilibrium,
+        )
+    except ValueError as error:
+        raise ValueError(f"{options.file}: {error}") from error
+    spectrum = solid_like.spectrum
+    solid = spectrum.solid(options.poisson_ratio, options.density)
 
-    def price(dt: float | Literal["auto"]) -> Budget:
+    def afford(dt: float | Literal["auto"]) -> Budget:
         return budget(spectrum, solid, cell=options.cell, band=band, dt=dt, formulation=options.formulation)
 
-    priced = price("auto")
-    priced = price(priced.elements[0].step / 2 if options.dt == "auto" else options.dt)
-    kept = choose(priced)
+    affordable = afford("auto")
+    affordable = afford(affordable.elements[0].step / 2 if options.dt == "auto" else options.dt)
+    kept = choose(affordable)
+    remarks = (
+        doubts(shift, options) if shift else "",
+        poor(spectrum.error, len(curve.ordinates) * len(getattr(curve, curve.axis))),
+        solid_like.remark,
+        beyond(curve, band),
+        f"{affordable.sentence} {kept.sentence}",
+    )
     material = Material(
         solid=solid,
         prony=kept.prony(),
-        left_out=f"{doubts(shift) if shift else ''}{remark}{priced.sentence} {kept.sentence}",
+        left_out="".join(remarks),
         source={
             "file": options.file.name,
             "temperature_C": f"{curve.temperature:g}",
             "window_rad_per_s": f"{curve.omega[0]:.3g} to {curve.omega[-1]:.3g}" if isinstance(curve, Sweep) else "",
             "cell_m": f"{options.cell:g}",
-            "step_s": f"{priced.dt:g}",
+            "step_s": f"{affordable.dt:g}",
             "formulation": options.formulation,
             "band_Hz": f"{options.band[0]:g} to {options.band[1]:g}",
         },
     )
-    found = Found(curves=curves, shift=shift, curve=curve, spectrum=spectrum, budget=priced, material=material)
+    found = Found(curves=curves, shift=shift, curve=curve, solidified=solid_like, budget=affordable, material=material)
+    page = report(found, options)
     options.out.mkdir(parents=True, exist_ok=True)
-    write_material(options.out / "material.toml", material)
     write_curve(options.out / "master.csv", curve)
-    report(found, options).save(options.out / "report.html")
+    page.save(options.out / "report.html")
+    write_material(options.out / "material.toml", material)
     return found
 
 
-def permanent(measured: Curve, options: Options) -> tuple[Spectrum, str]:
-    """Fit, and take for permanent what relaxes more slowly than the horizon, or than the data reach.
-
-    Returns:
-        The spectrum, with an equilibrium modulus that the simulator can take, and a remark on it.
+def curves_of(options: Options) -> Any:
+    """The file's isothermal curves, the coldest first.
 
     Raises:
-        ValueError: if nothing is left of the modulus by then.
+        ValueError: for a file that cannot be read, that holds no measurement of a linear viscoelastic material, or that
+            has no curve at the reference temperature.
     """
-    curve = measured
-    if options.equilibrium is not None and isinstance(curve, Creep):
-        raise ValueError(f"equilibrium: {options.equilibrium:g} with creep tests, wanted none: their fit finds it")
-    if options.equilibrium is not None:
-        return fit(curve, elements=options.elements, equilibrium=options.equilibrium), ""
-    found = fit(curve, elements=options.elements)
-    known = found.equilibrium_interval
-    ended = found.equilibrium > 0 and (known is None or known.low > 0)
-    reached = 1 / curve.omega[0] if isinstance(curve, Sweep) else curve.time[-1]
-    longest = min(options.horizon, reached)
-    slow = found.times > (0.3 * longest if longest == reached else longest)
-    if ended and not slow.any():
-        return found, ""
-    modulus = found.equilibrium + float(found.moduli[slow].sum())
-    if not modulus > 0:
-        raise ValueError(
-            f"file: {options.file} shows a material that flows, with no modulus left after {longest:.2g} s; wanted a "
-            "solid, or its equilibrium modulus by --equilibrium"
+    try:
+        curves = read(
+            options.file,
+            columns={name: int(column) if column.isdigit() else column for name, column in options.columns.items()},
+            units=options.units,
+            deformation=options.deformation,
+            temperature=options.temperature,
         )
-    if isinstance(curve, Sweep):
-        seen = curve.omega >= 0.3 / longest
-        curve = dataclasses.replace(curve, omega=curve.omega[seen], storage=curve.storage[seen], loss=curve.loss[seen])
-    elif isinstance(curve, Relaxation):
-        seen = curve.time <= 3 * longest
-        curve = dataclasses.replace(curve, time=curve.time[seen], modulus=curve.modulus[seen])
-    else:  # the relaxation that goes with the creep; it is not measured, and so there are no intervals
-        time = np.geomspace(curve.time[0], 3 * longest, 100)
-        about = {"temperature": curve.temperature, "deformation": curve.deformation}
-        curve = Relaxation(time=time, modulus=found.relaxation(time), **about)
-    known = not isinstance(measured, Creep)
-    spectrum = fit(curve, elements=max(int((~slow).sum()), 1), equilibrium=modulus, intervals=known)
-    return spectrum, f"What is left after {longest:.2g} s, {modulus / 1e6:.3g} MPa, counts as permanent. "
+    except (OSError, ImportError) as error:
+        raise ValueError(f"file: {error}") from error
+    check_curves(f"file: {options.file}", curves)
+    only = curves[0].temperature
+    if options.reference is not None and len(curves) == 1:
+        if abs(only - options.reference) > SAME:  # not so if the file does not say its temperature
+            raise ValueError(
+                f"reference = {options.reference:g}: {options.file} was measured at {only:.4g} deg C only; wanted "
+                "that, or a file with several temperatures to shift"
+            )
+        return [dataclasses.replace(curves[0], temperature=options.reference)]
+    return curves
+
+
+def shifted(curves: Any, options: Options) -> Shift:
+    """Shift factors of the curves, with a bar while they are sought.
+
+    Raises:
+        ValueError: for curves or a reference that do not allow it.
+    """
+    reference = options.reference
+    if reference is None:
+        measured = [c.temperature for c in curves]
+        reference = min(max(20.0, min(measured)), max(measured))
+    form = "{desc} {percentage:3.0f} % |{bar}| {elapsed}, at most {remaining} left"
+    with tqdm(total=1.0, desc=f"superposing {len(curves)} curves", bar_format=form, delay=3.0) as bar:
+        return superpose(
+            curves, reference=reference, vertical=options.vertical, moduli=options.moduli, progress=bar.update
+        )
 
 
 def report(found: Found, options: Options) -> Document:
     """The page: the answer on top, then the way to it."""
-    s, spectrum = found.material.solid, found.spectrum
+    s, spectrum = found.material.solid, found.solidified.spectrum
+    kind = "equilibrium Young's modulus" if not found.solidified.remark else "Young's modulus taken as permanent"
     lead = (
-        f"{options.file.name} at {found.curve.temperature:.3g} C: equilibrium Young's modulus "
-        f"{s.youngs_modulus / 1e6:.3g} MPa and {len(spectrum.moduli)} Maxwell elements, of which the simulator gets "
-        f"{found.material.prony.elements}. {found.material.left_out}"
+        f"{options.file.name} at {found.curve.temperature:.3g} C: {kind} {s.youngs_modulus / 1e6:.3g} MPa and "
+        f"{len(spectrum.moduli)} Maxwell elements, of which the simulator gets {found.material.prony.elements}. "
+        f"{found.material.left_out}"
     )
     page = Document(f"Material from {options.file.name}", lead)
     page.code(f"python recipes/walker.py --material {options.out / 'material.toml'}")
@@ -204,16 +239,24 @@ def report(found: Found, options: Options) -> Document:
         page.section("Time-temperature superposition")
         page.figure(draw_shift(found.curves, found.shift, found.curve), "Measured, and shifted to one temperature.")
         page.table(shift_rows(found.shift), "Shift factors and their standard errors, in decades")
-        page.text(doubts(found.shift) or "All neighbours superpose within their noise.")
-        page.text(laws(found.shift) if enough(found.shift) else "Too few temperatures for a law of the shift factors.")
-    page.section("Maxwell elements")
-    page.figure(draw_spectrum(found.curve, spectrum), "The master curve and its Maxwell elements.")
+        page.text(doubts(found.shift, options) or "All neighbouring curves superpose within their noise.")
+        few = "Too few temperatures for the WLF and Arrhenius laws."
+        page.text(laws(found.shift) if found.shift.determines_wlf else few)
+    page.section("Relaxation spectrum")
+    if found.solidified.flow is not None:
+        page.text(found.solidified.flow.sentence)
+    page.figure(draw_spectrum(found.curve, spectrum), "Measured or master curve, and its Maxwell elements.")
     page.table(spectrum.rows(), "Moduli with their 95 % intervals")
-    page.section("To the simulator")
+    page.text(
+        "An interval is that of the modulus of one element while all others, and all relaxation times within their own "
+        "part of the time axis, are fitted anew. Elements at the ends of the data stand for all that is faster or "
+        "slower and have no interval."
+    )
+    page.section("Elements for the simulator")
     choices = substitutes(found.budget, match=found.budget.band[1])
-    page.figure(draw_budget(found.budget, choices), "What may stand for all elements, and what it loses.")
-    page.table(found.budget.rows(), "Each element: whether the step bears it, and what it costs and brings")
-    page.table([m.row() for m in choices], "What may stand for all elements; the material written is the refitted one")
+    page.figure(draw_budget(found.budget, choices), "Substitutes for the whole series, and what each neglects.")
+    page.table(found.budget.rows(), "Each element: whether the step is stable with it, its cost and its share")
+    page.table([m.row() for m in choices], "Substitutes for the whole series; the refitted one is written")
     return page
 
 
@@ -224,21 +267,35 @@ def shift_rows(shift: Shift) -> list[dict[str, float]]:
     return [dict(zip(names, map(float, row), strict=True)) for row in zip(*columns, strict=True)]
 
 
-def doubts(shift: Shift) -> str:
+def doubts(shift: Shift, options: Options) -> str:
     """Where neighbouring curves do not superpose; empty if they all do."""
     bad = [o for o in shift.overlap if o.quality > WORST or o.common < 0]
     if not bad:
         return ""
-    where = ", ".join(f"{o.cold:.3g} and {o.hot:.3g} C" for o in bad)
+    where = ", ".join(f"{round(o.cold, 1) + 0:g} and {round(o.hot, 1) + 0:g} C" for o in bad)
+    most = max((o.mismatch for o in bad if o.common > 0), default=0.0)
+    other = [
+        *["the storage modulus alone (--moduli storage)"] * (options.moduli == "both" and len(shift.noise) > 1),
+        *["vertical shifts (--vertical)"] * (not options.vertical),
+    ]
+    advice = f"Compare with {' and with '.join(other)}. " if other else ""
     return (
-        f"Neighbours that do not superpose (they differ by more than {WORST:g} times their noise, or do not overlap): "
-        f"{where}. See whether the storage modulus alone (--moduli storage) or vertical shifts (--vertical) do better. "
+        f"Neighbouring curves that do not superpose (apart by more than {WORST:g} times their noise and by up to "
+        f"{10**most - 1:.0%}, or without overlap): {where}. {advice}"
     )
 
 
-def enough(shift: Shift) -> bool:
-    """Whether there are temperatures for WLF's two numbers: three beside the reference."""
-    return int((np.abs(shift.temperatures - shift.reference) > 1e-9).sum()) > 2
+def beyond(curve: Curve, band: tuple[float, float]) -> str:
+    """A remark on the part of the band [rad/s] that was not measured; empty if there is none."""
+    low, high = (
+        (curve.omega[0], curve.omega[-1]) if isinstance(curve, Sweep) else (1 / curve.time[-1], 1 / curve.time[0])
+    )
+    if low <= band[0] and band[1] <= high:
+        return ""
+    return (
+        f"The data cover {low:.3g} to {high:.3g} rad/s: in the rest of {band[0]:.3g} to {band[1]:.3g} rad/s the moduli "
+        "are extrapolated. "
+    )
 
 
 def laws(shift: Shift) -> str:
@@ -250,73 +307,6 @@ def laws(shift: Shift) -> str:
         f"{other.activation_energy / 1e3:.3g} +- {other.activation_energy_error / 1e3:.2g} kJ/mol, "
         f"{other.residual:.2g} decades."
     )
-
-
-def draw_shift(curves: Any, shift: Shift, curve: Any) -> Figure:
-    """Measured curves and the master curve, coloured by temperature; and the shift factors with WLF's law."""
-    figure = Figure(figsize=(11, 3.9), layout="constrained")
-    raw, reduced, factors = figure.subplots(1, 3)
-    low, high = min(c.temperature for c in curves), max(c.temperature for c in curves)
-    creep = isinstance(curve, Creep)
-    for c, log_a, log_b in zip(curves, shift.log_a, shift.log_b, strict=True):
-        color = figure_color((c.temperature - low) / max(high - low, 1e-9))
-        for x, y, style in series(c):
-            raw.loglog(x, y, style, color=color, ms=3)
-            factor = 10 ** (log_a if isinstance(c, Sweep) else -log_a)
-            reduced.loglog(x * factor, y * 10 ** (-log_b if creep else log_b), style, color=color, ms=3)
-    name = "angular frequency [rad/s]" if isinstance(curve, Sweep) else "time [s]"
-    title = "measured (dots: storage, crosses: loss)" if isinstance(curve, Sweep) else "measured"
-    raw.set(xlabel=name, ylabel="compliance [1/Pa]" if creep else "modulus [Pa]", title=title)
-    reduced.set(xlabel=f"{name}, reduced", title=f"at {shift.reference:.4g} C")
-    factors.errorbar(shift.temperatures, shift.log_a, 2 * shift.log_a_error, fmt="o", ms=4, label="2 standard errors")
-    if enough(shift):
-        fine = np.linspace(low, high, 200)
-        factors.plot(fine, wlf(shift).log_a(fine), "-", lw=1.2, label="WLF")
-    factors.set(xlabel="temperature [C]", ylabel="log10 a_T")
-    factors.legend(fontsize="small")
-    for axis in (raw, reduced, factors):
-        axis.grid(alpha=0.3)
-        axis.title.set_fontsize(10)
-    return figure
-
-
-def draw_spectrum(curve: Curve, spectrum: Spectrum) -> Figure:
-    """The data and what the Maxwell elements make of them; below, the relative error."""
-    figure = Figure(figsize=(8.5, 4.8), layout="constrained")
-    axis, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    if isinstance(curve, Sweep):
-        parts = [
-            (curve.omega, measured, model, name)
-            for measured, model, name in zip(
-                (curve.storage, curve.loss), spectrum.storage_loss(curve.omega), ("storage", "loss"), strict=True
-            )
-        ]
-    elif isinstance(curve, Relaxation):
-        parts = [(curve.time, curve.modulus, spectrum.relaxation(curve.time), "relaxation")]
-    else:
-        parts = [(curve.time, curve.compliance, spectrum.creep(curve.time), "creep")]
-    for k, (x, measured, model, name) in enumerate(parts):
-        axis.loglog(x, measured, "o", ms=3, color=f"C{k}", alpha=0.5, label=f"{name}, measured")
-        axis.loglog(x, model, "-", lw=1.3, color=f"C{k}", label=f"{name}, {len(spectrum.moduli)} elements")
-        below.semilogx(x, 100 * (model / measured - 1), ".", ms=4, color=f"C{k}")
-    axis.set(ylabel="compliance [1/Pa]" if isinstance(curve, Creep) else "modulus [Pa]")
-    axis.legend(fontsize="small")
-    below.set(xlabel="angular frequency [rad/s]" if isinstance(curve, Sweep) else "time [s]", ylabel="error [%]")
-    for one in (axis, below):
-        one.grid(alpha=0.3)
-    return figure
-
-
-def series(curve: Curve) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """What to plot of a curve: abscissa, modulus, mark."""
-    if isinstance(curve, Sweep):
-        return [(curve.omega, curve.storage, "."), (curve.omega, curve.loss, "x")]
-    return [(curve.time, curve.modulus if isinstance(curve, Relaxation) else curve.compliance, ".")]
-
-
-def figure_color(share: float) -> tuple[float, float, float]:
-    """From blue for the coldest to red for the warmest."""
-    return (0.15 + 0.7 * share, 0.35 - 0.2 * abs(2 * share - 1), 0.85 - 0.7 * share)
 
 
 def write_curve(path: Path, curve: Curve) -> None:
@@ -346,7 +336,7 @@ def cli(arguments: Sequence[str] | None = None) -> None:
     with plain_errors():
         chosen = tyro.cli(Options, description=__doc__, args=arguments)
         result = main(chosen)
-        print(f"{result.material.left_out}\nwritten to {chosen.out}: material.toml, report.html, master.csv")
+        print(f"{result.material.left_out}\nwritten to {chosen.out}: {', '.join(RESULTS)}")
 
 
 if __name__ == "__main__":

@@ -202,8 +202,8 @@ def test_declared_units_and_columns_go_before_what_the_file_says(tmp_path):
 
 def test_a_workbook_without_its_reader_says_how_to_go_on(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "python_calamine", None)
-    with pytest.raises(ModuleNotFoundError, match=r"pip install python-calamine.*save its sheet as CSV"):
-        read(write(tmp_path, "", name="data.xls"))
+    with pytest.raises(ModuleNotFoundError, match=r'extra excel \(pip install "torchsoro\[excel\]"\).*as CSV'):
+        read(write(tmp_path, "x", name="data.xls"))
     with pytest.raises(FileNotFoundError, match="no such file"):
         read(tmp_path / "none.xls")
 

@@ -12,7 +12,7 @@ Gaussian Processes for Machine Learning, 2006, Eqs. 2.30 and 5.9.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -257,7 +257,7 @@ class Alignment:
         vertical = [(-VERTICAL, VERTICAL)] * (len(self.windows) if self.vertical else 0)
         return np.array([*self.windows, *vertical])
 
-    def solve(self) -> Solution:
+    def solve(self, progress: Callable[[float], object]) -> Solution:
         """Search from the guesses that neighbouring curves give by themselves."""
         m = len(self.windows)
         hypers = np.array([channel.hyper for channel in self.channels])
@@ -270,7 +270,7 @@ class Alignment:
         steps = np.concatenate([[self._guess(i) for i in range(m)], np.zeros(len(self.bounds) - m)])
         departures = [channel.departure() for channel in self.channels]
         value = np.inf
-        for _ in range(ROUNDS):
+        for done in range(ROUNDS):
             found = minimize(
                 self._objective,
                 steps,
@@ -292,7 +292,9 @@ class Alignment:
             )
             hypers = better.x.reshape(-1, 3)
             if abs(better.fun - value) < 0.01:
+                progress(1 - done / ROUNDS)
                 break
+            progress(1 / ROUNDS)
             value = better.fun
         information = self._information(self._states(steps, hypers, departures), effects)
         return Solution(steps=steps, hypers=np.exp(hypers), covariance=np.linalg.inv(information))

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal, get_args
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from torchsoro.rheology.readers import Table, load
 
 Deformation = Literal["tension", "shear"]
+OUTLIER = 2.5  # decades from the median of the five values around it, beyond which a value is no measurement
 
 
 class _Curve:
@@ -157,6 +160,8 @@ def read(
     kind = _kind(table)
     if temperature is not None and "temperature" in table.columns:
         raise ValueError(f"temperature = {temperature}: {table.where('temperature')} holds temperatures already")
+    if kind is Sweep and "frequency" not in (units or {}):
+        _check_unit_of_frequency(table)
     x = table.numbers("frequency" if kind is Sweep else "time", positive=True)
     y = {name: table.numbers(name, positive=name != "loss") for name in kind.ordinates}
     mode = deformation or _deformation(table, kind.ordinates[0])
@@ -171,6 +176,8 @@ def read(
                 f"{table.path}, lines {first} and {second}: {kind.axis} {x[rows[twice[0]]]:g} twice in one curve, "
                 'wanted once. If they are of two curves, name the column that tells them apart: columns={"set": ...}'
             )
+        for name, values in y.items():
+            _check_outliers(table, name, values, rows)
         given = {kind.axis: x[rows], **{name: values[rows] for name, values in y.items()}}
         mean = np.nan if temperature is None else temperature
         if measured is not None:
@@ -203,6 +210,32 @@ def _deformation(table: Table, quantity: str) -> Deformation:
     if tension == shear:
         raise ValueError(f'{table.where(quantity)}: tension or shear? Declare it, for example deformation="shear"')
     return "tension" if tension else "shear"
+
+
+def _check_unit_of_frequency(table: Table) -> None:
+    """Refuse an angular frequency in Hz: the name and the unit contradict each other by a factor of 2 pi."""
+    if table.units["frequency"].endswith("hz") and re.fullmatch(r"w|ω|(?i:omega|ang.*)", table.stem("frequency")):
+        raise ValueError(
+            f"{table.where('frequency')}: an angular frequency in Hz; wanted rad/s, or a frequency in Hz. Declare "
+            'which, for example units={"frequency": "rad/s"}, on a command line --units frequency rad/s'
+        )
+
+
+def _check_outliers(table: Table, quantity: str, values: np.ndarray, rows: np.ndarray) -> None:
+    """Refuse a value that is decades from those beside it in its curve, naming its line and column."""
+    rows = rows[values[rows] > 0]  # a loss modulus may be zero
+    if len(rows) < 5:
+        return
+    logs = np.log10(values[rows])
+    off = logs - median_filter(logs, 5, mode="reflect")
+    worst = int(np.abs(off).argmax())
+    if abs(off[worst]) > OUTLIER:
+        line, column = table.lines[rows[worst]], table.names[table.columns[quantity]]
+        raise ValueError(
+            f"{table.path}, line {line}, column {column!r} ({quantity}): {table.texts(quantity)[rows[worst]]} is "
+            f"{abs(off[worst]):.1f} decades {'above' if off[worst] > 0 else 'below'} the values beside it; wanted a "
+            "continuous curve: mend or remove the row"
+        )
 
 
 DRIFT = 2.0  # more than this between the rows of one curve is another temperature, not scatter [K]

@@ -14,6 +14,7 @@ import numpy as np
 
 MODULUS = {"pa": 1.0, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9, "n/m2": 1.0, "n/mm2": 1e6, "dyn/cm2": 0.1}
 COMPLIANCE = {"1/pa": 1.0, "1/kpa": 1e-3, "1/mpa": 1e-6, "1/gpa": 1e-9, "m2/n": 1.0, "mm2/n": 1e-6, "cm2/dyn": 10.0}
+LARGEST = 10_000_000  # bytes of a file; a sweep has some thousand rows
 TEMPERATURE = {"c": 0.0, "k": -273.15}  # what is added
 UNITS: dict[str, dict[str, float]] = {
     "frequency": {"hz": 2 * math.pi, "khz": 2e3 * math.pi, "rad/s": 1.0},
@@ -88,7 +89,8 @@ class Table:
         if quantity in self.rivals:
             rival = self.rivals[quantity]
             raise ValueError(
-                f"{self.where(quantity)}, or {rival!r}? Choose one, for example columns={{{quantity!r}: {rival!r}}}"
+                f"{self.where(quantity)}, or {rival!r}? Choose one, for example columns={{{quantity!r}: {rival!r}}}, "
+                f"on a command line --columns {quantity} {rival!r}"
             )
         column = self.columns[quantity]
         for line, row in zip(self.lines, self.rows, strict=True):
@@ -112,7 +114,8 @@ class Table:
             spelled = ", ".join(repr(name) for name in _SPELLED[quantity])
             raise ValueError(
                 f"{self.where(quantity)}: {f'unit {unit!r}' if unit else 'no unit'}, wanted one of {spelled}. "
-                f"Declare it, for example units={{{quantity!r}: {_SPELLED[quantity][0]!r}}}"
+                f"Declare it, for example units={{{quantity!r}: {_SPELLED[quantity][0]!r}}}, on a command line "
+                f"--units {quantity} {_SPELLED[quantity][0]}"
             )
         values = []
         for line, text in zip(self.lines, self.texts(quantity), strict=True):
@@ -158,6 +161,10 @@ def load(path: Path, columns: Mapping[str, str | int], units: Mapping[str, str],
             raise ValueError(f"units: {unit!r} for {quantity!r}, wanted one of {', '.join(_SPELLED[quantity])}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
+    if (size := path.stat().st_size) > LARGEST:
+        raise ValueError(f"{path}: {size / 1e6:.0f} MB, wanted at most {LARGEST / 1e6:.0f} MB: average its rows")
+    if not size:
+        raise ValueError(f"{path}: is empty, wanted a table")
     for rows, decimal in _splits(path, sheet):
         found = _header(rows, columns)
         if found is not None:
@@ -167,6 +174,7 @@ def load(path: Path, columns: Mapping[str, str | int], units: Mapping[str, str],
     raise ValueError(
         f"{path}: no header row{declared}; the first rows are: {first}. Wanted one that names frequency, storage and "
         'loss, or time and modulus or compliance. Name the columns, for example columns={"frequency": 0, "storage": 1}'
+        ", on a command line --columns frequency 0 storage 1"
     )
 
 
@@ -180,13 +188,18 @@ def _splits(path: Path, sheet: str | None) -> Iterator[tuple[list[list[str]], bo
         raise ValueError(f"sheet = {sheet!r}: {path} is text; wanted None")
     raw = path.read_bytes()
     encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    if encoding != "utf-16" and b"\0" in raw:
+        raise ValueError(f"{path}: holds binary data, wanted text, or a workbook by its suffix .xls, .xlsx or .ods")
     try:
         text = raw.decode(encoding)
     except UnicodeDecodeError:
         text = raw.decode("latin-1")  # older instruments: the degree sign is one byte
     lines = text.splitlines()
     for delimiter in ("\t", ";", ","):
-        rows = [next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), []) for line in lines]
+        try:
+            rows = [next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), []) for line in lines]
+        except csv.Error as error:
+            raise ValueError(f"{path}: {error}; wanted a table of text") from error
         # Some instruments write a header with tabs over rows with blanks.
         for i, line in enumerate(lines):
             words = line.split()
@@ -202,10 +215,13 @@ def _workbook(path: Path, sheet: str | None) -> Iterator[list[list[str]]]:
         calamine = importlib.import_module("python_calamine")
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(
-            f"{path}: workbooks are read by python-calamine, which is not installed. Install it (pip install "
-            "python-calamine), or open the file in a spreadsheet and save its sheet as CSV"
+            f"{path}: workbooks are read by python-calamine, which is not installed. Install the extra excel (pip "
+            'install "torchsoro[excel]"), or open the file in a spreadsheet and save its sheet as CSV'
         ) from error
-    book = calamine.CalamineWorkbook.from_path(str(path))
+    try:
+        book = calamine.CalamineWorkbook.from_path(str(path))
+    except (calamine.CalamineError, OSError) as error:
+        raise ValueError(f"{path}: {error}; wanted a workbook, or a table of text with another suffix") from error
     if sheet is not None and sheet not in book.sheet_names:
         raise ValueError(f"sheet = {sheet!r}: {path} has {', '.join(map(repr, book.sheet_names))}")
     for name in book.sheet_names if sheet is None else [sheet]:

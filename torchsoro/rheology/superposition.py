@@ -7,7 +7,7 @@ the reference.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -75,6 +75,11 @@ class Shift:
         elif self.covariance.shape != (count, count):
             raise ValueError(f"covariance: shape {self.covariance.shape}, wanted {(count, count)}")
 
+    @property
+    def determines_wlf(self) -> bool:
+        """Whether there are temperatures for the two constants of WLF: three beside the reference."""
+        return int((np.abs(self.temperatures - self.reference) > 1e-9).sum()) > 2
+
 
 def read_shift(
     path: str | Path,
@@ -120,6 +125,7 @@ def superpose(
     vertical: bool = False,
     moduli: Literal["both", "storage", "loss"] = "both",
     misfit: float | None = None,
+    progress: Callable[[float], object] | None = None,
 ) -> Shift:
     """Find the shifts under which isothermal curves are most likely pieces of one smooth curve.
 
@@ -137,6 +143,7 @@ def superpose(
         misfit: By how much a curve may depart from the master curve, as standard deviation [decades]: estimated if
             None. With 0 whatever differs is shift, as in a superposition by eye: more definite, and wrong where curves
             are flat and their heights are not comparable.
+        progress: Is called with the share of the work done since its last call; the shares add up to 1.
 
     Raises:
         ValueError: naming the argument or the curve, the value seen and the value wanted.
@@ -150,7 +157,7 @@ def superpose(
     windows = [window(channels, temperatures, i) for i in range(len(ordered) - 1)]
     sign = -1.0 if isinstance(ordered[0], Creep) else 1.0
     search = Alignment(channels=channels, windows=windows, vertical=vertical, misfit=misfit, sign=sign)
-    found = search.solve()
+    found = search.solve(progress or (lambda share: None))
     m = len(windows)
     shifts = search.sums - weights @ search.sums  # of steps, relative to the reference
     log_a, of_a = shifts @ found.steps[:m], shifts @ found.covariance[:m, :m] @ shifts.T
