@@ -188,6 +188,36 @@ def test_terms_faster_than_the_data_cannot_be_known(seed):
         assert interval.low <= truth <= interval.high or abs(value / truth - 1) < 0.05
 
 
+def test_intervals_of_a_melt_cover_its_moduli_beside_an_element_faster_than_the_data():
+    truth = Spectrum(
+        equilibrium=0.0,
+        moduli=np.array([5e6, 2e5, 1e5, 5e4]),
+        times=np.array([1e-5, 1e-2, 1.0, 30.0]),
+        deformation="shear",
+    )
+    inside = []
+    for seed in range(8):
+        found = fit(sweep(truth, np.geomspace(1e-3, 1e3, 30), 0.02, seed), elements=4, equilibrium=False)
+        assert found.intervals[0].unknown and not any(i.unknown for i in found.intervals[1:])
+        for interval, modulus in zip(found.intervals[1:], truth.moduli[1:], strict=True):
+            assert interval.high < 1.1 * interval.low
+            inside.append(interval.low <= modulus <= interval.high)
+    assert sum(inside) >= 21  # of 24 at 95 %
+
+
+def test_serially_correlated_residuals_leave_intervals_at_held_relaxation_times():
+    # A smooth error, as where isotherms do not quite meet: one term less fits nearly as well.
+    times, omega = np.geomspace(1e-5, 1e2, 40), np.geomspace(1e-3, 1e3, 60)
+    truth = Spectrum(equilibrium=0.0, moduli=1e4 * times**-0.3, times=times, deformation="shear")
+    storage, loss = (m * (1 + 0.03 * np.sin(2 * np.log(omega))) for m in truth.storage_loss(omega))
+    found = fit(replace(sweep(truth, omega), storage=storage, loss=loss), equilibrium=False)
+    assert found.inflation > 3
+    known = [i for i in found.intervals if not i.unknown]
+    assert len(known) >= len(found.moduli) - 1 >= 3
+    assert any("relaxation times held" in i.condition for i in known)
+    assert all(0 < i.low and i.high < 5 * i.low for i in known if i.condition)
+
+
 def test_a_term_that_is_not_there_has_an_interval_from_zero():
     times = np.sort([*TABLE_S1.times, 40.0])
     found = fit(sweep(TABLE_S1, MASTER, 0.02, 3), times=times, regularization=0)

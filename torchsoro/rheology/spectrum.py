@@ -32,6 +32,7 @@ PENALTIES = (0.0, 1e-2, 1e-1, 1.0, 10.0)  # tried where regularization = "auto"
 _FASTER = {Sweep: 30.0, Relaxation: 3.0, Creep: 3.0}
 _SLOWER = 3.0
 _PERMANENT = 0.5  # least share of the lowest measured modulus that counts as an equilibrium modulus
+_HELD = "with the relaxation times held: one element less fits as well within the correlated residuals"
 _EDGE = 1.05  # a relaxation time within this factor of an end of the window lies on it
 
 
@@ -43,11 +44,13 @@ class Interval:
         low: Lower end [Pa].
         high: Upper end [Pa], inf if there is none.
         unknown: Why the modulus cannot be known, in words; empty if it can.
+        condition: What the interval takes for known that was fitted, in words; empty for nothing.
     """
 
     low: float
     high: float
     unknown: str = ""
+    condition: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,12 +193,12 @@ class Spectrum:
         )
 
     def rows(self) -> list[dict[str, float | str]]:
-        """One row for the equilibrium modulus and each term: time [s], modulus, interval [Pa], what cannot be known."""
+        """One row for the equilibrium modulus and each term: time [s], modulus, interval [Pa], and a remark on it."""
         known = (self.equilibrium_interval, *(self.intervals or (None,) * len(self.moduli)))
         values = zip((math.inf, *self.times), (self.equilibrium, *self.moduli), known, strict=True)
         return [
             {"time [s]": float(time), "modulus [Pa]": float(modulus)}
-            | ({} if i is None else {"low [Pa]": i.low, "high [Pa]": i.high, "unknown": i.unknown})
+            | ({} if i is None else {"low [Pa]": i.low, "high [Pa]": i.high, "remark": i.unknown or i.condition})
             for time, modulus, i in values
         ]
 
@@ -229,7 +232,9 @@ def fit(
     bear at all (``Spectrum.floor``).
 
     The intervals are profile likelihoods at 95 %: all else is fitted anew at each value of a modulus, relaxation times
-    too where they are free, and the noise is estimated from the residuals. Serially correlated residuals widen them.
+    too where they are free, each up to the geometric mean with its neighbours, lest terms exchange places. Where the
+    others can still take a term's part, within serially correlated residuals, the interval holds for the relaxation
+    times as fitted, and says so. The noise is estimated from the residuals. Serially correlated residuals widen them.
     Times that are given or on the logarithmic grid count as known, and a penalty as true. A modulus cannot be known
     when zero will do, when nothing bounds it from above, and when its time is at or beyond an end of the data's window,
     where the term stands for all that is faster or slower. An equilibrium modulus cannot be known when it is less than
@@ -321,14 +326,17 @@ def _known(problem: Problem, best: Found, seen: tuple[float, float], spare: floa
     grown = inflation(problem, best)
     rise = best.error * grown * float(fisher.ppf(LEVEL, 1, spare)) / spare
     ends = list(profiles(problem, best, rise, optimised=optimised))
+    held = list(profiles(problem, best, rise, optimised=False)) if optimised and grown > 1 else ends
     fast, slow = max(seen[0], problem.window[0]) * _EDGE, min(seen[1], problem.window[1]) / _EDGE
     known = []
-    for i, (low, high) in enumerate(ends):
+    for i, ((low, high), fixed_times) in enumerate(zip(ends, held, strict=True)):
         time = None if i < problem.first else best.times[i - problem.first]
         if time is not None and not fast < time < slow:
             side, more = ("fast", "higher frequencies or colder") if time <= fast else ("slow", "for longer or warmer")
             why = f"stands for all that is {side}er than the data see: measure at {more}"
             known.append(Interval(low=0.0, high=math.inf, unknown=why.replace("at for", "for")))
+        elif time is not None and low == 0 < fixed_times[0]:
+            known.append(Interval(low=fixed_times[0], high=fixed_times[1], condition=_HELD))
         else:
             known.append(Interval(low=low, high=high, unknown="" if low > 0 else "the data agree with zero"))
     if problem.constant is not None:
