@@ -4,8 +4,8 @@
     python recipes/convert.py "mass A.txt" "mass B.txt" --out my-experiment/trials/a/markers.csv --rename "mass A=tip"
     python recipes/convert.py walk.c3d --out my-experiment/trials/a/markers.csv --axes=x,z,-y
 
-Reads data files of Tracker (physlets.org), CSV of DeepLabCut and C3D of motion capture, told by ending and first line.
-Nothing is resampled, smoothed or filled. Markers of setup.toml must have the same names; others do no harm.
+Reads data files of Tracker (physlets.org), CSV of DeepLabCut and C3D of motion capture, recognized by ending and first
+line. Nothing is resampled, smoothed or filled. Markers of setup.toml must have the same names; others do no harm.
 """
 
 from __future__ import annotations

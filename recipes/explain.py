@@ -16,12 +16,14 @@ from collections.abc import Sequence
 import tyro
 
 from torchsoro.command_line import plain_errors
-from torchsoro.sim2real.pipeline import Options, explain
+from torchsoro.sim2real.options import Options
 
 
 def main(options: Options) -> None:
     """Explain an experiment, or predict a trial."""
-    explain(options)
+    from torchsoro.sim2real.pipeline import run  # takes seconds, which --help need not
+
+    run(options)
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:

@@ -23,7 +23,7 @@ def test_terms_that_are_not_there_are_dropped(baselines):
     rng = np.random.default_rng(0)
     A = rng.normal(size=(400, 6)) * np.array([1.0, 100.0, 1.0, 0.01, 1.0, 1.0])
     y = 3.0 * A[:, 0] - 200.0 * A[:, 3] + 0.1 * rng.normal(size=400)
-    x = baselines.thresholded(A, y)
+    x = baselines.sequential_thresholding(A, y)
     assert np.flatnonzero(x).tolist() == [0, 3]
     assert x[[0, 3]] == pytest.approx([3.0, -200.0], rel=0.02)
 
@@ -32,8 +32,8 @@ def test_a_derivative_of_a_track_bears_lost_samples(baselines):
     time = np.linspace(0.0, 1.0, 201)
     track = np.sin(5 * time)
     track[[7, 50, 51, 120]] = np.nan
-    found = baselines.smoothed(time, track, 2)
-    assert found[10:-10] == pytest.approx(-25 * np.sin(5 * baselines.evenly(time))[10:-10], abs=0.3)
+    found = baselines.smooth_derivative(time, track, 2)
+    assert found[10:-10] == pytest.approx(-25 * np.sin(5 * baselines.even_times(time))[10:-10], abs=0.3)
 
 
 def test_a_network_learns_a_force_against_the_velocity(baselines):
@@ -43,7 +43,7 @@ def test_a_network_learns_a_force_against_the_velocity(baselines):
     G = rng.normal(size=(200, *force.shape))
     d = np.einsum("rtpwa,tpwa->r", G, force)
     lines = SimpleNamespace(histories=SimpleNamespace(G=G, d=d))
-    found = baselines.trained(lines, x)(x).detach().numpy()
+    found = baselines.train(lines, x)(x).detach().numpy()
     assert np.corrcoef(found.ravel(), force.ravel())[0, 1] > 0.9
 
 
@@ -61,9 +61,9 @@ def test_a_network_learns_a_force_against_the_velocity(baselines):
 def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
     case = ROOT / "tests" / "judged" / "cases" / "case-111"
     baselines.main(baselines.Options(experiment=case, out=tmp_path, method=method, budget=0.5))
-    told = json.loads((tmp_path / "explanation.json").read_text())
-    assert verdict is None or told["verdict"] == verdict
-    assert named <= set(told["set"])
+    report = json.loads((tmp_path / "explanation.json").read_text())
+    assert verdict is None or report["verdict"] == verdict
+    assert named <= set(report["set"])
     assert (tmp_path / "model.toml").exists() == (method not in ("force-network", "sparse-regression"))
-    assert any(e["location_m"] for e in told["effects"]) == (method == "force-map")
-    assert all(row["before"] > 0 and row["after"] > 0 for row in told["heldout"])
+    assert any(e["location_m"] for e in report["effects"]) == (method == "force-map")
+    assert all(row["before"] > 0 and row["after"] > 0 for row in report["heldout"])

@@ -156,7 +156,7 @@ def test_the_report_says_which_force_no_effect_stands_for(made, tmp_path, monkey
     from torchsoro.sim2real import pipeline as explain
 
     problem = made(2, (0.0, 0.0, 0.05))
-    monkeypatch.setattr(explain, "read_experiment", lambda folder: problem.experiment)
+    monkeypatch.setattr("torchsoro.sim2real.inputs.read_experiment", lambda folder: problem.experiment)
     monkeypatch.setattr("torchsoro.sim2real.inference.verdict.library", lambda: (GravityTilt(),))
     explain.explain(explain.Options(experiment=problem.experiment.folder, out=tmp_path / "out", edge=0.01))
     answer = json.loads((tmp_path / "out" / "explanation.json").read_text())

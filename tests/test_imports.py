@@ -33,6 +33,8 @@ sim2real.twin
 sim2real.hypotheses
 sim2real.inference
 sim2real.report
+sim2real.options sim2real.progress
+sim2real.inputs
 sim2real.pipeline
 cli
 """

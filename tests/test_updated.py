@@ -11,7 +11,8 @@ import torch
 import trimesh
 from test_experiment import SETUP, experiment
 
-from torchsoro.sim2real.data.experiment import Boundary, Load, read_experiment
+from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.data.schema import Boundary, Load
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 

@@ -34,23 +34,23 @@ from torchsoro.sim2real.inference.histories import Lines, simulate
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects
 from torchsoro.sim2real.inference.model import write_model
 from torchsoro.sim2real.inference.verdict import Thresholds, judge
-from torchsoro.sim2real.pipeline import Options as ExplainOptions
-from torchsoro.sim2real.pipeline import begun, predicted, prepared
+from torchsoro.sim2real.inputs import read_inputs
+from torchsoro.sim2real.options import Options as ExplainOptions
+from torchsoro.sim2real.pipeline import correct, predict_markers
 from torchsoro.sim2real.report.explanation import effect_rows
-from torchsoro.sim2real.twin.ensemble import Ensemble
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
 Ablation = Literal["without-numerics", "without-heldout", "one-trial", "force-map"]
 
-SURE = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
+SIGNIFICANT = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
 PATCHES, WINDOWS = 4, 10  # that the force network acts on, in each trial
 SLICES = 8  # of the body, on which the force map puts its forces
 HIDDEN, EPOCHS, DECAY = 16, 1500, 1e-3  # of the force network
-HELPS = 0.85  # error on trials left out, over that without it, at which a network has found something
-SMOOTH = 9  # samples of the parabola that is differentiated twice for sparse regression
-SPARSE = 0.1  # of the largest normalised coefficient, below which a term is dropped
-PREDICTS = 0.1  # share of the residual accelerations of trials left out, at which terms are believed
-BROKEN = 1.0  # m, the error where a prediction breaks down
+IMPROVEMENT = 0.85  # error on trials left out, over that without it, at which a network has found something
+FILTER_SAMPLES = 9  # samples of the parabola that is differentiated twice for sparse regression
+SPARSITY = 0.1  # of the largest normalised coefficient, below which a term is dropped
+PREDICTED_SHARE = 0.1  # share of the residual accelerations of trials left out, at which terms are believed
+DIVERGED_ERROR = 1.0  # m, the error where a prediction breaks down
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -86,7 +86,7 @@ class Answer:
     Attributes:
         verdict: Of the four.
         effects: Rows.
-        names: That cannot be told apart.
+        names: Effects that cannot be distinguished.
         heldout: Of trials that were left out, the error as believed and after [m].
         fit: For model.toml, if there is one.
     """
@@ -98,7 +98,7 @@ class Answer:
     fit: Fit | None = None
 
 
-def fitted(problem: FitProblem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
+def fit_or_raise(problem: FitProblem, effects: Effects = (), start: np.ndarray | None = None, rounds: int = 6) -> Fit:
     """A fit.
 
     Raises:
@@ -110,7 +110,7 @@ def fitted(problem: FitProblem, effects: Effects = (), start: np.ndarray | None 
     return found
 
 
-def left_out(
+def leave_one_out_errors(
     problem: FitProblem, null_model: Fit, other: Callable[[int, FitProblem, Trial], float]
 ) -> dict[str, tuple[float, float]]:
     """The error of each trial as believed, and what a function of its number, the other trials and it gives."""
@@ -122,7 +122,7 @@ def left_out(
     return found
 
 
-def parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
+def fit_parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
     """Least squares in some parameters at once; those far from what is believed are named."""
     effects = tuple(problem.thought_of([e for e in library() if e.name in names]))
     start = [np.zeros(len(problem.common))]
@@ -131,26 +131,26 @@ def parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
         begin = np.zeros(len(effect.quantities)) if effect.joint else np.array(effect.starts[0], float)
         begin[0] = 0.0
         start.append(begin)
-    fit = fitted(problem, effects, np.concatenate(start), rounds=20)
+    fit = fit_or_raise(problem, effects, np.concatenate(start), rounds=20)
     spread = math.sqrt(max(1.0, fit.chi2 / fit.samples))
     rows = {r["name"]: r for r in effect_rows(fit, 1.0, problem)}
     sure = []
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         strengths = len(effect.quantities) if effect.joint else 1
         v, c = values[:strengths], covariance[:strengths, :strengths]
-        if v.any() and float(v @ np.linalg.pinv(c) @ v) > strengths * (SURE * spread) ** 2:
+        if v.any() and float(v @ np.linalg.pinv(c) @ v) > strengths * (SIGNIFICANT * spread) ** 2:
             sure.append(effect.name)
 
     def after(i: int, where: FitProblem, trial: Trial) -> float:
-        told = predict(where, problem.without(fit, i), [trial])
-        return told[0].total if told else BROKEN
+        predicted = predict(where, problem.without(fit, i), [trial])
+        return predicted[0].total if predicted else DIVERGED_ERROR
 
     kind = {0: "nothing_missing", 1: "explained"}.get(len(sure), "cannot_distinguish")
-    held = left_out(problem, fitted(problem), after)
+    held = leave_one_out_errors(problem, fit_or_raise(problem), after)
     return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
 
 
-def judged(problem: FitProblem, budget: float, **thresholds: float) -> Answer:
+def full_search(problem: FitProblem, budget: float, **thresholds: float) -> Answer:
     """The verdict of explain.py."""
     verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
     rows = effect_rows(verdict.chosen[0].fit, 1.0, verdict.problem) if verdict.chosen else []
@@ -163,7 +163,7 @@ def judged(problem: FitProblem, budget: float, **thresholds: float) -> Answer:
     )
 
 
-def without_band(problem: FitProblem) -> FitProblem:
+def without_discretization_error(problem: FitProblem) -> FitProblem:
     """The same, as if the corrected twin made no error."""
     return problem.only(problem.trials, discretization=[np.zeros_like(n) for n in problem.discretization])
 
@@ -212,7 +212,7 @@ class ForceNetwork(nn.Module):
         return self.unit * self.out(torch.tanh(self.hidden(x)))
 
 
-def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
+def train(lines: Lines, x: torch.Tensor) -> ForceNetwork:
     """The network whose forces leave least of a residual, by the linear response."""
     torch.manual_seed(0)
     G, d = torch.from_numpy(lines.histories.G.reshape(len(lines.histories.d), -1)), torch.from_numpy(lines.histories.d)
@@ -229,7 +229,7 @@ def trained(lines: Lines, x: torch.Tensor) -> ForceNetwork:
 
 def force_network(problem: FitProblem) -> Answer:
     """Forces by a network, learned from all trials but one."""
-    null_model = fitted(problem)
+    null_model = fit_or_raise(problem)
     s = problem.experiment.setup
     small = 1e-3 * s.youngs_modulus * min(s.size) ** 3 / max(s.size)
     _, shares = patches(problem.twin, PATCHES)
@@ -242,21 +242,21 @@ def force_network(problem: FitProblem) -> Answer:
         others = [k for k in range(len(problem.trials)) if k != i]
         still = problem.without(null_model, i)
         lines = Lines(where, still.errors, null_model.point, [motions[k] for k in others], none[others])
-        forces = trained(lines, x[others])(x[i]).detach().numpy()
+        forces = train(lines, x[others])(x[i]).detach().numpy()
         jumps = np.diff(forces, axis=1, prepend=0.0).reshape(-1)
         fit = dataclasses.replace(still, effects=steps, point=np.concatenate([still.point, jumps]))
         # Without forces where the body does not bear them.
         found = predict(where, fit, [trial]) or predict(where, still, [trial])
         return found[0].total
 
-    held = left_out(problem, null_model, after)
+    held = leave_one_out_errors(problem, null_model, after)
     (one, other) = (math.sqrt(sum(v[k] ** 2 for v in held.values())) for k in (0, 1))
-    return Answer(verdict="unknown_physics" if other < HELPS * one else "nothing_missing", heldout=held)
+    return Answer(verdict="unknown_physics" if other < IMPROVEMENT * one else "nothing_missing", heldout=held)
 
 
-def mapped(problem: FitProblem) -> Answer:
+def largest_force(problem: FitProblem) -> Answer:
     """The place of the largest force that a force map needs, where something is missing."""
-    null_model = fitted(problem)
+    null_model = fit_or_raise(problem)
     if null_model.chi2 < Thresholds().quiet * null_model.samples:
         return Answer(verdict="nothing_missing", fit=null_model)
     needed = force_map(problem, null_model, count=SLICES, windows=WINDOWS).needed
@@ -267,19 +267,19 @@ def mapped(problem: FitProblem) -> Answer:
 # Sparse regression -------------------------------------------------------------------------------------------------
 
 
-def evenly(time: np.ndarray) -> np.ndarray:
+def even_times(time: np.ndarray) -> np.ndarray:
     """Times as far apart as most samples are."""
     return np.arange(time[0], time[-1], float(np.median(np.diff(time))))
 
 
-def smoothed(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
+def smooth_derivative(time: np.ndarray, track: np.ndarray, order: int) -> np.ndarray:
     """A derivative of a track, some of whose samples were lost, at even times."""
-    even, good = evenly(time), np.isfinite(track)
+    even, good = even_times(time), np.isfinite(track)
     whole = CubicSpline(time[good], track[good])(even)
-    return np.asarray(savgol_filter(whole, SMOOTH, 3, deriv=order, delta=float(even[1] - even[0])))
+    return np.asarray(savgol_filter(whole, FILTER_SAMPLES, 3, deriv=order, delta=float(even[1] - even[0])))
 
 
-def terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
+def candidate_terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], list[np.ndarray]]:
     """Names of terms, and for each trial their values [N, K] and the residual accelerations [N], by the recordings."""
     names = ["modulus", "stiffening", "viscoelastic", "drag", "friction", "density"]
     names += ["gravity_tilt"] * len(problem.experiment.setup.axes)
@@ -289,7 +289,7 @@ def terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], l
     for trial, seen, scenario in zip(problem.trials, fit.seen, problem.scenarios, strict=True):
         assert trial.recording is not None
         t = trial.recording.time
-        even = evenly(t)
+        even = even_times(t)
         p = np.zeros(len(even))
         if scenario.pressure is not None:
             p = scenario.pressure.at(torch.from_numpy(even)).reshape(-1, len(even))[0].numpy()
@@ -297,10 +297,10 @@ def terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], l
         rows, accelerations = [], []
         for m, a in np.ndindex(*seen.shape[1:]):
             left = trial.recording.place[:, m, a] - seen[:, m, a]
-            if np.isfinite(left).sum() < SMOOTH:
+            if np.isfinite(left).sum() < FILTER_SAMPLES:
                 continue
-            u = smoothed(t, seen[:, m, a] - seen[0, m, a], 0)
-            v, b = (smoothed(t, seen[:, m, a], k) for k in (1, 2))
+            u = smooth_derivative(t, seen[:, m, a] - seen[0, m, a], 0)
+            v, b = (smooth_derivative(t, seen[:, m, a], k) for k in (1, 2))
             speed = float(np.abs(v).max()) or 1.0
             constant = np.zeros((len(even), seen.shape[2]))
             constant[:, a] = 1.0
@@ -309,13 +309,13 @@ def terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.ndarray], l
                 way = float(u[int(np.abs(p).argmax())])
                 columns += [p * way, rate * way]
             rows.append(np.stack(columns, -1))
-            accelerations.append(smoothed(t, left, 2))
+            accelerations.append(smooth_derivative(t, left, 2))
         values.append(np.concatenate(rows))
         targets.append(np.concatenate(accelerations))
     return names, values, targets
 
 
-def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
+def sequential_thresholding(A: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Coefficients by least squares, small ones dropped until none is."""
     scale = np.sqrt((A**2).mean(0)) + 1e-300
     kept = np.ones(A.shape[1], bool)
@@ -323,7 +323,7 @@ def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
     while kept.any():
         x[:] = 0.0
         x[kept] = np.linalg.lstsq(A[:, kept] / scale[kept], y, rcond=1e-8)[0]
-        small = kept & (np.abs(x) < SPARSE * np.abs(x).max())
+        small = kept & (np.abs(x) < SPARSITY * np.abs(x).max())
         if not small.any():
             break
         kept &= ~small
@@ -332,17 +332,18 @@ def thresholded(A: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def sparse_regression(problem: FitProblem) -> Answer:
     """Terms that the residual accelerations are made of."""
-    null_model = fitted(problem)
-    names, values, targets = terms(problem, null_model)
+    null_model = fit_or_raise(problem)
+    names, values, targets = candidate_terms(problem, null_model)
     left = whole = 0.0
     for i, (A, y) in enumerate(zip(values, targets, strict=True)):
         others = [k for k in range(len(values)) if k != i]
-        x = thresholded(np.concatenate([values[k] for k in others]), np.concatenate([targets[k] for k in others]))
+        known, wanted = (np.concatenate([rows[k] for k in others]) for rows in (values, targets))
+        x = sequential_thresholding(known, wanted)
         left, whole = left + float(((y - A @ x) ** 2).sum()), whole + float((y**2).sum())
-    if left > (1 - PREDICTS) * whole:
+    if left > (1 - PREDICTED_SHARE) * whole:
         return Answer(verdict="nothing_missing")
     A, y = np.concatenate(values), np.concatenate(targets)
-    x = thresholded(A, y)
+    x = sequential_thresholding(A, y)
     sizes: dict[str, float] = {}
     for name, size in zip(names, np.abs(x) * np.sqrt((A**2).mean(0)), strict=True):
         sizes[name] = max(sizes.get(name, 0.0), float(size))
@@ -358,29 +359,32 @@ def main(options: Options) -> Answer | None:
         ValueError: for an experiment that cannot be read or simulated.
     """
     if options.predict is not None:
-        return predicted(ExplainOptions(predict=options.predict, trial=options.trial, out=options.out))
+        predict_markers(ExplainOptions(predict=options.predict, trial=options.trial, out=options.out))
+        return None
     begin, seconds = time.perf_counter(), 60 * options.budget
     whole = ExplainOptions(
         experiment=options.experiment, out=options.out, budget=options.budget, threads=options.threads
     )
+    torch.set_num_threads(1)  # threads belong to the ensembles
+    inputs = read_inputs(whole)
     if options.method in get_args(Ablation):
-        problem, _ = prepared(whole)
+        problem, _ = correct(inputs)
     else:
-        experiment, trials, twin = begun(whole)
-        problem = FitProblem(experiment, twin, trials=trials, ensemble=Ensemble(twin, options.threads), lasting=0.0)
+        ensemble = inputs.ensemble
+        problem = FitProblem(inputs.experiment, ensemble.twin, trials=inputs.trials, ensemble=ensemble, lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
-        "modulus-and-damping": lambda: parameters(problem, ["modulus", "viscoelastic"]),
-        "all-parameters": lambda: parameters(problem, everything),
-        "white-noise": lambda: judged(problem, seconds),
+        "modulus-and-damping": lambda: fit_parameters(problem, ["modulus", "viscoelastic"]),
+        "all-parameters": lambda: fit_parameters(problem, everything),
+        "white-noise": lambda: full_search(problem, seconds),
         "force-network": lambda: force_network(problem),
         "sparse-regression": lambda: sparse_regression(problem),
-        "without-numerics": lambda: judged(without_band(problem), seconds),
-        "without-heldout": lambda: judged(problem, seconds, lost=math.inf, worse=math.inf),
-        "one-trial": lambda: judged(problem.only(problem.trials[:1]), seconds),
-        "force-map": lambda: mapped(problem),
+        "without-numerics": lambda: full_search(without_discretization_error(problem), seconds),
+        "without-heldout": lambda: full_search(problem, seconds, lost=math.inf, worse=math.inf),
+        "one-trial": lambda: full_search(problem.only(problem.trials[:1]), seconds),
+        "force-map": lambda: largest_force(problem),
     }[options.method]()
-    told = {
+    report = {
         "verdict": answer.verdict,
         "effects": [] if answer.verdict == "cannot_distinguish" else answer.effects,
         "set": answer.names,
@@ -392,10 +396,10 @@ def main(options: Options) -> Answer | None:
     }
     options.out.mkdir(parents=True, exist_ok=True)
     with atomic_write(options.out / "explanation.json") as file:
-        file.write((json.dumps(told, indent=2) + "\n").encode())
+        file.write((json.dumps(report, indent=2) + "\n").encode())
     if answer.fit is not None:
         write_model(options.out / "model.toml", problem.experiment.folder / "setup.toml", answer.fit, problem.twin)
-    print(f"{options.method}: {answer.verdict} {', '.join(answer.names)}; {told['cost']['seconds']:.0f} s")
+    print(f"{options.method}: {answer.verdict} {', '.join(answer.names)}; {report['cost']['seconds']:.0f} s")
     return answer
 
 

@@ -19,17 +19,19 @@ from typing import Annotated, Literal
 import numpy as np
 import torch
 import tyro
+from scipy.spatial import KDTree
 
 from torchsoro import Body, Domain, Force, Plane, Prony, Simulator, Solid, fill
 from torchsoro.command_line import plain_errors
-from torchsoro.sim2real.data.experiment import Load, Setup, read_experiment
+from torchsoro.sim2real.data.experiment import Setup, read_experiment
 from torchsoro.sim2real.data.recording import write_table
+from torchsoro.sim2real.data.schema import Load
 from torchsoro.sim2real.twin.twin import Twin
 
 FINE = 1e-3  # s, between samples
 BEHIND = 2  # cells behind a clamp, where planes hold every node
 HELD = 1e12  # Pa, that it would take to leave them
-AROUND = 27  # particles, by which a marker's motion is told
+AROUND = 27  # particles, from whose motion a marker's is interpolated
 SWITCH = 1e-6  # s, in which a force comes that comes at once
 MOST = 80  # particles across the shortest edge
 
@@ -118,7 +120,7 @@ def planes_of(setup: Setup, cell: float, faces: list[tuple[int, int]]) -> list[P
 
 def around(x: torch.Tensor, at: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Particles [M, AROUND] next to markers at [M, 3], and shares with which what is linear among them is exact."""
-    near = torch.cdist(at, x).topk(AROUND, largest=False).indices
+    near = torch.from_numpy(KDTree(x.numpy()).query(at.numpy(), k=AROUND)[1])
     away = x[near] - at[:, None]
     linear = torch.cat([torch.ones_like(away[..., :1]), away / away.abs().amax((1, 2), keepdim=True)], -1)
     return near, torch.linalg.pinv(linear)[:, 0]
@@ -148,7 +150,7 @@ def simulate(setup: Setup, options: Options) -> dict[str, np.ndarray]:
     )
     pairs = torch.tensor(setup.prony, dtype=torch.float64).reshape(-1, 2)
     with torch.no_grad():
-        told = simulator(
+        motion = simulator(
             body,
             duration=math.ceil(setup.duration / FINE) * FINE,
             prony=Prony(moduli=pairs[:, 0], times=pairs[:, 1]),
@@ -158,10 +160,10 @@ def simulate(setup: Setup, options: Options) -> dict[str, np.ndarray]:
             sample_every=FINE,
             probes=near.reshape(-1),
         )
-    moved = told.position.cpu().double().reshape(len(told.time), *near.shape, 3)
+    moved = motion.position.cpu().double().reshape(len(motion.time), *near.shape, 3)
     place = (shares[..., None] * moved).sum(2).numpy()
     columns = {f"{m.name}_{a}_m": place[:, i, k] for i, m in enumerate(setup.markers) for k, a in enumerate("xyz")}
-    return {"time_s": told.time.cpu().double().numpy(), **columns}
+    return {"time_s": motion.time.cpu().double().numpy(), **columns}
 
 
 def main(options: Options) -> int:

@@ -88,13 +88,13 @@ def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tupl
         rear = -(x @ x.new_tensor(robot.direction))
         last = x[torch.where(solid, rear, -torch.inf).argmax()]
         group = torch.nonzero(solid & ((x - last).norm(dim=-1) < REACH)).squeeze(-1)
-        told = {name: options.strength * value for name, value in TUBE.items()}
+        tube = {name: options.strength * value for name, value in TUBE.items()}
         loads = [
-            PointMass(particles=group, mass=told["mass_kg"]),
-            Spring(particles=group, stiffness=told["stiffness_n_m"]),
-            Drag(particles=group, coefficient=told["damping_n_s_m"]),
+            PointMass(particles=group, mass=tube["mass_kg"]),
+            Spring(particles=group, stiffness=tube["stiffness_n_m"]),
+            Drag(particles=group, coefficient=tube["damping_n_s_m"]),
         ]
-        return body, loads, {"name": "tether", "parameters": told, "location_m": x[group].mean(0).tolist()}
+        return body, loads, {"name": "tether", "parameters": tube, "location_m": x[group].mean(0).tolist()}
     if options.hide == "asymmetry":
         softer = 1 - options.strength * SOFT * ((x[:, 1] > 0) & solid)
         body = dataclasses.replace(body, bulk=body.bulk * softer, shear=body.shear * softer)
@@ -130,7 +130,7 @@ def believed(options: Options, robot: Robot, stiffness: float) -> str:
 
 def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, rate: float) -> dict[str, np.ndarray]:
     """Times [T] s and places of some particles [T, M, 3] m of a trial."""
-    told = robot.simulator()(
+    motion = robot.simulator()(
         body,
         duration=robot.settings.settle + robot.settings.duration,
         prony=robot.prony,
@@ -141,7 +141,7 @@ def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, 
         sample_every=1 / rate,
         probes=probes,
     )
-    return {"time": told.time.cpu().double().numpy(), "place": told.position.cpu().double().numpy()}
+    return {"time": motion.time.cpu().double().numpy(), "place": motion.position.cpu().double().numpy()}
 
 
 def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: torch.Tensor) -> dict[str, np.ndarray]:

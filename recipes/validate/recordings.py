@@ -17,7 +17,7 @@ The pressure is believed to be there at once. The section is not published: roun
 bellows-actuator: the actuator of Caasenbrood, Pogromsky, Nijmeijer (2022), bent by 17 degrees and let go. Its section
 is not published: a solid bar of its length and mass, with the linear stiffness of its authors, is believed, which a
 force at its end holds. Recorded is an angle: the place of the end is that of an arc. Gravity, whose direction is not
-told, is left out.
+reported, is left out.
 """
 
 from __future__ import annotations

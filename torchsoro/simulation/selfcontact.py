@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import torch
+from scipy.spatial import KDTree
 from torch import Tensor
 
 # Two parts that just touch have their outermost particles one spacing apart; two lattices that lie in one another
 # leave at most 0.87 spacings between a particle and the nearest one of the other part.
 NEAR = 0.8
-
-_WRAP = 1 << 16  # hash cells along an axis; the cells beyond share the keys of these
-_HALF = [offset for offset in itertools.product((-1, 0, 1), repeat=3) if offset >= (0, 0, 0)]
-_PAIRS = 1 << 22  # candidate pairs that are looked at together: bounds the memory
 
 
 @torch.no_grad()
@@ -24,8 +20,8 @@ def overlapping(position: Tensor, reference: Tensor, solid: Tensor, *, spacing: 
     A particle is marked if a solid particle is nearer than 0.8 spacings now that was more than ``apart`` spacings
     away at first. So compression alone marks nothing before it brings the material to 0.8 / ``apart`` of its length.
 
-    Candidates come from a hash of cells of 0.8 spacings: the time grows with the number of particles, and with the
-    square of how many share a cell. No gradient passes.
+    Candidates come from a k-d tree on the CPU: the time grows with the number of particles, and with the square of how
+    many lie within 0.8 spacings of each other. No gradient passes.
 
     Args:
         position: Current places [..., N, 3] m.
@@ -42,48 +38,19 @@ def overlapping(position: Tensor, reference: Tensor, solid: Tensor, *, spacing: 
     """
     _check(position, reference, solid, spacing, apart)
     batch, count = position.shape[:-2], position.shape[-2]
-    found = torch.zeros(math.prod(batch) * count, dtype=torch.bool, device=position.device)
-    chosen = solid.to(position.device).nonzero().flatten()
-    x = position.reshape(math.prod(batch), count, 3)[:, chosen]
+    chosen = solid.cpu().nonzero().flatten()
+    x, first = position.reshape(math.prod(batch), count, 3).cpu()[:, chosen], reference.cpu()[chosen]
     if not bool(torch.isfinite(x).all()):
         raise ValueError("position: got a solid particle at a place that is not finite, want finite coordinates in m")
-    if x.numel() == 0:
-        return found.reshape(*batch, count)
-    where = torch.arange(len(x), device=x.device)[:, None] * count + chosen
-    first = reference.to(x.device)[chosen].expand(x.shape).reshape(-1, 3)
     near, far = (NEAR * spacing) ** 2, (apart * spacing) ** 2
-
-    # Cells are a little larger than the distance, so that rounding puts no near pair two cells apart.
-    cell = torch.remainder(torch.floor(x.double() / (1.001 * NEAR * spacing)), _WRAP).long()
-    simulation = torch.arange(len(x), device=x.device)[:, None].expand(x.shape[:-1]).reshape(-1)
-    key, order = torch.sort(_key(simulation, cell.reshape(-1, 3)))
-    x, first, where = x.reshape(-1, 3)[order], first[order], where.reshape(-1)[order]
-    cells, size = torch.unique_consecutive(key, return_counts=True)
-    start = torch.cumsum(size, 0) - size
-    simulation, cell = simulation[order][start], cell.reshape(-1, 3)[order][start]
-
-    for offset in _HALF:
-        wanted = _key(simulation, (cell + torch.tensor(offset, device=x.device)) % _WRAP)
-        other = torch.searchsorted(cells, wanted).clamp(max=len(cells) - 1)
-        here = (cells[other] == wanted).nonzero().flatten()
-        other = other[here]
-        ends = torch.cumsum(size[here] * size[other], 0)
-        total = int(ends[-1]) if len(ends) else 0
-        for low in range(0, total, _PAIRS):
-            pair = torch.arange(low, min(low + _PAIRS, total), device=x.device)
-            which = torch.searchsorted(ends, pair, right=True)
-            one, two = here[which], other[which]
-            pair = pair - (ends[which] - size[one] * size[two])
-            i, j = start[one] + pair // size[two], start[two] + pair % size[two]
-            meets = ((x[i] - x[j]).square().sum(-1) < near) & ((first[i] - first[j]).square().sum(-1) > far)
-            found[where[i[meets]]] = True
-            found[where[j[meets]]] = True
-    return found.reshape(*batch, count)
-
-
-def _key(simulation: Tensor, cell: Tensor) -> Tensor:
-    """One integer for a simulation and a hash cell in it [..., 3]."""
-    return ((simulation * _WRAP + cell[..., 0]) * _WRAP + cell[..., 1]) * _WRAP + cell[..., 2]
+    found = torch.zeros(len(x), count, dtype=torch.bool)
+    for here, marked in zip(x, found, strict=True):
+        # A little farther, as the tree and the comparison below round differently.
+        pairs = KDTree(here.double().numpy()).query_pairs(1.001 * NEAR * spacing, output_type="ndarray")
+        i, j = torch.from_numpy(pairs).unbind(-1)
+        meets = ((here[i] - here[j]).square().sum(-1) < near) & ((first[i] - first[j]).square().sum(-1) > far)
+        marked[chosen[torch.cat([i[meets], j[meets]])]] = True
+    return found.reshape(*batch, count).to(position.device)
 
 
 def _check(position: Tensor, reference: Tensor, solid: Tensor, spacing: float, apart: float) -> None:

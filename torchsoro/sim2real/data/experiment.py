@@ -14,8 +14,7 @@ SI units; z is up.
 from __future__ import annotations
 
 import dataclasses
-import math
-import tomllib
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -23,52 +22,30 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from torchsoro.sim2real.data.recording import Recording, read_table
+from torchsoro.sim2real.data.recording import Recording, brief, read_table
+from torchsoro.sim2real.data.schema import (
+    LENGTH,
+    Boundary,
+    Box,
+    Cavity,
+    Load,
+    Marker,
+    SetupFile,
+    Vector,
+    read_tables,
+    validated,
+)
 from torchsoro.sim2real.data.surface import Surface, read_surface
 from torchsoro.simulation.actuation import Waveform
 
-SHORTEST = 0.03  # s, three times what a clock may be late
-FAR = 2.0  # times a body's size, that a marker may be from where it is stated, when all begins
+SHORTEST = 0.03  # s, three times the standard deviation of a clock's offset
+COVERED = 0.03  # of a trial's duration, that a recording must last; minutes in place of seconds last 1/60
+FEW = 10  # samples within a trial, below which a recording that goes on for ten times as long has another unit of time
+FAR = 2.0  # edge lengths of the body, that a marker may be from its stated place at the beginning
+LOST = 100.0  # the same at any time: no thrown body flies further
+PRESSURE = 10.0  # Young's moduli, that a pressure may be
+NOISE = 0.1  # of the body's longest edge, that the noise may be
 WHOLE = ("title", "body", "clamp", "marker", "recording")  # tables that are the same in all trials
-Vector = tuple[float, float, float]
-Box = tuple[Vector, Vector]
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Boundary:
-    """Ground or wall; the body stays on the side that ``normal`` points to."""
-
-    point: Vector
-    normal: Vector
-    friction: str | float = "stick"
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Load:
-    """Dead force [N] on the body points in a box, from ``start`` to ``end`` [s]; at first it grows for ``ramp`` [s]."""
-
-    box: Box
-    force: Vector
-    start: float = 0.0
-    ramp: float = 0.0
-    end: float = math.inf
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Cavity:
-    """A void inside the body, pressed on all its walls; ``air_stiffness`` [Pa] is 0 for a regulated supply."""
-
-    name: str
-    box: Box
-    air_stiffness: float = 0.0
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Marker:
-    """A tracked point, by its place in the undeformed body [m]; it moves with the nearest surface point."""
-
-    name: str
-    at: Vector
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -170,6 +147,10 @@ def read_experiment(folder: Path) -> Experiment:
         ValueError: if a file or a table is missing, unknown or out of range; names file and table.
     """
     file = folder / "setup.toml"
+    if not folder.is_dir():
+        raise ValueError(f"experiment = {folder}: {'a file' if folder.exists() else 'not there'}, wanted a folder")
+    if not file.is_file():
+        raise ValueError(f"experiment = {folder}: no setup.toml, wanted one that says what is believed")
     tables = read_tables(file)
     setup = setup_of(tables, file)
     trials = [read_trial(path, tables, file) for path in _folders(folder / "trials")]
@@ -201,18 +182,14 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     recording = None
     if markers.is_file():
         recording = Recording.read(markers, [m.name for m in setup.markers], setup.axes)
-        if recording.time[0] > setup.duration or recording.time[-1] < SHORTEST:
-            raise ValueError(
-                f"{markers}: times from {recording.time[0]:g} to {recording.time[-1]:g} s, wanted some of the "
-                f"{SHORTEST:g} to {setup.duration:g} s from release, in seconds"
-            )
+        _check_times(recording.time, setup.duration, markers)
         recording = recording.until(setup.duration)
         _check_places(recording, setup, markers)
     pressure = None
     if setup.cavities:
         if not supply.is_file():
             raise ValueError(f"{folder}: no pressure.csv, wanted one, as the body has a chamber")
-        pressure = _pressure(supply, [c.name for c in setup.cavities])
+        pressure = _pressure(supply, setup)
     elif supply.is_file():
         raise ValueError(f"{supply}: a pressure, wanted none, as the body has no [[chamber]]")
     own = folder / "simulated.csv"
@@ -232,6 +209,23 @@ def _simulated(path: Path, setup: Setup) -> Recording:
     return found
 
 
+def _check_times(time: np.ndarray, duration: float, path: Path) -> None:
+    """Times of a recording by the clock of the trial, in seconds; most other units show by how long it lasts."""
+    begin, end = float(time[0]), float(time[-1])
+    seen = f"{path}: times from {begin:g} to {end:g}"
+    wanted = (
+        f"wanted seconds from release, some of {SHORTEST:g} to {duration:g} s as duration = {duration:g} in setup.toml"
+    )
+    inside = int(np.count_nonzero(time <= duration))
+    if end > 10 * duration and 0 < inside < FEW <= len(time):
+        unit = "milliseconds" if end < 2000 * duration else "microseconds, or numbers of frames"
+        raise ValueError(f"{seen} with {inside} samples within the trial: are they {unit}? {wanted}")
+    if begin > duration or end < SHORTEST:
+        raise ValueError(f"{seen}, {wanted}")
+    if end < COVERED * duration:
+        raise ValueError(f"{seen}: are they minutes, or does the trial end earlier? {wanted}")
+
+
 def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
     reach = max(setup.size)
     for m, marker in enumerate(setup.markers):
@@ -242,93 +236,52 @@ def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
             )
         stated, first = np.array(marker.at)[list(setup.axes)], int(there.argmax())
         seen = recording.place[first, m]
-        if np.abs(seen - stated).max() > (FAR if recording.time[first] < SHORTEST else 100) * reach:
+        if np.abs(seen - stated).max() > (FAR if recording.time[first] < SHORTEST else LOST) * reach:
+            scaled = np.abs(seen).max() > 100 * reach > 100 * np.abs(seen / 1000 - stated).max()
             raise ValueError(
                 f"{path}: marker {marker.name} begins at {seen.tolist()}, wanted about {stated.tolist()} m: "
-                "is it in metres, and in the frame of setup.toml?"
+                f"is it in {'millimetres' if scaled else 'metres, and in the frame of setup.toml'}?"
+            )
+        away = np.nan_to_num(np.abs(recording.place[:, m] - stated).max(-1))
+        if away.max() > LOST * reach:
+            at = int(away.argmax())
+            raise ValueError(
+                f"{path}: marker {marker.name} is at {recording.place[at, m].tolist()} m at {recording.time[at]:g} s, "
+                f"wanted within {LOST * reach:g} m, or an empty cell where it was lost"
             )
 
 
 def _folders(parent: Path) -> list[Path]:
-    return sorted(p for p in parent.iterdir() if p.is_dir()) if parent.is_dir() else []
+    try:
+        return sorted(p for p in parent.iterdir() if p.is_dir()) if parent.is_dir() else []
+    except OSError as error:
+        raise ValueError(f"{parent}: {error}; wanted a folder that can be read") from error
 
 
-def _pressure(path: Path, names: Sequence[str]) -> Waveform:
+def _pressure(path: Path, setup: Setup) -> Waveform:
+    names: Sequence[str] = [c.name for c in setup.cavities]
     columns = read_table(path)
     wanted = ["time_s", *(f"{name}_pa" for name in names)]
     if missing := [name for name in wanted if name not in columns]:
-        raise ValueError(f"{path}: columns {', '.join(columns)}, wanted also {', '.join(missing)}")
+        raise ValueError(f"{path}: columns {brief(', '.join(columns), 300)}, wanted also {', '.join(missing)}")
     time = torch.tensor(columns["time_s"], dtype=torch.float64)
     values = torch.tensor([columns[f"{name}_pa"] for name in names], dtype=torch.float64)
     try:
-        return Waveform(time=time, pressure=values)
+        wave = Waveform(time=time, pressure=values)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def read_tables(file: Path) -> dict[str, Any]:
-    """Tables of a TOML file.
-
-    Raises:
-        ValueError: if it cannot be read.
-    """
-    try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{file}: {error}; wanted a setup in TOML") from error
-
-
-class _Table:
-    """A table of a file, of which every entry is asked for once, and checked."""
-
-    def __init__(self, values: object, where: str) -> None:
-        if not isinstance(values, Mapping):
-            raise ValueError(f"{where} = {values!r}: wanted a table")
-        self.values, self.where = dict(values), where
-
-    def number(self, name: str, default: float | None = None, *, least: float = -math.inf) -> float:
-        value = self.values.pop(name, default)
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or value < least:
-            bound = f" of at least {least:g}" if least > -math.inf else ""
-            raise ValueError(f"{self.where}: {name} = {value!r}, wanted a finite number{bound}")
-        return float(value)
-
-    def vector(self, name: str, default: Vector | None = None) -> Vector:
-        return _vector(self.values.pop(name, default), f"{self.where}: {name}")
-
-    def box(self, name: str = "box") -> Box:
-        found = self.values.pop(name, None)
-        if not isinstance(found, list | tuple) or len(found) != 2:
-            raise ValueError(f"{self.where}: {name} = {found!r}, wanted two corners [[x, y, z], [x, y, z]]")
-        low, high = (_vector(corner, f"{self.where}: {name}") for corner in found)
-        if not all(a < b for a, b in zip(low, high, strict=True)):
-            raise ValueError(f"{self.where}: {name} = {found!r}, wanted the lower corner first")
-        return low, high
-
-    def text(self, name: str, default: str | None = None, *, among: Sequence[str] = ()) -> str:
-        value = self.values.pop(name, default)
-        if not isinstance(value, str) or (among and value not in among):
-            wanted = f"one of {', '.join(map(repr, among))}" if among else "a text"
-            raise ValueError(f"{self.where}: {name} = {value!r}, wanted {wanted}")
-        return value
-
-    def tables(self, name: str) -> list[_Table]:
-        found = self.values.pop(name, [])
-        if not isinstance(found, list):
-            raise ValueError(f"{self.where}: {name} = {found!r}, wanted [[{name}]] tables")
-        return [_Table(t, f"{self.where}: [[{name}]] number {i}") for i, t in enumerate(found, start=1)]
-
-    def done(self) -> None:
-        if self.values:
-            raise ValueError(f"{self.where}: unknown {', '.join(self.values)}")
-
-
-def _vector(found: object, where: str) -> Vector:
-    good = isinstance(found, list | tuple) and len(found) == 3
-    if not good or not all(isinstance(v, int | float) and math.isfinite(v) for v in found):  # type: ignore[union-attr]
-        raise ValueError(f"{where} = {found!r}, wanted three finite numbers")
-    x, y, z = (float(v) for v in found)  # type: ignore[union-attr]
-    return x, y, z
+    begin, end, most = float(time[0]), float(time[-1]), float(values.abs().max())
+    inside = int((time <= setup.duration).sum())
+    if begin >= setup.duration or end <= 0 or (end > 10 * setup.duration and inside < 3 <= len(time) / 3):
+        raise ValueError(
+            f"{path}: times from {begin:g} to {end:g}, wanted the pressure from 0 to {setup.duration:g}, in seconds"
+        )
+    if most > PRESSURE * setup.youngs_modulus:
+        raise ValueError(
+            f"{path}: a pressure of {most:g}, wanted at most {PRESSURE * setup.youngs_modulus:g} Pa, ten times "
+            "youngs_modulus: is it gauge pressure in Pa?"
+        )
+    return wave
 
 
 def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) -> Setup:
@@ -342,112 +295,68 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
     Raises:
         ValueError: as :func:`read_experiment`.
     """
-    top = _Table(tables, str(file))
-    start = top.values.pop("start", "rest")
-    moving = _Table({} if start == "rest" else start, f"{file}: start")
-    body = _Table(top.values.pop("body", None), f"{file}: [body]")
-    shape = body.text("shape", "box", among=("box", "mesh"))
+    parsed = validated(SetupFile, tables, str(file))
+    body, material, recording = parsed.body, parsed.material, parsed.recording
     surface = None
-    if shape == "mesh":
-        at = body.vector("origin") if "origin" in body.values else None
-        mesh = Path(body.text("file"))
+    if body.file is not None:
+        mesh = Path(body.file)
         if ".." in mesh.parts:
             raise ValueError(f"{file}: [body]: file = '{mesh}', wanted one beside it or below, or an absolute path")
-        surface = read_surface((folder or file.parent) / mesh, body.number("scale", 1.0, least=1e-9), at)
-    material = _Table(top.values.pop("material", None), f"{file}: [material]")
-    recording = _Table(top.values.pop("recording", {}), f"{file}: [recording]")
-    kind: Any = recording.text("kind", "mocap", among=("mocap", "video"))
-    axes = recording.values.pop("axes", ["x", "y", "z"])
-    if not axes or any(axis not in ("x", "y", "z") for axis in axes) or len(set(axes)) != len(axes):
-        raise ValueError(f'{recording.where}: axes = {axes!r}, wanted some of "x", "y", "z"')
-    zero = (0.0, 0.0, 0.0)
+        surface = read_surface((folder or file.parent) / mesh, body.scale or 1.0, body.origin)
     setup = Setup(
-        title=top.text("title", ""),
-        gravity=top.vector("gravity", (0.0, 0.0, -9.81)),
-        duration=top.number("duration", least=1e-6),
-        velocity=moving.vector("velocity", zero),
-        angular_velocity=moving.vector("angular_velocity", zero),
-        size=body.vector("size") if surface is None else surface.size,
-        origin=body.vector("origin", zero) if surface is None else surface.origin,
+        title=parsed.title,
+        gravity=parsed.gravity,
+        duration=parsed.duration,
+        velocity=parsed.start.velocity,
+        angular_velocity=parsed.start.angular_velocity,
+        size=surface.size if surface is not None else body.size or (0.0, 0.0, 0.0),
+        origin=surface.origin if surface is not None else body.origin or (0.0, 0.0, 0.0),
         surface=surface,
-        density=material.number("density", least=1e-9),
-        youngs_modulus=material.number("youngs_modulus", least=1e-9),
-        poisson_ratio=material.number("poisson_ratio", least=0.0),
-        prony=_prony(material),
-        clamps=tuple(table.box() for table in top.tables("clamp")),
-        cavities=tuple(
-            Cavity(name=t.text("name"), box=t.box(), air_stiffness=t.number("air_stiffness", 0.0, least=0.0))
-            for t in top.tables("chamber")
-        ),
-        planes=tuple(
-            Boundary(point=t.vector("point"), normal=t.vector("normal"), friction=_friction(t))
-            for t in top.tables("plane")
-        ),
-        loads=tuple(_load(t) for t in top.tables("load")),
-        markers=tuple(Marker(name=t.text("name"), at=t.vector("at")) for t in top.tables("marker")),
-        kind=kind,
-        axes=tuple("xyz".index(axis) for axis in axes),
-        noise=recording.number("noise", least=1e-12) if "noise" in recording.values else None,
+        density=material.density,
+        youngs_modulus=material.youngs_modulus,
+        poisson_ratio=material.poisson_ratio,
+        prony=material.prony,
+        clamps=tuple(clamp.box for clamp in parsed.clamp),
+        cavities=parsed.chamber,
+        planes=parsed.plane,
+        loads=parsed.load,
+        markers=parsed.marker,
+        kind=recording.kind,
+        axes=tuple("xyz".index(axis) for axis in recording.axes),
+        noise=recording.noise,
     )
-    for table in (top, moving, body, material, recording):
-        table.done()
     _check(setup, file)
     return setup
 
 
-def _load(table: _Table) -> Load:
-    start, ramp = table.number("start", 0.0, least=0.0), table.number("ramp", 0.0, least=0.0)
-    end = table.number("end") if "end" in table.values else math.inf
-    if not end > start + ramp:
-        raise ValueError(f"{table.where}: end = {end:g}, wanted one after it has grown, at {start + ramp:g} s")
-    return Load(box=table.box(), force=table.vector("force"), start=start, ramp=ramp, end=end)
-
-
-def _prony(material: _Table) -> tuple[tuple[float, float], ...]:
-    pairs = material.values.pop("prony", [])
-    good = isinstance(pairs, list) and all(isinstance(p, list) and len(p) == 2 for p in pairs)
-    if not good or not all(isinstance(v, int | float) and v > 0 for p in pairs for v in p) or len(pairs) > 5:
-        raise ValueError(f"{material.where}: prony = {pairs!r}, wanted at most five pairs of positive numbers")
-    return tuple((float(g), float(tau)) for g, tau in pairs)
-
-
-def _friction(table: _Table) -> str | float:
-    value = table.values.pop("friction", "stick")
-    if value != "stick" and (isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e9):
-        raise ValueError(f'{table.where}: friction = {value!r}, wanted "stick" or a coefficient of at least 0')
-    return "stick" if value == "stick" else float(value)
-
-
-# What bodies are like whose numbers are in SI units.
-_LENGTH, _MODULUS, _DENSITY, _PULL = (1e-4, 10.0), (1e2, 1e10), (10.0, 3e4), 1e3
-
-
 def _check(setup: Setup, file: Path) -> None:
-    if not all(edge > 0 for edge in setup.size):
-        raise ValueError(f"{file}: [body]: size = {setup.size}, wanted positive lengths")
-    sized = {
-        "[body]: size": (min(setup.size), max(setup.size), _LENGTH, "m"),
-        "[material]: youngs_modulus": (setup.youngs_modulus, setup.youngs_modulus, _MODULUS, "Pa"),
-        "[material]: density": (setup.density, setup.density, _DENSITY, "kg/m3"),
-    }
-    for name, (least, most, (low, high), unit) in sized.items():
-        if least < low or most > high:
-            seen = f"{least:g}" if least == most else f"{least:g} to {most:g}"
-            raise ValueError(f"{file}: {name} = {seen}, wanted {low:g} to {high:g} {unit}: is the unit right?")
-    if max(map(abs, setup.gravity)) > _PULL:
-        raise ValueError(f"{file}: gravity = {setup.gravity}, wanted at most {_PULL:g} m/s2: is the unit right?")
-    reach = max(setup.size)
+    """What tables say together."""
+    least, most = min(setup.size), max(setup.size)
+    if not (least >= LENGTH[0] and most <= LENGTH[1]):  # of a mesh; also where it is not a number
+        raise ValueError(
+            f"{file}: [body]: the mesh is {least:g} to {most:g} m long, wanted {LENGTH[0]:g} to {LENGTH[1]:g} m: "
+            "is the unit right? scale = metres in a unit of the mesh"
+        )
     for marker in setup.markers:
         away = [max(o - x, x - o - s, 0.0) for x, o, s in zip(marker.at, setup.origin, setup.size, strict=True)]
-        if max(away) > reach / 2:
+        if max(away) > most / 2:
             raise ValueError(
                 f"{file}: [[marker]] {marker.name} at {marker.at} m is {1e3 * max(away):.0f} mm outside of the body, "
-                f"wanted one on it or within {1e3 * reach / 2:.0f} mm"
+                f"wanted one on it or within {1e3 * most / 2:.0f} mm"
             )
-    if setup.poisson_ratio >= 0.5:
-        raise ValueError(f"{file}: [material]: poisson_ratio = {setup.poisson_ratio}, wanted less than 0.5")
-    if not setup.markers:
-        raise ValueError(f"{file}: no [[marker]], wanted at least one")
     for what, names in (("marker", [m.name for m in setup.markers]), ("chamber", [c.name for c in setup.cavities])):
         if len(set(names)) != len(names):
             raise ValueError(f"{file}: [[{what}]] names {', '.join(names)}, wanted each once")
+    if setup.noise is not None and setup.noise > NOISE * most:
+        raise ValueError(
+            f"{file}: [recording]: noise = {setup.noise:g} m, wanted at most {NOISE * most:g} m, a tenth of the body: "
+            "is it in metres?"
+        )
+    for low, high in setup.clamps:
+        if all(low[a] <= setup.origin[a] and high[a] >= setup.origin[a] + setup.size[a] for a in range(3)):
+            raise ValueError(f"{file}: [[clamp]] box {low}, {high} holds the whole body, wanted a part that can move")
+    for one, other in itertools.combinations(setup.cavities, 2):
+        if all(max(one.box[0][a], other.box[0][a]) < min(one.box[1][a], other.box[1][a]) for a in range(3)):
+            raise ValueError(
+                f"{file}: [[chamber]] {one.name} and {other.name} overlap, wanted chambers with a wall between them"
+            )

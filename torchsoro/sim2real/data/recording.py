@@ -15,6 +15,13 @@ import numpy as np
 from torchsoro.storage import atomic_write
 
 AXES = "xyz"
+SHOWN = 60  # characters of a value in a message
+
+
+def brief(value: object, most: int = SHOWN) -> str:
+    """A value for a message, cut where it is longer than so many characters."""
+    text = repr(value)
+    return text if len(text) <= most else f"{text[:most]}..."
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,10 +50,13 @@ class Recording:
         if self.place.ndim != 3 or self.place.shape[2] != len(self.axes):
             raise ValueError(f"place: shape {self.place.shape}, wanted [T, M, {len(self.axes)}] as axes = {self.axes}")
         late = np.flatnonzero(~(np.diff(self.time) > 0))
-        if len(late) or not np.isfinite(self.time).all():
+        if len(late):
+            before, after = self.time[late[0] : late[0] + 2]
             raise ValueError(
-                f"time: does not increase after sample {late[0] if len(late) else 0}, wanted increasing times"
+                f"time: {after:g} s in sample {late[0] + 2} after {before:g} s, wanted times that increase"
             )
+        if not np.isfinite(self.time).all():
+            raise ValueError("time: an infinite number, wanted finite times")
         if np.isinf(self.place).any():
             raise ValueError("place: an infinite number, wanted finite ones, or NaN for a lost sample")
 
@@ -59,6 +69,10 @@ class Recording:
         """What was recorded up to a time [s], the first three samples in any case."""
         count = max(int(np.searchsorted(self.time, end, side="right")), 3)
         return dataclasses.replace(self, time=self.time[:count], place=self.place[:count])
+
+    def every(self, step: int) -> Recording:
+        """Every ``step``-th sample, from the first on."""
+        return dataclasses.replace(self, time=self.time[::step], place=self.place[::step])
 
     def columns(self, markers: Sequence[str]) -> dict[str, np.ndarray]:
         """Columns [T] of a markers.csv by name; NaN where a sample was lost.
@@ -87,7 +101,7 @@ class Recording:
         columns = read_table(path)
         wanted = [[f"{name}_{AXES[a]}_m" for a in axes] for name in markers]
         if missing := [n for n in ("time_s", *itertools.chain(*wanted)) if n not in columns]:
-            raise ValueError(f"{path}: columns {', '.join(columns)}, wanted also {', '.join(missing)}")
+            raise ValueError(f"{path}: columns {brief(', '.join(columns), 300)}, wanted also {', '.join(missing)}")
         place = np.array([[columns[name] for name in row] for row in wanted]).transpose(2, 0, 1)
         try:
             return cls(time=np.array(columns["time_s"]), place=place, axes=tuple(axes))
@@ -111,25 +125,32 @@ def read_table(path: Path) -> dict[str, list[float]]:
     """Columns of a CSV file by name; an empty cell is NaN.
 
     Raises:
-        ValueError: if the file cannot be read, has no rows, or a cell is no number; with file and line.
+        ValueError: if the file cannot be read, has no rows, a column twice, or a cell that is no number; with file and
+            line.
     """
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: {error}; wanted a table of numbers") from error
-    rows = list(csv.reader(lines))
+        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: {error}; wanted a table of numbers between commas") from error
     if len(rows) < 2:
         raise ValueError(f"{path}: {len(rows)} lines, wanted names of columns and numbers below")
     names = [name.strip() for name in rows[0]]
-    columns: dict[str, list[float]] = {name: [] for name in names}
-    for number, row in enumerate(rows[1:], start=2):
-        if not row:
-            continue
+    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+        raise ValueError(f"{path}: column {brief(twice[0])} is there {names.count(twice[0])} times, wanted each once")
+    body = [(number, row) for number, row in enumerate(rows[1:], start=2) if row]
+    for number, row in body:
         if len(row) != len(names):
             raise ValueError(f"{path}: line {number} has {len(row)} cells, wanted {len(names)} as in the first")
-        for name, cell in zip(names, row, strict=True):
-            try:
-                columns[name].append(float(cell) if cell.strip() else math.nan)
-            except ValueError:
-                raise ValueError(f"{path}: line {number}: {name} = {cell!r}, wanted a number or nothing") from None
-    return columns
+    columns = zip(*(row for _, row in body), strict=True) if body else ([] for _ in names)
+    return {name: _numbers(cells, name, path, body) for name, cells in zip(names, columns, strict=True)}
+
+
+def _numbers(cells: Sequence[str], name: str, path: Path, body: Sequence[tuple[int, list[str]]]) -> list[float]:
+    found = []
+    for k, cell in enumerate(cells):
+        try:
+            found.append(float(cell) if cell and not cell.isspace() else math.nan)
+        except ValueError:
+            where = f"{path}: line {body[k][0]}: {brief(name)} = {brief(cell)}"
+            raise ValueError(f"{where}, wanted a number or nothing") from None
+    return found

@@ -92,9 +92,12 @@ def read_surface(path: Path, scale: float = 1.0, origin: tuple[float, float, flo
     Raises:
         ValueError: if the file cannot be read, or its surface is not closed.
     """
-    if not path.is_file():
-        raise ValueError(f"{path}: no such file, wanted the body's surface")
-    return _read(path, path.stat().st_mtime_ns, scale, origin)
+    try:
+        if not path.is_file():
+            raise ValueError(f"{path}: no such file, wanted the body's surface")
+        return _read(path, path.stat().st_mtime_ns, scale, origin)
+    except OSError as error:
+        raise ValueError(f"{path}: {error}; wanted the body's surface as STL, OBJ or PLY") from error
 
 
 @functools.lru_cache(maxsize=4)

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsoro.sim2real.data.experiment import Setup, Trial, read_tables, read_trial, setup_of
+from torchsoro.sim2real.data.experiment import Setup, Trial, read_trial, setup_of
 from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.data.schema import ModelFile, read_tables, validated
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
@@ -74,7 +75,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
     prior_residual = [*fit.ln_factors.tolist(), 0.0][:2]
     lines = [
         _HEAD,
-        setup.read_text(encoding="utf-8").rstrip(),
+        setup.read_text(encoding="utf-8-sig").rstrip(),
         "",
         "[model]",
         f"edge = {twin.edge!r}",
@@ -110,27 +111,26 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
         ValueError: if the file cannot be read, or an effect or a parameter of it is missing or unknown.
     """
     tables = read_tables(path)
-    numbers, rows = tables.pop("model", None), tables.pop("effect", [])
-    wanted = {"edge", "walls", "across", "ln_modulus", "ln_pressure"}
-    if not isinstance(numbers, dict) or set(numbers) != wanted:
-        raise ValueError(f"{path}: [model] = {numbers}, wanted {', '.join(sorted(wanted))}")
+    parts = {name: tables.pop(name) for name in ModelFile.model_fields if name in tables}
+    file = validated(ModelFile, parts, str(path))
     known: dict[str, list[Hypothesis]] = {}
     for effect in library() if effects is None else effects:
         known.setdefault(effect.name, []).append(effect)
     found = []
-    for row in rows:
-        alike = known.get(row.get("name"), [])
+    for table in file.effect:
+        alike = known.get(table.name, [])
         if not alike:
-            raise ValueError(f"{path}: [[effect]] name = {row.get('name')!r}, wanted one of {', '.join(known)}")
+            raise ValueError(f"{path}: [[effect]] name = {table.name!r}, wanted one of {', '.join(known)}")
         # Some share a name, as friction of planes that were thought to stick and of others.
         wants = [[*(q.name for q in e.quantities), *(["at"] if e.local else [])] for e in alike]
-        fits = [e for e, names in zip(alike, wants, strict=True) if set(row) - {"name"} == set(names)]
+        names = [*table.values, *(["at"] if table.at else [])]
+        fits = [e for e, wanted in zip(alike, wants, strict=True) if set(names) == set(wanted)]
         if not fits:
-            wanted = " or ".join(", ".join(names) for names in wants)
-            raise ValueError(f"{path}: [[effect]] {row['name']} has {', '.join(row)}, wanted {wanted}")
-        names = [q.name for q in fits[0].quantities]
-        found.append((fits[0], np.array([*(row[name] for name in names), *row.get("at", [])], dtype=float)))
-    return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **numbers)
+            wanted = " or ".join(", ".join(w) for w in wants)
+            raise ValueError(f"{path}: [[effect]] {table.name} has {', '.join(names)}, wanted {wanted}")
+        values = [*(table.values[q.name] for q in fits[0].quantities), *(table.at or ())]
+        found.append((fits[0], np.array(values, dtype=float)))
+    return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **dict(file.model))
 
 
 def predict_trial(

@@ -23,6 +23,7 @@ from torchsoro.simulation.material import Prony
 SAMPLE = 2.5e-3  # s between two samples, between which motion is a cubic
 SAFETY = 1.4  # of the largest step that is surely stable near rest; free blocks and bars are stable up to 1.6
 CUT = 1.0  # the same where cells are body in part only, and nodes may have next to no mass
+SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 THREADS = os.cpu_count() or 1
 
 Lane = tuple[int, int]  # number of the scenario, and of its variation
@@ -72,9 +73,16 @@ class Ensemble:
 
         Returns:
             For each, its motions [B, ...]; those that broke down are not ``sound``.
+
+        Raises:
+            ValueError: if one is so stiff that no step is short enough.
         """
         lanes = [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
         steps = {i: self.stable(s) for i, s in enumerate(scenarios)}
+        if not (shortest := min(float(dt.min()) for dt in steps.values())) > SHORTEST:
+            raise ValueError(
+                f"stiffness: a step of {shortest:g} s is needed, wanted a body with at least {SHORTEST:g} s"
+            )
         alike: dict[object, list[Lane]] = {}
         for lane in lanes:
             alike.setdefault(_common(scenarios[lane[0]]), []).append(lane)
@@ -147,11 +155,11 @@ class Ensemble:
     def case(self, scenarios: Sequence[Scenario], group: list[Lane], dt: float, every: int, samples: int) -> Case:
         """Numbers of up to sixteen variations; empty lanes repeat the first."""
         full = [*group, *[group[0]] * (LANES - len(group))]
-        told = [scenarios[i] for i, _ in full]
+        varied = [scenarios[i] for i, _ in full]
 
         def lanes(get, rank: int) -> np.ndarray:
             rows = []
-            for (_, b), s in zip(full, told, strict=True):
+            for (_, b), s in zip(full, varied, strict=True):
                 t = torch.as_tensor(get(s), dtype=torch.float64)
                 rows.append(t[b if t.shape[0] > 1 else 0] if t.ndim > rank else t)
             return np.ascontiguousarray(torch.stack(rows, -1).numpy(), dtype=np.float32)
@@ -172,7 +180,7 @@ class Ensemble:
 
         weight = lanes(lambda s: torch.where(mass(s) > 0, 1 / mass(s).clamp(min=1e-30), 0.0), 1)
         left = lanes(lambda s: mass(s) / (mass(s) + dt * s.drag).clamp(min=1e-30), 1)
-        first = told[0]
+        first = varied[0]
         elements = 0 if first.prony is None else first.prony.elements
         maxwell = np.zeros((elements, 4, LANES), np.float32)
         for e in range(elements):
@@ -181,9 +189,9 @@ class Ensemble:
         supply = np.zeros((steps if chambers else 1, chambers, LANES), np.float32)
         if chambers:
             times = torch.arange(steps, dtype=torch.float64) * dt
-            for k, ((_, b), s) in enumerate(zip(full, told, strict=True)):
+            for k, ((_, b), s) in enumerate(zip(full, varied, strict=True)):
                 supply[:, :, k] = _pressure(s.pressure, b).at(times).T.numpy()
-        pushes = _pushes(full, told, dt)
+        pushes = _pushes(full, varied, dt)
         springs = [lanes(lambda s, i=i: s.springs[i].share, 1) for i in range(len(first.springs))]
         where = [np.flatnonzero(share.any(-1)) for share in springs]
         empty = np.zeros(0, np.int64)
@@ -267,12 +275,12 @@ def _pressure(supply: Waveform | None, number: int) -> Waveform:
     return Waveform(time=supply.time.double(), pressure=p.double())
 
 
-def _pushes(full: Sequence[Lane], told: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
+def _pushes(full: Sequence[Lane], varied: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
     """Forces of each scenario in its own lanes."""
     begin, nodes, shares, forces, starts = [0], [], [], [], []
     for number in dict.fromkeys(i for i, _ in full):
         mine = [k for k, (i, _) in enumerate(full) if i == number]
-        for push in told[mine[0]].pushes:
+        for push in varied[mine[0]].pushes:
             on = np.flatnonzero(push.share.numpy())
             nodes.append(on)
             shares.append(push.share.numpy()[on])

@@ -1,4 +1,4 @@
-"""All that one simulation is told; hypotheses change it."""
+"""All input of one simulation; hypotheses change it."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Tie:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Scenario:
-    """All that a simulation is told; leading axes [...] are a batch of variations; float64.
+    """All input of a simulation; leading axes [...] are a batch of variations; float64.
 
     Attributes:
         stiffness: Young's modulus at each point of the body [..., P] Pa.

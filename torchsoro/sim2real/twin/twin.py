@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.sim2real.data.experiment import Boundary, Box, Load, Setup, Trial
+from torchsoro.sim2real.data.experiment import Setup, Trial
+from torchsoro.sim2real.data.schema import Boundary, Box, Load
 from torchsoro.sim2real.twin.grid import Axis, Grid, divide
 from torchsoro.sim2real.twin.scenario import Ground, Push, Scenario
 from torchsoro.simulation.material import Prony
 
 STEPS = 16  # in which a force grows
 NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
+CELLS = 200_000  # of a grid, with which a simulation takes hours
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,10 +74,20 @@ class Twin:
         across: Cells across a body without a chamber, at least.
 
     Raises:
-        ValueError: for a clamp that holds no part of a face, or a chamber that does not lie inside the body.
+        ValueError: for an edge or walls with which there are too many cells, a clamp that holds nothing or all of the
+            body, or a chamber that does not lie inside the body.
     """
 
     def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
+        if not (edge > 0 and walls > 0 and across > 0):
+            raise ValueError(f"edge = {edge:g} m, walls = {walls}, across = {across}, wanted positive numbers")
+        cells = math.prod(max(s / edge, across, walls * bool(setup.cavities)) for s in setup.size)
+        if not cells <= CELLS:
+            raise ValueError(
+                f"edge = {edge:g} m, walls = {walls}: {cells:.2g} cells in a body of "
+                f"{' x '.join(f'{s:g}' for s in setup.size)} m, wanted at most {CELLS}: cells that are larger, or a "
+                "body that is less slender"
+            )
         surface = setup.surface
         self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
         axes = []
@@ -109,6 +121,8 @@ class Twin:
             self.held |= on
             if not on.any():
                 raise ValueError(f"clamp: box {low}, {high}, wanted one that holds a part of the body, in metres")
+        if self.held[self.nodal(self.volumes).numpy() > 0].all():
+            raise ValueError("clamp: the boxes hold the whole body, wanted a part of it that can move")
 
     @property
     def count(self) -> int:
@@ -213,10 +227,7 @@ def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
 
 def _ground(plane: Boundary) -> Ground:
     normal = torch.tensor(plane.normal, dtype=torch.float64)
-    size = float(normal.norm())
-    if not size > 0 or not math.isfinite(size):
-        raise ValueError(f"plane: normal = {plane.normal}, wanted one that is not zero")
-    unit = normal / size
+    unit = normal / normal.norm()
     zero = torch.zeros((), dtype=torch.float64)
     return Ground(
         normal=unit,

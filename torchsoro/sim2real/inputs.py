@@ -1,0 +1,198 @@
+"""What an explanation is asked for, and whether it can be done: all input is checked here, before any simulation."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
+from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.inference.noise import estimate_noise
+from torchsoro.sim2real.inference.recording_faults import reordered
+from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer
+from torchsoro.sim2real.options import Options
+from torchsoro.sim2real.twin.ensemble import SAMPLE, THREADS, Ensemble
+from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.storage import check_folder
+
+RESULTS = ("report.html", "explanation.json", "model.toml")
+MEMORY = 4e9  # bytes, that the covariances of all recordings may take: rows squared for each marker and axis
+ROWS = 4000  # of a recording, whose covariance is factorized in seconds
+DEAR = 100.0  # budgets, that a twin with a given edge may take
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Inputs:
+    """An experiment that can be explained.
+
+    Attributes:
+        experiment: As read, columns of confused markers put right, recordings thinned where they have too many rows.
+        trials: To be explained, each with a recording.
+        kept: With a recording, only to be predicted.
+        ensemble: Simulates the twin that is fitted.
+        fine: Simulates one with smaller cells, which tells the other's error.
+        effects: Considered; None for the whole library.
+        notes: What was changed, a line each.
+    """
+
+    experiment: Experiment
+    trials: tuple[Trial, ...]
+    kept: tuple[Trial, ...]
+    ensemble: Ensemble
+    fine: Ensemble
+    effects: list[Hypothesis] | None
+    notes: tuple[str, ...]
+
+
+def read_inputs(options: Options) -> Inputs:
+    """Read an experiment and check all that an explanation needs; nothing is simulated or written.
+
+    Args:
+        options: What is asked for.
+
+    Raises:
+        ValueError: for options out of range, a folder that cannot be written, or an experiment that cannot be read or
+            simulated; names the option or the file, what was seen and what is wanted.
+    """
+    if options.experiment is None:
+        raise ValueError("experiment: not given, wanted a folder, or --predict with a model.toml")
+    check_numbers(options)
+    effects = named(options.effects)
+    check_folder("out", Path(options.out), RESULTS)
+    experiment, confused = reordered(read_experiment(Path(options.experiment)))
+    if empty := [f"trials/{t.name}" for t in experiment.trials if t.recording is None]:
+        raise ValueError(f"{options.experiment}: {', '.join(empty)}: no markers.csv, wanted one in each trial")
+    experiment, thinned = affordable(experiment)
+    trials = experiment.trials
+    recordings = [t.recording for t in trials if t.recording is not None]
+    _check_noise(experiment, recordings)
+    with named_in(experiment.folder):
+        twin = _twin(options, experiment)
+    scenarios = {}
+    for room, group in (("trials", trials), ("heldout", experiment.heldout)):
+        for trial in group:
+            with named_in(experiment.folder / room / trial.name):
+                scenarios[trial.name] = twin.scenario(trial)
+    if effects and not any(e.applies(scenarios[t.name], twin) for e in effects for t in trials):
+        raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
+    ensemble = Ensemble(twin, options.threads or THREADS, options.device)
+    with named_in(experiment.folder):
+        fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads, options.device)
+    return Inputs(
+        experiment=experiment,
+        trials=trials,
+        kept=tuple(t for t in experiment.heldout if t.recording is not None),
+        ensemble=ensemble,
+        fine=fine,
+        effects=effects,
+        notes=tuple(filter(None, [confused, *thinned])),
+    )
+
+
+def check_numbers(options: Options) -> None:
+    """Ranges of the options that are numbers.
+
+    Raises:
+        ValueError: for one out of range.
+    """
+    ranges = {
+        "budget": (options.budget, lambda v: 0 < v <= 1e5, "a positive number of minutes, at most 100000"),
+        "edge": (options.edge, lambda v: 0 <= v <= 10, "a positive length in metres, or 0 to choose one"),
+        "walls": (options.walls, lambda v: 1 <= v <= 32, "1 to 32 cells"),
+        "threads": (options.threads, lambda v: 0 <= v <= 1024, "1 to 1024, or 0 for the number of processors"),
+    }
+    for name, (value, good, wanted) in ranges.items():
+        whole = name in ("walls", "threads")
+        if isinstance(value, bool) or not isinstance(value, int if whole else int | float) or not good(value):
+            raise ValueError(f"{name} = {value!r}, wanted {wanted}")
+
+
+def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
+    """Effects of the library by name; None for all.
+
+    Raises:
+        ValueError: for a name that is not known.
+    """
+    known = dict.fromkeys(effect.name for effect in library())
+    if unknown := set(names) - set(known):
+        raise ValueError(f"effects = {', '.join(sorted(unknown))}: wanted names out of {', '.join(known)}")
+    # Two effects may share a name, as friction of planes that are thought to stick and of others.
+    return [effect for effect in library() if effect.name in names] or None
+
+
+def affordable(experiment: Experiment) -> tuple[Experiment, list[str]]:
+    """The experiment with recordings whose covariances fit into memory.
+
+    A recording with too many rows keeps every k-th if it then has a sample for each of the twin's.
+
+    Returns:
+        The experiment, and a line for each recording that was thinned.
+
+    Raises:
+        ValueError: for too many rows at a rate that is not far above the twin's.
+    """
+    channels = len(experiment.setup.markers) * len(experiment.setup.axes)
+    trials = sum(t.recording is not None for t in (*experiment.trials, *experiment.heldout))
+    most = min(ROWS, math.isqrt(int(MEMORY / (8 * channels * max(trials, 1)))))
+    notes = []
+
+    def thin(trial: Trial) -> Trial:
+        recording = trial.recording
+        if recording is None or len(recording.time) <= most:
+            return trial
+        rows, step = len(recording.time), math.ceil(len(recording.time) / most)
+        interval = float(np.median(np.diff(recording.time)))
+        if step * interval > SAMPLE:
+            raise ValueError(
+                f"{experiment.folder}: trial {trial.name}: markers.csv has {rows} rows from {recording.time[0]:g} to "
+                f"{recording.time[-1]:g} s, wanted at most {most}: keep every {step}th row, or a shorter duration"
+            )
+        notes.append(f"trial {trial.name}: every {step}th of {rows} rows of markers.csv is used")
+        return dataclasses.replace(trial, recording=recording.every(step))
+
+    trials_, heldout = (tuple(map(thin, group)) for group in (experiment.trials, experiment.heldout))
+    return dataclasses.replace(experiment, trials=trials_, heldout=heldout), notes
+
+
+def _check_noise(experiment: Experiment, recordings: list[Recording]) -> None:
+    if experiment.setup.noise is not None:
+        return
+    wanted = "wanted noise = ..., its standard deviation in metres, under [recording] in setup.toml"
+    third = [np.diff(r.place, 3, axis=0) for r in recordings]
+    if not any(np.isfinite(t).any() for t in third):
+        raise ValueError(f"{experiment.folder}: no marker has four samples in a row to estimate noise from, {wanted}")
+    if not estimate_noise(recordings) > 0:
+        raise ValueError(f"{experiment.folder}: recorded samples repeat each other and show no noise, {wanted}")
+
+
+def _twin(options: Options, experiment: Experiment) -> Twin:
+    setup, trials = experiment.setup, len(experiment.trials)
+    if not options.edge:
+        return choose_twin(setup, trials, 60 * options.budget, walls=options.walls)
+    if options.edge > max(setup.size):
+        raise ValueError(f"edge = {options.edge:g} m, wanted at most {max(setup.size):g} m, the body's longest edge")
+    twin = Twin(setup, edge=options.edge, walls=options.walls)
+    needed = cost(twin, trials) / 60
+    if needed > DEAR * options.budget:
+        raise ValueError(
+            f"edge = {options.edge:g} m, walls = {options.walls}: about {needed:.3g} minutes, wanted at most "
+            f"{DEAR:g} times budget = {options.budget:g} minutes"
+        )
+    return twin
+
+
+@contextlib.contextmanager
+def named_in(file: Path) -> Iterator[None]:
+    """Complaints begin with the file or folder that they are about."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from error
