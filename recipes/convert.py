@@ -19,6 +19,7 @@ import tyro
 from torchsoro.command_line import plain_errors
 from torchsoro.sim2real.data.recording import AXES, write_table
 from torchsoro.sim2real.data.tracking import LIKELIHOOD, Frame, Tracked, read
+from torchsoro.storage import check_folder
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,8 +72,11 @@ def main(options: Options) -> None:
     """Write the markers.
 
     Raises:
-        ValueError: for a file that cannot be read; nothing is written then.
+        ValueError: for a file that cannot be read or written; nothing is written then.
     """
+    if options.out.resolve() in [path.resolve() for path in options.files]:
+        raise ValueError(f"out = {options.out}: one of the files to convert, wanted another")
+    check_folder("out", options.out.parent, [options.out.name])
     frame = Frame(
         axes=options.axes.replace(" ", "").split(",") if options.axes else None,
         scale=options.scale,

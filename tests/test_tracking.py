@@ -6,8 +6,10 @@ import importlib
 import sys
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
+from hypothesis import strategies as st
 
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.data.tracking import Frame, read, read_c3d, read_deeplabcut, read_tracker
@@ -296,3 +298,50 @@ def test_the_recipe_converts_motion_capture(tmp_path):
     written = read([path]).recording
     np.testing.assert_allclose(found.place, written.place, rtol=1e-8)
     np.testing.assert_allclose(found.time, written.time)
+
+
+def test_an_output_that_would_overwrite_a_recording_or_cannot_be_written_is_refused(tmp_path):
+    from convert import Options, main
+
+    path = file(tmp_path, ONE)
+    for out, message in ((path, "one of the files to convert"), (path / "a.csv", "is a file"), (tmp_path, "a folder")):
+        with pytest.raises(ValueError, match=rf"out = .*{message}"):
+            main(Options(files=(path,), out=out))
+    assert path.read_text() == ONE and [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@hypothesis.settings(suppress_health_check=[hypothesis.HealthCheck.function_scoped_fixture], max_examples=100)
+@hypothesis.given(
+    text=st.sampled_from([ONE, BESIDE, BELOW, DEEPLABCUT, ANIMALS]),
+    changes=st.lists(
+        st.tuples(
+            st.integers(0, 200), st.sampled_from(["", "\t", ",", "\n", "nan", "1e999", "x", "-1", "\0", '"', ";"])
+        ),
+        max_size=4,
+    ),
+    settings=st.fixed_dictionaries(
+        {},
+        optional={
+            "fps": st.floats(),
+            "scale": st.floats(),
+            "axes": st.sampled_from(["x,z", "x", "x,x", "-z,y", "up"]),
+            "origin": st.lists(st.floats(), max_size=3).map(tuple),
+            "start": st.floats(),
+            "likelihood": st.floats(),
+            "rename": st.sampled_from([("tip=end",), ("mass A=",), ("=",), ("tip=base", "base=tip")]),
+        },
+    ),
+)
+def test_drawn_recordings_are_converted_or_refused_with_nothing_written(tmp_path, text, changes, settings):
+    from convert import Options, main
+
+    for at, cell in changes:
+        text = text[:at] + cell + text[at + 1 :]
+    out = tmp_path / "out" / "markers.csv"
+    out.unlink(missing_ok=True)
+    try:
+        main(Options(files=(file(tmp_path, text),), out=out, **{"fps": 100.0, "scale": 1e-3, **settings}))
+    except ValueError as error:
+        assert "wanted" in str(error) and not out.exists()
+    else:
+        assert out.exists()

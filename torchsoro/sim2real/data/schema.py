@@ -57,7 +57,7 @@ def _ordered(box: tuple[Place, Place]) -> tuple[Place, Place]:
 
 
 def _named(name: str) -> str:
-    if not 0 < len(name) <= 64 or name != name.strip() or not name.isprintable() or "," in name or '"' in name:
+    if not 0 < len(name) <= 64 or name != name.strip() or not name.isprintable():
         raise ValueError
     return name
 
@@ -89,7 +89,7 @@ CheckedBox = Annotated[Box, AfterValidator(_ordered)]
 Name = Annotated[StrictStr, AfterValidator(_named)]
 
 _BOX = "two corners [[x, y, z], [x, y, z]] in metres, the lower corner first"
-_NAME = "a text of 1 to 64 characters without commas, quotes, and blanks at its ends"
+_NAME = "a text of 1 to 64 printable characters without blanks at its ends"
 _VECTOR = "three finite numbers"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchsoro.sim2real.data.recording import AXES, Recording
+from torchsoro.sim2real.data.recording import AXES, Recording, brief
 
 LIKELIHOOD = 0.6  # below which a sample is lost, as in DeepLabCut's own plots
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -129,7 +129,10 @@ def _lines(path: Path) -> list[str]:
 
 
 def _cells(line: str, delimiter: str = ",") -> list[str]:
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])] or [""]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=delimiter), [])] or [""]
+    except csv.Error as error:
+        raise ValueError(f"{brief(line)}: {error}; wanted a row of a table") from error
 
 
 def _number(cell: str, where: str) -> float:
@@ -229,7 +232,7 @@ def read_deeplabcut(
     Raises:
         ValueError: for a file that is no such table, or without ``fps`` or a scale.
     """
-    if fps is None or frame is None or frame.scale is None or not 0 < fps < math.inf or not 0 <= likelihood <= 1:
+    if fps is None or frame is None or frame.scale is None or not 1e-3 <= fps <= 1e6 or not 0 <= likelihood <= 1:
         seen = f"fps = {fps}, scale = {frame and frame.scale}, likelihood = {likelihood}"
         raise ValueError(f"{path}: {seen}, wanted frames per second, metres per pixel, and 0 to 1")
     lines = [_cells(line) for line in _lines(path) if line.strip(" ,")]
