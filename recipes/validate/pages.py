@@ -28,7 +28,7 @@ from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.output.archive import load_design
 from torchsoro.output.delivery import drawn_planes
-from torchsoro.output.page import Motion, Page, curve, curve_axes, legend, motion_of, pressure_trace
+from torchsoro.output.page import DrawnMotion, Page, curve, curve_axes, legend, motion_of, pressure_trace
 from torchsoro.output.scene import FULL, INK, REST, Camera, Scene, Shape, bounds_of
 from torchsoro.storage import read_metrics
 
@@ -52,16 +52,16 @@ class Found:
         columns, rows = read_metrics(path / "metrics.csv", sys.maxsize)
         self.history = {column: np.array([row.get(column, math.nan) for row in rows]) for column in columns if rows}
         self.rows = self._compared(path / "compare.json")
-        self._motions: dict[str, Motion | None] = {}
+        self._motions: dict[str, DrawnMotion | None] = {}
 
-    def motion(self, check: str) -> Motion | None:
+    def motion(self, check: str) -> DrawnMotion | None:
         """The frames of a check, ordered in time; None without a file."""
         if check not in self._motions:
             path = self.path / f"motion_{check}.npz"
             self._motions[check] = self._read(path) if path.is_file() else None
         return self._motions[check]
 
-    def turns(self, motion: Motion) -> list[int]:
+    def turns(self, motion: DrawnMotion) -> list[int]:
         """Frames at whole cycles of the pressure; the last one without any."""
         turns = (motion.time - self.settings.settle) * self.settings.frequency
         return [i for i, t in enumerate(turns) if t > -0.04 and abs(t - round(t)) < 0.04] or [len(turns) - 1]
@@ -72,7 +72,7 @@ class Found:
         kept = (time >= -1e-9) & (time <= duration + 1e-6)
         return time[kept], center[kept] - center[kept][:1]
 
-    def _read(self, path: Path) -> Motion:
+    def _read(self, path: Path) -> DrawnMotion:
         domain, keys = self.robot.domain, ("time", "pressure", "displacement", "gamma")
         try:
             with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
@@ -109,12 +109,12 @@ def millimetres(length: float) -> str:
     return f"{round(1e3 * length, 1) + 0.0:.1f} mm"
 
 
-def pressure(motion: Motion) -> np.ndarray:
+def pressure(motion: DrawnMotion) -> np.ndarray:
     """Of the frames [kPa]."""
     return np.zeros(len(motion.time)) if motion.pressure is None else motion.pressure
 
 
-def draw(axes: Axes, found: Found, motion: Motion, chosen: list[int], camera: Camera, text: str, **view: Any) -> None:
+def draw(axes: Axes, found: Found, motion: DrawnMotion, chosen: list[int], camera: Camera, text: str, **view: Any) -> None:
     """The body in one frame, with its pressure, or in several, side by side; the rest is for the scene."""
     axes.set_title(text, fontsize=8, color=INK, pad=3, linespacing=1.25)
     scene = Scene(axes, motion.shape.times(len(chosen)), camera, found.planes, along=found.along, **view)
@@ -142,7 +142,7 @@ def iterations(page: Page, found: Found, camera: Camera, top: float, height: flo
     s, final = found.settings, found.motion("design")
     steps = sorted(int(path.stem.rpartition("_")[2]) for path in found.path.glob("motion_iteration_[0-9]*.npz"))
     count = min(5 if final is None else 4, len(steps))
-    views: list[tuple[str, Motion, int]] = []
+    views: list[tuple[str, DrawnMotion, int]] = []
     for step in (steps[i] for i in np.linspace(0, len(steps) - 1, count).round().astype(int)):
         if (motion := found.motion(f"iteration_{step}")) is not None:
             views.append((f"iteration {step}{reached(found, step)}", motion, len(motion.time) - 1))

@@ -50,7 +50,7 @@ def check_planes(planes: Sequence[PlaneTuple]) -> None:
 
 
 @dataclass(frozen=True)
-class Motion:
+class DrawnMotion:
     """Checked input of a movie or a summary; lengths in mm, pressure in kPa, time in s."""
 
     shape: Shape
@@ -78,7 +78,7 @@ def motion_of(
     planes: Sequence[PlaneTuple],
     direction: Any,
     level: float,
-) -> Motion:
+) -> DrawnMotion:
     """Check the arrays of a movie or a summary, and deform the body in every frame."""
     check_planes(planes)
     if sorted(abs(float(c)) for c in direction) != [0.0, 0.0, 1.0]:
@@ -97,7 +97,7 @@ def motion_of(
     cog = (np.einsum("sni,n->si", moved, weight) / weight.sum() - shape.origin) * 1e3
     along = int(np.argmax(np.abs(direction)))
     travel = (cog - cog[0]) @ np.asarray(direction, dtype=float)
-    return Motion(shape, placed, bounds_of([v for v, _ in placed]), times, kilopascal, cog, along, travel)
+    return DrawnMotion(shape, placed, bounds_of([v for v, _ in placed]), times, kilopascal, cog, along, travel)
 
 
 def canvas_of(width: int, height: int, dpi: int = 100) -> tuple[Figure, FigureCanvasAgg]:
@@ -164,7 +164,7 @@ def pressure_trace(axes: Axes, time: np.ndarray, pressure: np.ndarray) -> Any:
     return axes.plot([], [], "o", ms=7, mfc="white", mec=INK, mew=1.6, zorder=5, clip_on=False)[0]
 
 
-def last_cycle(motion: Motion, period: float | None) -> tuple[float, float]:
+def last_cycle(motion: DrawnMotion, period: float | None) -> tuple[float, float]:
     """Start and end of the last whole cycle."""
     time, pressure = motion.time, motion.pressure
     rises = np.zeros(0)
@@ -181,7 +181,7 @@ def last_cycle(motion: Motion, period: float | None) -> tuple[float, float]:
     return start, min(start + period, float(time[-1]))
 
 
-def path_panels(figure: Figure, motion: Motion, cycle: tuple[float, float]) -> None:
+def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float]) -> None:
     """Travel over time and the path of the centre of gravity."""
     over = figure.add_axes((0.735, 0.74, 0.24, 0.175))
     over.axvspan(*cycle, color="#eef1f4", lw=0)
@@ -227,7 +227,7 @@ def path_panels(figure: Figure, motion: Motion, cycle: tuple[float, float]) -> N
 
 
 def gait_panels(
-    figure: Figure, motion: Motion, planes: Sequence[PlaneTuple], camera: Camera, cycle: tuple[float, float]
+    figure: Figure, motion: DrawnMotion, planes: Sequence[PlaneTuple], camera: Camera, cycle: tuple[float, float]
 ) -> None:
     """Six snapshots from the beginning to the end of a cycle, all in one frame, and where they lie on the pressure."""
     count = 6

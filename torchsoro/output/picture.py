@@ -24,7 +24,7 @@ from PIL import Image
 
 from torchsoro.output.levelset import as_array
 from torchsoro.output.page import (
-    Motion,
+    DrawnMotion,
     canvas_of,
     check_frames,
     check_planes,
@@ -177,7 +177,13 @@ def movie(
 
 
 def _pictures(
-    motion: Motion, planes: Sequence[PlaneTuple], camera: Camera, title: str | None, fps: int, width: int, height: int
+    motion: DrawnMotion,
+    planes: Sequence[PlaneTuple],
+    camera: Camera,
+    title: str | None,
+    fps: int,
+    width: int,
+    height: int,
 ) -> Iterator[np.ndarray]:
     figure, canvas = canvas_of(width, height)
     strip = 0.0 if motion.pressure is None else 0.17

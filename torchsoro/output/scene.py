@@ -31,6 +31,7 @@ PlaneTuple = tuple[int, float, int]
 
 BODY = np.array([0.64, 0.73, 0.83])
 WALL = np.array([0.95, 0.69, 0.38])
+BODY_SECTION, WALL_SECTION = 0.8 * BODY, 0.84 * WALL
 REST, FULL = "#3a6ea5", "#d1344b"
 PRESSURE = LinearSegmentedColormap.from_list("pressure", [REST, "#9a6fa8", FULL])
 INK, FAINT = "#27313d", "#8b96a3"
@@ -108,20 +109,13 @@ class Shape:
     def __init__(self, domain: Domain, gamma: Any, level: float) -> None:
         rest, self.faces = surface(domain, gamma, level)
         self.origin = np.asarray(domain.origin, dtype=float)
-        wall = as_array(domain.wall).astype(bool).reshape(domain.particles)
-        lattice = (rest - self.origin) / float(domain.spacing) - 0.5
-        # A triangle shows the chamber wall if the particle just below it is wall.
-        corners = lattice[self.faces]
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-        below = np.rint(corners.mean(axis=1) - 0.4 * normal).astype(int).clip(0, np.asarray(domain.particles) - 1)
-        self.colors = np.where(wall[tuple(below.T)][:, None], WALL, BODY)
+        self.colors = np.where(shows_wall(domain, rest, self.faces)[:, None], WALL, BODY)
         self.skin = Skin(domain, rest, gamma)
         count = len(self.faces)
         self.around = sparse.csr_matrix(
             (np.ones(3 * count), (self.faces.ravel(), np.repeat(np.arange(count), 3))), shape=(len(rest), count)
         )
-        boxes = [_box(np.asarray(c.center), np.asarray(c.size) - 2 * c.wall) for c in domain.chambers]
+        boxes = [box_faces(np.asarray(c.center), np.asarray(c.size) - 2 * c.wall) for c in domain.chambers]
         self.cavity = Skin(domain, np.concatenate(boxes).reshape(-1, 3), gamma) if boxes else None
 
     def place(self, frame: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -138,7 +132,16 @@ class Shape:
         return many
 
 
-def _box(center: np.ndarray, size: np.ndarray, cuts: int = 5) -> np.ndarray:
+def shows_wall(domain: Domain, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Which triangles [F] of a surface at rest [V, 3] m show chamber wall: the particle just below them is wall."""
+    corners = ((vertices - np.asarray(domain.origin)) / float(domain.spacing) - 0.5)[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    below = np.rint(corners.mean(axis=1) - 0.4 * normal).astype(int).clip(0, np.asarray(domain.particles) - 1)
+    return as_array(domain.wall).astype(bool).reshape(domain.particles)[tuple(below.T)]
+
+
+def box_faces(center: np.ndarray, size: np.ndarray, cuts: int = 5) -> np.ndarray:
     """The faces of a box as quadrilaterals [Q, 4, 3], counter-clockwise seen from outside."""
     ticks = np.linspace(-0.5, 0.5, cuts + 1)
     quads = []
@@ -202,12 +205,7 @@ class Scene:
     ) -> list[np.ndarray]:
         axis, position, side = plane
         first, second = (a for a in range(3) if a != axis)
-        low, high = bounds[0] - 7.0, bounds[1] + 7.0
-        if axis != 2 and (floors := [o for a, o, s in self.planes if a == 2 and s > 0]):
-            low[2] = floors[0]
-        for a, o, s in self.planes:  # a plane ends where another one stands
-            if a != axis and a != 2:
-                low[a], high[a] = (max(low[a], o), high[a]) if s > 0 else (low[a], min(high[a], o))
+        low, high = plane_extent(plane, self.planes, bounds)
         behind = self.view[2, axis] * side > 0
 
         def point(u: float, v: float) -> np.ndarray:
@@ -311,6 +309,23 @@ class Scene:
             self.cavity.set_verts(visible @ self.view[:2].T)  # pyright: ignore[reportArgumentType]
             self.cavity.set_facecolor((red, green, blue, 0.16 if fill is None else 0.16 + 0.24 * fill))
             self.cavity.set_edgecolor((red, green, blue, 0.22))
+
+
+def plane_extent(plane: PlaneTuple, planes: Sequence[PlaneTuple], bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far a plane is drawn: lower and upper corner [3] mm of the box whose section it is.
+
+    Args:
+        plane: The plane, with its position in mm.
+        planes: All planes; one ends where another stands.
+        bounds: Corners [2, 3] mm of the box in which the body moves.
+    """
+    low, high = bounds[0] - 7.0, bounds[1] + 7.0
+    if plane[0] != 2 and (floors := [o for a, o, s in planes if a == 2 and s > 0]):
+        low[2] = floors[0]
+    for a, o, s in planes:
+        if a != plane[0] and a != 2:
+            low[a], high[a] = (max(low[a], o), high[a]) if s > 0 else (low[a], min(high[a], o))
+    return low, high
 
 
 def bounds_of(placed: Iterable[np.ndarray]) -> np.ndarray:
