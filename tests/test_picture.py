@@ -138,7 +138,7 @@ def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "false")
     with pytest.raises(RuntimeError, match="ffmpeg could not write"):
         movie(tmp_path / "new.mp4", **arguments(2))
-    monkeypatch.setattr("torchsoro.output.picture._write_gif", fail)
+    monkeypatch.setattr("torchsoro.output.picture._write_animation", fail)
     with pytest.raises(OSError, match="disk full"):
         movie(old, **arguments(2))
     assert old.read_bytes() == b"old" and list(tmp_path.iterdir()) == [old]
@@ -184,7 +184,7 @@ def test_refusals(tmp_path: Path) -> None:
     ]:
         with pytest.raises(ValueError, match=words):
             movie(tmp_path / "x.mp4", **(arguments() | change))
-    with pytest.raises(ValueError, match=r"path: got .* want a suffix among .mp4, .gif"):
+    with pytest.raises(ValueError, match=r"path: got .* want a suffix among .mp4, .gif, .webp"):
         movie(tmp_path / "x.avi", **arguments())
     with pytest.raises(ValueError, match="want a folder that exists"):
         movie(tmp_path / "no" / "x.gif", **arguments())

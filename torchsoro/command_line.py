@@ -107,3 +107,15 @@ def plain_errors() -> Iterator[None]:
         raise SystemExit(2 if isinstance(error, ValueError) else 1) from error
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+
+
+def parse_resolution(text: str) -> tuple[int, int]:
+    """Width and height in pixels from a text such as ``1280x720``.
+
+    Raises:
+        ValueError: for another text.
+    """
+    width, by, height = text.partition("x")
+    if not (by and width.isdecimal() and height.isdecimal() and max(len(width), len(height)) < 5):
+        raise ValueError(f"resolution = {text!r}: wanted width x height in pixels, such as 1280x720")
+    return int(width), int(height)

@@ -114,7 +114,9 @@ def pressure(motion: DrawnMotion) -> np.ndarray:
     return np.zeros(len(motion.time)) if motion.pressure is None else motion.pressure
 
 
-def draw(axes: Axes, found: Found, motion: DrawnMotion, chosen: list[int], camera: Camera, text: str, **view: Any) -> None:
+def draw(
+    axes: Axes, found: Found, motion: DrawnMotion, chosen: list[int], camera: Camera, text: str, **view: Any
+) -> None:
     """The body in one frame, with its pressure, or in several, side by side; the rest is for the scene."""
     axes.set_title(text, fontsize=8, color=INK, pad=3, linespacing=1.25)
     scene = Scene(axes, motion.shape.times(len(chosen)), camera, found.planes, along=found.along, **view)

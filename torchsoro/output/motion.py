@@ -1,7 +1,7 @@
 """The recorded motion of a robot in a small file, as a few spatial modes with their amplitudes over time.
 
 Displacements are decomposed by proper orthogonal decomposition of the snapshots (Sirovich, Q. Appl. Math. 45, 1987):
-position_s = rest + mean_s + sum_k amplitude_sk mode_k. A gait of a soft body needs some ten modes for 0.02 mm. Whatever
+position_s = rest + mean_s + sum_k amplitude_sk mode_k. The archived walker's three cycles need some fifteen modes for 0.002 mm. Whatever
 is interpolated linearly from the particles, such as a surface, moves by the same amplitudes.
 """
 
@@ -21,11 +21,11 @@ import numpy as np
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.output.levelset import as_array
 from torchsoro.output.page import check_frames, check_planes
-from torchsoro.output.scene import PlaneTuple, Skin, plane_extent
+from torchsoro.output.scene import PlaneTuple, Skin, camera_path, plane_extent
 from torchsoro.storage import atomic_write
 
 FILE = "motion.npz"
-TOLERANCE = 2e-5  # m; largest error of a coordinate in the file, a fortieth of the paper's particle spacing
+TOLERANCE = 2e-6  # m; root-mean-square error of a coordinate, 1/400 of the paper's particle spacing
 MOST_SAMPLES = 240  # of the file; three cycles of the paper's pressure as finely as they are recorded
 _VOID = 0.1  # density below which particles follow no material and are not kept
 
@@ -108,6 +108,11 @@ class Motion:
         """Travel of the centre of gravity since the first sample [S] m."""
         return (self.center - self.center[0]) @ np.array(self.direction)
 
+    @cached_property
+    def camera(self) -> np.ndarray:
+        """Where a camera looks that follows the robot [S, 3] m."""
+        return camera_path(self.center, self.direction)
+
     def at(self, time: float) -> tuple[np.ndarray, np.ndarray, float]:
         """Shift [3] m, amplitudes [K] and pressure [Pa] at a time [s], linear between samples."""
         table = np.column_stack([self.shift, self.amplitude, self.pressure])
@@ -138,11 +143,11 @@ class Motion:
     def save(self, path: Path) -> None:
         """Write the motion; the file is there whole or not at all.
 
-        Mode shapes are rounded to a step that keeps every coordinate within half of :data:`TOLERANCE`, and stored as
-        differences between neighbouring particles, which compress well.
+        Mode shapes are rounded to :data:`TOLERANCE`, which moves no coordinate by more than a few times as much since
+        the amplitudes of a sample are at most one in norm, and are stored as differences between neighbouring
+        particles, which compress well.
         """
-        step = TOLERANCE / max(1.0, math.sqrt(len(self.modes)))
-        whole = np.rint(self.modes[:, self.material] / step)
+        whole = np.rint(self.modes[:, self.material] / TOLERANCE)
         differences = np.diff(whole, axis=1, prepend=0.0)
         kind = np.int16 if np.abs(differences).max(initial=0.0) < 2**15 else np.int32
         domain = self.domain
@@ -156,7 +161,7 @@ class Motion:
             "direction": self.direction,
             "tilt": self.tilt,
             "period": self.period,
-            "step": step,
+            "step": TOLERANCE,
         }
         with atomic_write(path) as file:
             np.savez_compressed(
@@ -216,7 +221,7 @@ def decompose(
         direction: Unit vector of the travel.
         tilt: Angle of the slope [degrees].
         period: Of the pressure [s].
-        tolerance: Largest error of a coordinate of a particle [m]; half of it is left to the rounding in the file.
+        tolerance: Root-mean-square error of a coordinate of a particle [m] that modes may be left out for.
 
     Returns:
         The motion.
@@ -225,29 +230,30 @@ def decompose(
         ValueError: for arrays of the wrong shape or not finite, times that do not increase, planes that are none.
     """
     check_planes(planes)
-    moved = check_frames(domain, frames)
+    recorded = as_array(frames)
+    count = len(recorded) if recorded.ndim else 0
+    drawn = np.unique(np.linspace(0, max(count - 1, 0), min(count, MOST_SAMPLES)).round().astype(int))
+    moved = check_frames(domain, recorded[drawn] if count else recorded)
     density = as_array(gamma).astype(np.float16).astype(float)  # as in the file
     if density.shape != (domain.count,):
         raise ValueError(f"gamma: got shape {density.shape}, want one density per particle, ({domain.count},)")
     times, supply = (as_array(values).astype(float) for values in (time, pressure))
     for label, values in (("time", times), ("pressure", supply)):
-        if values.shape != (len(moved),) or not np.isfinite(values).all():
-            raise ValueError(f"{label}: got shape {values.shape}, want one finite number per frame, ({len(moved)},)")
+        if values.shape != (count,) or not np.isfinite(values).all():
+            raise ValueError(f"{label}: got shape {values.shape}, want one finite number per frame, ({count},)")
     if (np.diff(times) <= 0).any():
         raise ValueError("time: got times that do not increase, want increasing times in s")
-    drawn = np.unique(np.linspace(0, len(times) - 1, min(len(times), MOST_SAMPLES)).round().astype(int))
     kept = _material(domain, density)
-    displacement = moved[drawn][:, kept] - as_array(domain.positions)[kept]
+    displacement = moved[:, kept] - as_array(domain.positions)[kept]
     shift = displacement.mean(axis=1)
     residual = (displacement - shift[:, None]).reshape(len(drawn), -1)
-    # Eigenvectors of the Gram matrix of the snapshots, the largest first: the method of snapshots.
-    basis = np.linalg.eigh(residual @ residual.T)[1][:, ::-1]
-    rows: list[np.ndarray] = []
-    while len(rows) < len(basis) and np.abs(residual).max() > 0.5 * tolerance:
-        rows.append(basis[:, len(rows)] @ residual)
-        residual = residual - np.outer(basis[:, len(rows) - 1], rows[-1])
-    modes = np.zeros((len(rows), domain.count, 3))
-    modes[:, kept] = np.array(rows).reshape(len(rows), -1, 3)
+    # Method of snapshots: eigenvectors of the Gram matrix, the largest first; what is left out is told by the others.
+    energy, basis = np.linalg.eigh(residual @ residual.T)
+    energy, basis = energy[::-1].clip(0), basis[:, ::-1]
+    remaining = np.sqrt(np.append(np.cumsum(energy[::-1])[::-1], 0.0) / max(residual.size, 1))
+    modal = int(np.argmax(remaining <= tolerance))
+    modes = np.zeros((modal, domain.count, 3))
+    modes[:, kept] = (basis[:, :modal].T @ residual).reshape(modal, -1, 3)
     x, y, z = (float(component) for component in direction)
     return Motion(
         name=name,
@@ -256,7 +262,7 @@ def decompose(
         time=times[drawn],
         pressure=supply[drawn],
         shift=shift,
-        amplitude=basis[:, : len(rows)],
+        amplitude=basis[:, :modal],
         modes=modes,
         planes=tuple((axis, float(offset), side) for axis, offset, side in planes),
         direction=(x, y, z),
@@ -297,7 +303,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
             if arrays[key].shape != shape:
                 raise ValueError(f"{key} of shape {arrays[key].shape} for {shape}")
     except Exception as error:  # a damaged file can fail in any way
-        raise ValueError(f"path: {file} holds no motion ({error}), wanted a file that a finished run wrote") from error
+        raise ValueError(f"path: {file} holds no motion, or is damaged; wanted what a finished run wrote") from error
     return Motion(
         name=about["name"],
         domain=domain,

@@ -37,11 +37,14 @@ from torchsoro.output.page import (
     pixels,
     pressure_trace,
 )
-from torchsoro.output.scene import FAINT, INK, REST, Camera, PlaneTuple, Scene, Shape, Skin, bounds_of
+from torchsoro.output.scene import FAINT, INK, REST, Camera, PlaneTuple, Scene, Shape, Skin, bounds_of, camera_path
 from torchsoro.storage import atomic_write
 
 if TYPE_CHECKING:
     from torchsoro.design.domain import Domain
+
+
+MOVIES = (".mp4", ".gif", ".webp")
 
 
 # ---------------------------------------------------------------------------------------------------------- deformation
@@ -131,12 +134,13 @@ def movie(
     tilt: float = 0.0,
     width: int = 960,
     height: int = 640,
+    follow: bool = False,
     level: float = 0.5,
 ) -> Path:
     """Write a movie, one picture per frame, with the time, the travel and the pressure.
 
     Args:
-        path: an .mp4 or .gif file; it is there whole or not at all.
+        path: an .mp4, .gif or .webp file; it is there whole or not at all.
         domain: the lattice.
         gamma: density per particle [N].
         frames: positions of the particles [S, N, 3] in m.
@@ -149,8 +153,9 @@ def movie(
         azimuth: of the camera [degrees].
         elevation: of the camera [degrees].
         tilt: by which all is turned, so that a slope whose ground was kept level rises along +x [degrees].
-        width: in pixels; a multiple of 16 for .mp4.
-        height: in pixels; a multiple of 16 for .mp4.
+        width: in pixels; even for .mp4.
+        height: in pixels; even for .mp4.
+        follow: let the camera follow the robot, which is then larger; otherwise all of its way is seen.
         level: density at the surface.
 
     Returns:
@@ -159,18 +164,21 @@ def movie(
     Raises:
         ValueError: for another suffix, arrays of the wrong shape, times that do not increase, planes that are none.
     """
-    target = _target(path, (".mp4", ".gif"))
+    target = _target(path, MOVIES)
     if not (isinstance(fps, int) and 1 <= fps <= 120):
         raise ValueError(f"fps: got {fps}, want a whole number from 1 to 120")
-    if target.suffix.lower() == ".mp4" and (width % 16 or height % 16):
-        raise ValueError(f"width, height: got {width} x {height}, want multiples of 16 for .mp4")
+    if min(width, height) < 160 or (target.suffix.lower() == ".mp4" and (width % 2 or height % 2)):
+        raise ValueError(f"width, height: got {width} x {height}, want at least 160, and even numbers for .mp4")
     motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level)
-    pictures = _pictures(motion, planes, Camera(azimuth, elevation, tilt), title, fps, width, height)
+    looks = camera_path(motion.cog, direction) if follow else None
+    pictures = _pictures(motion, planes, Camera(azimuth, elevation, tilt), title, fps, (width, height), looks)
     # ffmpeg writes to a path of its own, so a movie moves to its place when it is complete.
     with tempfile.TemporaryDirectory() as folder:
         temporary = Path(folder) / target.name
-        write = _write_mp4 if target.suffix.lower() == ".mp4" else _write_gif
-        write(temporary, pictures, (width, height), fps)
+        if target.suffix.lower() == ".mp4":
+            _write_mp4(temporary, pictures, (width, height), fps)
+        else:
+            _write_animation(temporary, pictures, fps)
         with atomic_write(target) as file:
             file.write(temporary.read_bytes())
     return target
@@ -182,23 +190,26 @@ def _pictures(
     camera: Camera,
     title: str | None,
     fps: int,
-    width: int,
-    height: int,
+    size: tuple[int, int],
+    looks: np.ndarray | None,
 ) -> Iterator[np.ndarray]:
-    figure, canvas = canvas_of(width, height)
+    figure, canvas = canvas_of(*size)
+    # Below some 600 pixels text of the usual size would run into itself.
+    scale = min(1.0, size[0] / 720)
     strip = 0.0 if motion.pressure is None else 0.17
     axes = figure.add_axes((0.01, strip + 0.01, 0.98, 0.90 - strip))
-    scene = Scene(
-        axes, motion.shape, camera, planes, motion.bounds, along=motion.along, start=float(motion.cog[0, motion.along])
-    )
+    start = float(motion.cog[0, motion.along])
+    scene = Scene(axes, motion.shape, camera, planes, motion.bounds, along=motion.along, start=start)
+    if looks is not None:
+        scene.frame(vertices - look for (vertices, _), look in zip(motion.placed, looks, strict=True))
     if title:
-        figure.text(0.02, 0.975, title, va="top", fontsize=14, color=INK, weight="bold")
+        figure.text(0.02, 0.975, title, va="top", fontsize=14 * scale, color=INK, weight="bold")
     steps = np.diff(motion.time)
     slow = 1 / (fps * steps.mean()) if len(steps) else 1.0
     speed = "real time" if abs(slow - 1) < 0.05 else (f"slowed {slow:.3g}x" if slow > 1 else f"{1 / slow:.3g}x faster")
-    figure.text(0.98, 0.975, speed if len(steps) else "", va="top", ha="right", fontsize=10, color=FAINT)
+    figure.text(0.98, 0.975, speed if len(steps) else "", va="top", ha="right", fontsize=10 * scale, color=FAINT)
     label = figure.text(
-        0.02, 0.925 if title else 0.975, "", va="top", fontsize=12, color=INK, family="DejaVu Sans Mono"
+        0.02, 0.925 if title else 0.975, "", va="top", fontsize=12 * scale, color=INK, family="DejaVu Sans Mono"
     )
     dot = None
     if motion.pressure is not None:
@@ -207,6 +218,8 @@ def _pictures(
         trace.set_xlabel("time [s]", color=INK, fontsize=9, labelpad=1)
     for i, (vertices, cavity) in enumerate(motion.placed):
         scene.show(vertices, cavity, motion.fill(i))
+        if looks is not None:
+            scene.look_at(looks[i])
         label.set_text(f"t = {motion.time[i]:.3f} s   travel {motion.travel[i]:+6.2f} mm")
         if dot is not None and motion.pressure is not None:
             dot.set_data([motion.time[i]], [motion.pressure[i]])
@@ -229,14 +242,14 @@ def _write_mp4(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int]
             raise RuntimeError(f"ffmpeg could not write the movie: {messages.read().decode(errors='replace').strip()}")
 
 
-def _write_gif(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: int) -> None:
-    palettes = (
-        Image.fromarray(p).quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE) for p in pictures
-    )
-    first = next(palettes)
-    first.save(
-        path, format="GIF", save_all=True, append_images=palettes, duration=round(1000 / fps), loop=0, optimize=False
-    )
+def _write_animation(path: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
+    images: Iterator[Image.Image] = (Image.fromarray(picture) for picture in pictures)
+    options: dict[str, Any] = {"quality": 80, "method": 4}
+    if path.suffix.lower() == ".gif":
+        images = (i.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE) for i in images)
+        options = {"optimize": False}
+    first = next(images)
+    first.save(path, save_all=True, append_images=images, duration=round(1000 / fps), loop=0, **options)
 
 
 def _target(path: str | os.PathLike[str], suffixes: tuple[str, ...]) -> Path:

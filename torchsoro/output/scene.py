@@ -18,7 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Polygon
-from scipy import sparse
+from scipy import ndimage, sparse
 
 from torchsoro.output.fabricate import surface
 from torchsoro.output.levelset import as_array
@@ -195,10 +195,31 @@ class Scene:
         margin = 0.03 * (high - low).max()
         axes.set_xlim(low[0] - margin, high[0] + margin)
         axes.set_ylim(low[1] - margin - (3.0 if ruler else 0.0), high[1] + margin)
+        self._window: np.ndarray | None = None
         if camera.tilt:
             arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.0}
             axes.annotate("", (0.06, 0.72), (0.06, 0.98), xycoords="axes fraction", arrowprops=arrow)
             axes.text(0.08, 0.85, "g", transform=axes.transAxes, va="center", fontsize=8, color=INK, style="italic")
+
+    def frame(self, offsets: Iterable[np.ndarray]) -> None:
+        """Fit the window to a body that moves about the place where the camera looks (see :meth:`look_at`).
+
+        Args:
+            offsets: Vertices [V, 3] mm relative to that place, for each picture.
+        """
+        flat = np.concatenate([points @ self.view[:2].T for points in offsets])
+        half = 1.18 * np.abs(flat).max(axis=0)
+        place = self.axes.get_position()
+        width, height = self.axes.figure.get_size_inches() * [place.width, place.height]  # pyright: ignore
+        scale = max(half[0] / width, half[1] / height)
+        self._window = scale * np.array([width, height])
+
+    def look_at(self, center: np.ndarray) -> None:
+        """Move the window so that a place [3] mm is in its middle; after :meth:`frame`."""
+        assert self._window is not None
+        across, up = self.view[:2] @ center
+        self.axes.set_xlim(across - self._window[0], across + self._window[0])
+        self.axes.set_ylim(up - self._window[1], up + self._window[1])
 
     def _plane(
         self, plane: PlaneTuple, bounds: np.ndarray, along: int, start: float | None, ruler: bool
@@ -309,6 +330,18 @@ class Scene:
             self.cavity.set_verts(visible @ self.view[:2].T)  # pyright: ignore[reportArgumentType]
             self.cavity.set_facecolor((red, green, blue, 0.16 if fill is None else 0.16 + 0.24 * fill))
             self.cavity.set_edgecolor((red, green, blue, 0.22))
+
+
+def camera_path(center: np.ndarray, direction: Sequence[float]) -> np.ndarray:
+    """Where a camera looks that follows a robot [S, 3]: the mean place, moved on with the smoothed travel.
+
+    Args:
+        center: Centre of gravity in each picture [S, 3].
+        direction: Unit vector of the travel.
+    """
+    travel = center @ np.asarray(direction, dtype=float)
+    smooth = ndimage.gaussian_filter1d(travel, max(len(travel) / 8, 1.0), mode="nearest")
+    return center.mean(axis=0) + (smooth - travel.mean())[:, None] * np.asarray(direction, dtype=float)
 
 
 def plane_extent(plane: PlaneTuple, planes: Sequence[PlaneTuple], bounds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -95,7 +95,7 @@ def _about(motion: Motion, meshes: dict[str, Mesh], vertices: np.ndarray, larges
         part = {"name": name, "start": start, "count": len(faces), "outer": name in ("body", "wall")}
         parts.append({**part, "front": list(front), "back": list(back), "lit": lit})
         start += len(faces)
-    center = (motion.center - origin) * 1e3
+    center = (motion.camera - origin) * 1e3
     high = np.asarray(motion.domain.size) * 1e3
     planes = [{"axis": p.axis, "side": p.side, "corners": p.corners.round(3).tolist()} for p in motion.stage]
     ticks = [
