@@ -45,6 +45,12 @@ class Options:
     """Simulate void, too."""
     frames: int = 60
     """Pictures in the movie."""
+    resolution: str = "960x640"
+    """Of the movie: width x height in pixels."""
+    fps: int = 20
+    """Pictures of the movie per second."""
+    follow: bool = False
+    """Let the movie's camera follow the robot."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute."""
     archive: Path | None = None
@@ -75,7 +81,8 @@ def main(options: Options) -> dict[str, float]:
     begin = time.perf_counter()
     folder = archive.find(options.robot)
     designed = archive.read_result(folder)
-    base = read_settings(folder / "settings.json", device=options.device, frames=options.frames)
+    movie = {name: getattr(options, name) for name in ("frames", "resolution", "fps", "follow")}
+    base = read_settings(folder / "settings.json", device=options.device, **movie)
     duration = round(options.cycles / base.frequency / base.sample_every) * base.sample_every
     settle = options.settle if base.settle > 0 else 0.0
     robot = build(dataclasses.replace(base, duration=duration, settle=settle))

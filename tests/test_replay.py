@@ -38,7 +38,13 @@ def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, s
     path, result = straight
     found = play(replay, path, tmp_path / "out", void=True)
     assert found == {name: pytest.approx(result[name], rel=1e-6) for name in ("L", "stride", "C", "mass")}
-    assert {file.name for file in (tmp_path / "out").iterdir()} == {"straight.mp4", "shape.stl", "shape.json"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == {
+        "straight.mp4",
+        "motion.npz",
+        "motion.html",
+        "shape.stl",
+        "shape.json",
+    }
     assert imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "out" / "straight.mp4"))[0] == 3
     assert trimesh.load_mesh(tmp_path / "out" / "shape.stl").is_watertight
     for name in ("shape.stl", "shape.json"):

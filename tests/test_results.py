@@ -63,7 +63,13 @@ def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run
     monkeypatch.setattr(robot, "forward", lambda gamma, **how: asked.append(how) or forward(gamma, **how))
     found, part = show(tmp_path, robot, gamma, name="stump", void=void)
     assert asked == [{"everything": True, "void": void}]
-    assert {file.name for file in tmp_path.iterdir()} == {"stump.mp4", "shape.stl", "shape.json"}
+    assert {file.name for file in tmp_path.iterdir()} == {
+        "stump.mp4",
+        "motion.npz",
+        "motion.html",
+        "shape.stl",
+        "shape.json",
+    }
     assert json.loads((tmp_path / "shape.json").read_text())["mass_g"] == part.report.mass_g
     assert found["C"] == 0
     # Body and wall, without air; of grey there is none.

@@ -116,6 +116,9 @@ def parse_resolution(text: str) -> tuple[int, int]:
         ValueError: for another text.
     """
     width, by, height = text.partition("x")
-    if not (by and width.isdecimal() and height.isdecimal() and max(len(width), len(height)) < 5):
-        raise ValueError(f"resolution = {text!r}: wanted width x height in pixels, such as 1280x720")
-    return int(width), int(height)
+    sizes = [int(size) if size.isdecimal() and len(size) < 5 else 0 for size in (width, height)]
+    if not by or any(size < 160 or size > 7680 or size % 2 for size in sizes):
+        raise ValueError(
+            f"resolution = {text!r}: wanted width x height in pixels, even numbers from 160 to 7680, such as 1280x720"
+        )
+    return sizes[0], sizes[1]

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import torch
 from pydantic import Field
 
-from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options
+from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
 
 _SOFTEST = 1e3  # Pa; below the softest gels, so that a smaller modulus is one in another unit
 _STEEPEST = 2.0  # rise over run, 63 degrees; a larger slope is one in percent or degrees
@@ -154,6 +154,12 @@ class Settings:
     """Iterations between two designs that are kept in the folder's shapes."""
     frames: Count = 60
     """Pictures in the movie."""
+    resolution: str = "960x640"
+    """Of the movie: width x height in pixels."""
+    fps: Count = 20
+    """Pictures of the movie per second."""
+    follow: bool = False
+    """Let the movie's camera follow the robot."""
     offset: AtLeastZero = 0.0
     """Thickness added to the outer surface of the printed part [m]."""
     port: AtLeastZero = 0.0
@@ -163,6 +169,9 @@ class Settings:
         """Refuse values that do not fit together, and such that are most likely in another unit."""
         self._check_units()
         self._check_times()
+        parse_resolution(self.resolution)
+        if self.fps > 120:
+            raise ValueError(f"fps = {self.fps}: wanted at most 120")
         if not self.void_range[0] < self.void_range[1]:
             raise ValueError(f"void_range = {self.void_range}: wanted two increasing densities from 0 to 1")
         if self.offset > 0.25 * min(self.size):
@@ -250,7 +259,7 @@ class Settings:
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
         here = ("out", "resume", "amend", "overwrite", "iterations", "device", "memory")
-        return (*here, "picture_every", "shape_every", "frames", "offset", "port")
+        return (*here, "picture_every", "shape_every", "frames", "resolution", "fps", "follow", "offset", "port")
 
 
 def check_pressure(name: str, largest: float, modulus: float) -> None:

@@ -116,7 +116,7 @@ def load_shape(folder: Path, domain: Domain, iteration: int) -> Tensor:
 
 
 def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) -> None:
-    """Copy what is worth keeping of a finished run: design, some early designs, settings, metrics, result, summary.
+    """Copy what is worth keeping of a finished run: design, early designs, motion, settings, metrics, result, summary.
 
     Args:
         run: The run's folder.
@@ -135,7 +135,7 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
     if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
         raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
     folder.mkdir(parents=True, exist_ok=True)
-    files += ("amendments.json",) if (run / "amendments.json").is_file() else ()
+    files += tuple(name for name in ("amendments.json", "motion.npz") if (run / name).is_file())
     for name in files:
         with atomic_write(folder / name) as file:
             file.write((run / name).read_bytes())

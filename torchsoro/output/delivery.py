@@ -7,10 +7,12 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from torchsoro.command_line import parse_resolution
 from torchsoro.design.loop import optimize
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.robot import Robot
@@ -18,7 +20,11 @@ from torchsoro.design.settings import Settings
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import save_design
 from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
+from torchsoro.output.motion import FILE as MOTION
+from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.picture import movie, shape_image, summary
+from torchsoro.output.web_page import FILE as PAGE
+from torchsoro.output.web_page import write_page
 from torchsoro.storage import atomic_write
 
 
@@ -127,8 +133,8 @@ def show(
 ) -> tuple[dict[str, float], Part]:
     """Simulate a gait with every particle recorded, and write what people look at and print.
 
-    Files: ``<name>.mp4``, with a history ``summary.png``, and ``shape.stl`` with ``shape.json`` (what the part weighs
-    and how thin it gets).
+    Files: ``<name>.mp4``, ``motion.npz`` and ``motion.html`` (the motion, for recipes/view.py and for a browser), with
+    a history ``summary.png``, and ``shape.stl`` with ``shape.json`` (what the part weighs and how thin it gets).
 
     Args:
         path: Folder to write to.
@@ -143,7 +149,7 @@ def show(
         Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg]; and the printable part.
 
     Raises:
-        ValueError: if the design has no connected body to print; the movie is written before.
+        ValueError: if the design has no connected body to print; movie and motion are written before.
     """
     s = robot.settings
     outcome = robot(gamma, everything=True, void=void)
@@ -154,6 +160,7 @@ def show(
     way = trajectory.center_of_gravity.cpu().double().numpy() @ np.array(robot.direction)
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
+    width, height = parse_resolution(s.resolution)
     shown = {
         "domain": robot.domain,
         "gamma": density,
@@ -167,9 +174,13 @@ def show(
         frames=frames[drawn],
         time=time[drawn],
         pressure=supply[drawn],
-        fps=20,
+        fps=s.fps,
+        width=width,
+        height=height,
+        follow=s.follow,
         title=f"{name}, {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
     )
+    record(path, name, robot, shown, frames, time, supply)
     if history is not None:
         summary(
             path / "summary.png",
@@ -194,6 +205,35 @@ def show(
         "mass": float(outcome.mass),
     }
     return found, part
+
+
+def record(
+    path: Path,
+    name: str,
+    robot: Robot,
+    shown: Mapping[str, Any],
+    frames: np.ndarray,
+    time: np.ndarray,
+    supply: np.ndarray,
+) -> None:
+    """Write the motion since the actuation starts, at most its last three cycles: ``motion.npz`` and ``motion.html``.
+
+    Args:
+        path: Folder to write to.
+        name: Of the robot.
+        robot: The robot.
+        shown: Its lattice, density, planes, direction and tilt.
+        frames: Positions of the particles [S, N, 3] m.
+        time: Of the frames [S] s.
+        supply: Gauge pressure at the frames [S] Pa.
+    """
+    s = robot.settings
+    period = 1 / s.frequency
+    on = time >= max(s.settle, time[-1] - 3 * period) - 1e-3 * s.sample_every
+    motion = decompose(name=name, frames=frames[on], time=time[on], pressure=supply[on], period=period, **shown)
+    motion.save(path / MOTION)
+    # As it is read from the file: the page shows what the viewer does.
+    write_page(read_motion(path / MOTION), path / PAGE)
 
 
 def print_part(robot: Robot, density: np.ndarray) -> Part:

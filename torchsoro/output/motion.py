@@ -1,8 +1,8 @@
 """The recorded motion of a robot in a small file, as a few spatial modes with their amplitudes over time.
 
 Displacements are decomposed by proper orthogonal decomposition of the snapshots (Sirovich, Q. Appl. Math. 45, 1987):
-position_s = rest + mean_s + sum_k amplitude_sk mode_k. The archived walker's three cycles need some fifteen modes for 0.002 mm. Whatever
-is interpolated linearly from the particles, such as a surface, moves by the same amplitudes.
+position_s = rest + mean_s + sum_k amplitude_sk mode_k. Whatever is interpolated linearly from the particles, such as a
+surface, moves by the same amplitudes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from torchsoro.output.scene import PlaneTuple, Skin, camera_path, plane_extent
 from torchsoro.storage import atomic_write
 
 FILE = "motion.npz"
-TOLERANCE = 2e-6  # m; root-mean-square error of a coordinate, 1/400 of the paper's particle spacing
+TOLERANCE = 5e-6  # m; root-mean-square error of a coordinate, 1/175 of the spacing of the particles in the paper
 MOST_SAMPLES = 240  # of the file; three cycles of the paper's pressure as finely as they are recorded
 _VOID = 0.1  # density below which particles follow no material and are not kept
 
@@ -91,7 +91,7 @@ class Motion:
         """Which particles were kept: those that are not void, bool [N]."""
         return _material(self.domain, self.gamma)
 
-    def positions(self, samples: Sequence[int] | slice = slice(None)) -> np.ndarray:
+    def positions(self, samples: Sequence[int] | np.ndarray | slice = slice(None)) -> np.ndarray:
         """Positions of all particles [S, N, 3] m at some of the samples; void moves with the mean of the material."""
         deformation = np.tensordot(self.amplitude[samples], self.modes, axes=1)
         return self.rest + self.shift[samples][:, None] + deformation

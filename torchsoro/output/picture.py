@@ -213,7 +213,8 @@ def _pictures(
     )
     dot = None
     if motion.pressure is not None:
-        trace = figure.add_axes((0.075, 0.075, 0.905, strip - 0.075))
+        left = max(0.075, 54 / size[0])  # for the numbers beside it
+        trace = figure.add_axes((left, 0.075, 1 - left - max(0.02, 18 / size[0]), strip - 0.075))
         dot = pressure_trace(trace, motion.time, motion.pressure)
         trace.set_xlabel("time [s]", color=INK, fontsize=9, labelpad=1)
     for i, (vertices, cavity) in enumerate(motion.placed):
@@ -244,7 +245,7 @@ def _write_mp4(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int]
 
 def _write_animation(path: Path, pictures: Iterator[np.ndarray], fps: int) -> None:
     images: Iterator[Image.Image] = (Image.fromarray(picture) for picture in pictures)
-    options: dict[str, Any] = {"quality": 80, "method": 4}
+    options: dict[str, Any] = {"quality": 75, "method": 4}
     if path.suffix.lower() == ".gif":
         images = (i.quantize(256, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE) for i in images)
         options = {"optimize": False}

@@ -208,18 +208,22 @@ class Scene:
             offsets: Vertices [V, 3] mm relative to that place, for each picture.
         """
         flat = np.concatenate([points @ self.view[:2].T for points in offsets])
-        half = 1.18 * np.abs(flat).max(axis=0)
-        place = self.axes.get_position()
-        width, height = self.axes.figure.get_size_inches() * [place.width, place.height]  # pyright: ignore
-        scale = max(half[0] / width, half[1] / height)
-        self._window = scale * np.array([width, height])
+        low, high = flat.min(axis=0), flat.max(axis=0)
+        place = self.axes.get_position(original=True)
+        canvas = self.axes.get_figure(root=True)
+        assert canvas is not None
+        shape = canvas.get_size_inches() * [place.width, place.height]
+        # More room below than above, for the ground and its numbers.
+        half = 0.5 * shape * ([1.16, 1.3] * (high - low) / shape).max()
+        middle = 0.5 * (low + high) - [0.0, 0.07 * (high - low)[1]]
+        self._window = np.stack([middle - half, middle + half])
 
     def look_at(self, center: np.ndarray) -> None:
         """Move the window so that a place [3] mm is in its middle; after :meth:`frame`."""
         assert self._window is not None
-        across, up = self.view[:2] @ center
-        self.axes.set_xlim(across - self._window[0], across + self._window[0])
-        self.axes.set_ylim(up - self._window[1], up + self._window[1])
+        (left, low), (right, high) = self.view[:2] @ center + self._window
+        self.axes.set_xlim(left, right)
+        self.axes.set_ylim(low, high)
 
     def _plane(
         self, plane: PlaneTuple, bounds: np.ndarray, along: int, start: float | None, ruler: bool

@@ -34,7 +34,7 @@ void main() {
   float lambert = max(dot(m, light), 0.0), sky = 0.5 + 0.5 * m.z;
   float gloss = 0.16 * pow(max(dot(m, normalize(light + view)), 0.0), 28.0);
   float rim = 0.10 * pow(1.0 - max(dot(m, view), 0.0), 3.0);
-  color = vec4(front * (0.36 + 0.20 * sky + 0.56 * lambert) + gloss + rim, alpha);
+  color = vec4(front * (0.40 + 0.22 * sky + 0.50 * lambert) + gloss + rim, alpha);
 }`;
 const planeVertex = `#version 300 es
 in vec3 position;
@@ -59,7 +59,7 @@ void main() {
   result = vec4(mix(color, vec3(0.62, 0.67, 0.73), line), mix(alpha, 1.0, 0.6 * line * (1.0 - alpha)));
 }`;
 
-const state = { time: 0, playing: false, azimuth: -62, elevation: 18, distance: 2.2, pan: [0, 0], dirty: true };
+const state = { time: 0, playing: false, azimuth: -62, elevation: 18, distance: 2.3, pan: [0, -4], dirty: true };
 let gl, body, planes, data, clock = null;
 
 function fail(text) { byId("stage").textContent = text; throw new Error(text); }
@@ -295,7 +295,7 @@ function controls() {
   for (const id of ["axis", "cut", "flip", "follow", "through"]) byId(id).addEventListener("input", () => { state.dirty = true; });
   for (const button of document.querySelectorAll("[data-view]")) button.onclick = () => {
     [state.azimuth, state.elevation] = button.dataset.view.split(",").map(Number);
-    state.pan = [0, 0]; state.dirty = true;
+    state.pan = [0, -4]; state.dirty = true;
   };
   const view = byId("view");
   view.onpointerdown = (e) => view.setPointerCapture(e.pointerId);
