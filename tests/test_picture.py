@@ -128,6 +128,30 @@ def test_movies_are_whole(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["gait.gif", "gait.mp4"]
 
 
+def body_column(picture: np.ndarray) -> float:
+    """Mean column of the bluish pixels above the pressure trace."""
+    upper = picture[: int(0.8 * len(picture))].astype(int)
+    return float(np.argwhere(upper[..., 2] - upper[..., 0] > 20)[:, 1].mean())
+
+
+@pytest.mark.parametrize("follow", [False, True])
+def test_camera_that_follows_keeps_the_body_within_a_tenth_of_the_width_and_shows_it_larger(
+    tmp_path: Path, follow: bool
+) -> None:
+    given = arguments(7) | {"frames": walk(7, 0.06)}
+    path = movie(tmp_path / "gait.webp", **given, width=481, height=321, follow=follow)
+    with Image.open(path) as film:
+        assert film.size == (481, 321)
+        pictures = []
+        for frame in range(7):
+            film.seek(frame)
+            pictures.append(np.asarray(film.convert("RGB")))
+    columns = [body_column(picture) for picture in pictures]
+    # The camera's path is smoothed: a body at constant speed drifts a little at both ends.
+    assert np.ptp(columns) < 48 if follow else np.ptp(columns) > 100
+    assert (share_of(pictures[3], "blue") > 0.1) == follow
+
+
 def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     old = tmp_path / "gait.gif"
     old.write_bytes(b"old")
