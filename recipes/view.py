@@ -15,13 +15,16 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import tyro
 
 from torchsoro.command_line import parse_resolution, plain_errors
-from torchsoro.output import archive
-from torchsoro.output.motion import FILE, Motion, read_motion
+
+if TYPE_CHECKING:
+    from torchsoro.output.motion import Motion
+
+# What a command needs beyond its options is imported by it alone: --help and a wrong option answer at once.
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -62,6 +65,8 @@ def main(options: Options) -> Path | None:
         ValueError: for a robot that does not exist or has no motion, an address that cannot be served on, a path that
             cannot be written to.
     """
+    from torchsoro.output import archive
+
     if not options.robot:
         print("\n".join(archive.names()))
         return None
@@ -69,7 +74,6 @@ def main(options: Options) -> Path | None:
     if options.pictures < 2:
         raise ValueError(f"pictures = {options.pictures}: wanted at least 2")
     motion = find_motion(options.robot)
-    # Each of these imports what it needs, and the others need not wait for it.
     if options.page is not None:
         from torchsoro.output.web_page import write_page
 
@@ -97,6 +101,9 @@ def find_motion(robot: str) -> Motion:
     Raises:
         ValueError: if there is no such robot, or no motion of it.
     """
+    from torchsoro.output import archive
+    from torchsoro.output.motion import FILE, read_motion
+
     path = Path(robot)
     if path.is_file() or (path / FILE).is_file():
         return read_motion(path)
@@ -105,6 +112,8 @@ def find_motion(robot: str) -> Motion:
 
 def animate(motion: Motion, options: Options, width: int, height: int) -> Path:
     """Write a movie of the motion."""
+    import numpy as np
+
     from torchsoro.output.picture import movie
 
     assert options.animation is not None
