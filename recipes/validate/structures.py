@@ -121,8 +121,8 @@ def timoshenko(length: float, width: float, solid: Solid) -> float:
 
     Solutions are cosh, sinh (a x) and cos, sin (b x); omega is the first root of the 4 x 4 determinant of the ends.
     """
-    E, nu, rho = solid.youngs_modulus, solid.poisson_ratio, solid.density
-    kG = 10 * (1 + nu) / (12 + 11 * nu) * solid.shear
+    E, nu, rho = (float(n) for n in (solid.youngs_modulus, solid.poisson_ratio, solid.density))
+    kG = 10 * (1 + nu) / (12 + 11 * nu) * float(solid.shear)
     gyration = width**2 / 12  # I / A
 
     def determinant(omega: float) -> float:

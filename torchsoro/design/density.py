@@ -9,24 +9,25 @@ import torch
 from torch import Tensor
 
 from torchsoro.design.domain import Domain, Region
-from torchsoro.simulation.material import Body, Gas, Solid
+from torchsoro.simulation.material import Body, Gas, Number, Solid, value_of
 
 
-def simp(gamma: Tensor, *, epsilon: float = 1e-5, power: float = 3.0) -> Tensor:
+def simp(gamma: Tensor, *, epsilon: Number = 1e-5, power: Number = 3.0) -> Tensor:
     """Interpolation between void and solid, (1 - epsilon) gamma^power + epsilon (Eq. 11).
 
     Args:
         gamma: Density field in [0, 1], any shape.
-        epsilon: What the void keeps, relative to the solid.
-        power: 3 in the paper, so that intermediate densities carry little.
+        epsilon: What the void keeps, relative to the solid; a tensor may require grad.
+        power: 3 in the paper, so that intermediate densities carry little; a tensor may require grad.
 
     Raises:
         ValueError: if epsilon is not in (0, 1) or power not positive.
     """
-    if not 0 < epsilon < 1:
-        raise ValueError(f"epsilon = {epsilon}: wanted more than 0 and less than 1")
-    if not (math.isfinite(power) and power > 0):
-        raise ValueError(f"power = {power}: wanted finite and positive")
+    share, exponent = value_of("epsilon", epsilon), value_of("power", power)
+    if not 0 < share < 1:
+        raise ValueError(f"epsilon = {share}: wanted more than 0 and less than 1")
+    if not (math.isfinite(exponent) and exponent > 0):
+        raise ValueError(f"power = {exponent}: wanted finite and positive")
     return (1 - epsilon) * gamma**power + epsilon
 
 
@@ -42,9 +43,9 @@ def fill(
     *,
     solid: Solid,
     gas: Gas | None = None,
-    epsilon: float = 1e-5,
-    power: float = 3.0,
-    void_range: tuple[float, float] | None = None,
+    epsilon: Number = 1e-5,
+    power: Number = 3.0,
+    void_range: tuple[Number, Number] | None = None,
 ) -> Body:
     """Fill a domain with material: mass and moduli interpolated by density (Eq. 11), gas in the chambers.
 
@@ -53,8 +54,8 @@ def fill(
     Args:
         domain: Lattice and regions.
         gamma: Density of every particle [..., N]; differentiable. Gas particles ignore theirs.
-        solid: The printed material.
-        gas: The chambers' gas; the paper's if None.
+        solid: The printed material; its numbers may require grad.
+        gas: The chambers' gas; the paper's if None. Its numbers may require grad.
         epsilon: See :func:`simp`.
         power: See :func:`simp`.
         void_range: Densities between which the stress goes over, smoothly, from the law of void to that of the solid.
@@ -69,8 +70,10 @@ def fill(
     Raises:
         ValueError: if gamma's last axis is not the particles, or ``void_range`` is not two increasing densities.
     """
-    if void_range is not None and not 0 <= void_range[0] < void_range[1] <= 1:
-        raise ValueError(f"void_range = {void_range}: wanted two increasing densities from 0 to 1")
+    if void_range is not None:
+        low, high = (value_of("void_range", density) for density in void_range)
+        if not 0 <= low < high <= 1:
+            raise ValueError(f"void_range = {(low, high)}: wanted two increasing densities from 0 to 1")
     if gamma.shape[-1] != domain.count:
         raise ValueError(
             f"gamma: shape {tuple(gamma.shape)}, wanted [..., {domain.count}], one value for each particle"
@@ -81,20 +84,25 @@ def fill(
     scale = simp(gamma, epsilon=epsilon, power=power)
     zero = torch.zeros((), **like)
     void = None if void_range is None else torch.where(air, zero, _void(gamma, *void_range))
-    numbers = torch.tensor([solid.linear_stiffening, solid.quadratic_stiffening], **like)
-    stiffening = torch.where(air[:, None], zero, numbers) if bool(numbers.any()) else None
-    mass = domain.volume * torch.where(air, torch.tensor(gas.density, **like), solid.density * scale)
+
+    def number(value: Number) -> Tensor:
+        return torch.as_tensor(value, **like)
+
+    laws = torch.stack([number(solid.linear_stiffening), number(solid.quadratic_stiffening)])
+    stiffening = torch.where(air[:, None], zero, laws) if laws.requires_grad or bool(laws.any()) else None
+    mass = domain.volume * torch.where(air, number(gas.density), number(solid.density) * scale)
+    light = torch.as_tensor(gas.density, dtype=torch.float64).clamp(max=AIR) * domain.volume
     return Body(
         position=domain.positions.to(**like),
         mass=mass,
         volume=torch.full((domain.count,), domain.volume, **like),
-        bulk=torch.where(air, torch.tensor(gas.stiffness, **like), solid.bulk * scale),
-        shear=torch.where(air, torch.tensor(gas.shear, **like), solid.shear * scale),
+        bulk=torch.where(air, number(gas.stiffness), number(solid.bulk) * scale),
+        shear=torch.where(air, number(gas.shear), number(solid.shear) * scale),
         chamber=domain.chamber.to(device=gamma.device, dtype=torch.int32),
-        viscosity=torch.where(air, torch.tensor(gas.viscosity, **like), zero),
-        volume_viscosity=torch.where(air, torch.tensor(gas.volume_viscosity, **like), zero),
+        viscosity=torch.where(air, number(gas.viscosity), zero),
+        volume_viscosity=torch.where(air, number(gas.volume_viscosity), zero),
         void_fraction=void,
-        drag=None if void is None else VOID_DRAG * torch.where(air, domain.volume * min(gas.density, AIR), mass * void),
+        drag=None if void is None else VOID_DRAG * torch.where(air, light.to(**like), mass * void),
         stiffening=stiffening,
     )
 
@@ -120,7 +128,7 @@ def part(body: Body, keep: Tensor) -> Body:
     return replace(body, **given)
 
 
-def _void(gamma: Tensor, low: float, high: float) -> Tensor:
+def _void(gamma: Tensor, low: Number, high: Number) -> Tensor:
     """Smooth step from 1 at the lower density to 0 at the upper."""
     x = ((gamma - low) / (high - low)).clamp(0, 1)
     return 1 - x * x * (3 - 2 * x)

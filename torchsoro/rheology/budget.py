@@ -259,7 +259,9 @@ def substitutes(budget: Budget, *, match: float) -> list[Material]:
         lumped = moduli[:n].copy()
         lumped[-1] += left * (1 + wt * wt) / wt
         found.append(_material(f"lumped into element {n}", budget, lumped, times[:n]))
-    found.append(_material("viscosity", budget, moduli[:n], times[:n], viscosity=budget.solid.shear * left / match))
+    found.append(
+        _material("viscosity", budget, moduli[:n], times[:n], viscosity=float(budget.solid.shear) * left / match)
+    )
     return [*found, choose(budget, elements=min(len(moduli), MOST))]
 
 
@@ -343,7 +345,7 @@ def _material(name: str, budget: Budget, moduli: np.ndarray, times: np.ndarray, 
     below, above = _omega((1e-6 * low, low)), _omega((high, 1e6 * high))
     omega = np.concatenate([below[:-1], _omega(budget.band), above[1:]])
     full = moduli_over(budget.moduli, budget.times, omega)
-    here = moduli_over(moduli, times, omega, viscosity / budget.solid.shear)
+    here = moduli_over(moduli, times, omega, viscosity / float(budget.solid.shear))
     off = np.abs(here / full - 1)
     storage, loss = (float(v) for v in off[:, (omega >= low) & (omega <= high)].max(axis=1))
     bad, middle = omega[(off > 0.1).any(axis=0)], math.sqrt(low * high)

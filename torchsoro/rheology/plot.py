@@ -35,7 +35,9 @@ def draw_budget(budget: Budget, materials: Sequence[Material]) -> Figure:
         axis.axvspan(low, high, color="0.9", zorder=0, label="the robot's band")
         axis.loglog(omega, full[i], color="k", lw=1.6, label=f"all {len(budget.moduli)} elements")
         for k, material in enumerate(materials):
-            value = unit * moduli_over(material.moduli, material.times, omega, material.viscosity / budget.solid.shear)
+            value = unit * moduli_over(
+                material.moduli, material.times, omega, material.viscosity / float(budget.solid.shear)
+            )
             off = (material.storage_error, material.loss_error)[i]
             label = f"{material.name}: off by {100 * off:.2g} %"
             axis.loglog(omega, value[i], "--", color=f"C{k}", lw=1.4, label=label)

@@ -45,11 +45,11 @@ class Law:
     @classmethod
     def of(cls, solid: Solid, prony: Prony | None = None) -> Law:
         """The law of a solid of the simulator, without leading axes."""
-        numbers = (solid.shear, solid.bulk, (solid.linear_stiffening, solid.quadratic_stiffening))
-        shear, bulk, stiffening = (torch.tensor(n, dtype=torch.float64) for n in numbers)
+        numbers = (solid.shear, solid.bulk, solid.linear_stiffening, solid.quadratic_stiffening)
+        shear, bulk, *stiffening = (torch.as_tensor(n, dtype=torch.float64) for n in numbers)
         none = torch.zeros(0, dtype=torch.float64)
         moduli, times = (none, none) if prony is None else (prony.moduli, prony.times)
-        return cls(shear=shear, bulk=bulk, stiffening=stiffening, moduli=moduli, times=times)
+        return cls(shear=shear, bulk=bulk, stiffening=torch.stack(stiffening), moduli=moduli, times=times)
 
     def factor(self, x: Tensor) -> Tensor:
         """By what mu is multiplied at x = I1b - 3 [..., T]."""

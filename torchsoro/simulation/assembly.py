@@ -153,6 +153,16 @@ def check_body(body: Body) -> None:
             wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
             bad = value.detach()[~(finite if vector else finite & least)][0]
             raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
+    void = body.void_fraction
+    if (
+        void is not None
+        and void.is_leaf
+        and void.requires_grad
+        and bool((void.detach()[..., body.chamber < 0] == 1).any())
+    ):
+        raise ValueError(
+            "body.void_fraction: exactly 1 with a gradient, which is not computed there, wanted less than 1"
+        )
 
 
 def check_weight(weight: Tensor, count: int) -> Tensor:

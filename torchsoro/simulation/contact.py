@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -19,7 +20,7 @@ class Plane:
     Attributes:
         axis: 0, 1 or 2: the plane's normal is x, y or z.
         offset: Where it cuts the axis [m], a number or a tensor [...]; in the updated formulation its gradient
-            is that of shifting the grid.
+            is that of shifting the grid, and a further plane of the same axis has none.
         side: +1 if the body lies on the positive side, else -1.
         friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
         adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
@@ -69,3 +70,18 @@ def ground(height: float | Tensor = 0.0, *, friction: str | float | Tensor = "st
         friction: See :class:`Plane`.
     """
     return Plane(axis=2, offset=height, friction=friction)
+
+
+def check_offsets(planes: Sequence[Plane]) -> None:
+    """Refuse gradients by the offsets of planes of an axis that do not shift the grid of the updated formulation.
+
+    Raises:
+        ValueError: if the offset of a plane requires a gradient, and a plane before it has the same axis.
+    """
+    for k, plane in enumerate(planes):
+        shifts = all(other.axis != plane.axis for other in planes[:k])
+        if not shifts and isinstance(plane.offset, Tensor) and plane.offset.requires_grad:
+            raise ValueError(
+                f"planes: the offset of plane {k} requires a gradient, but in the updated formulation only the first "
+                f"plane of axis {plane.axis} has one, wanted an offset without, or the total-Lagrangian formulation"
+            )

@@ -23,7 +23,7 @@ class Force:
         particles: int64 indices [n].
         value: [..., 3] N, constant; or [..., S, 3] with ``time``.
         time: [S] s, increasing; interpolated linearly.
-        share: Of each particle [..., n]; equal if None.
+        share: Of each particle [n]; equal if None. No gradient flows to it.
     """
 
     particles: Tensor
@@ -118,7 +118,8 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
 
     Raises:
         ValueError: for an empty group, an index out of range, a negative mass, stiffness or coefficient, springs that
-            share a particle, or forces or shifts of the wrong shape or not finite.
+            share a particle, forces or shifts of the wrong shape or not finite, or a force's share that requires a
+            gradient.
     """
     x = body.position.detach()
     count = x.shape[-2]
@@ -133,6 +134,11 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
         if isinstance(load, Force):
             if group.ndim > 1:
                 raise ValueError(f"share of a force: shape {tuple(group.shape[:-1])} of a batch, wanted [n]")
+            if group.requires_grad:
+                raise ValueError(
+                    "share of a force: requires a gradient, which is not computed, wanted one without; forces on parts "
+                    "of the group have gradients by their values"
+                )
             shares.append(group.unsqueeze(0))
             _check_vector("force", load.value)
         elif isinstance(load, PointMass):
@@ -173,9 +179,10 @@ def _shares(particles: Tensor, share: Tensor | None, count: int, like: Tensor) -
     if share is None:
         group[indices] = 1 / len(indices)
         return group
-    share = share.detach().to(like)
-    total = share.sum(-1)
-    if share.shape[-1:] != particles.shape or not bool((share >= 0).all() & ((total - 1).abs() < 1e-4).all()):
+    share = share.to(like)
+    values = share.detach()
+    total = values.sum(-1)
+    if share.shape[-1:] != particles.shape or not bool((values >= 0).all() & ((total - 1).abs() < 1e-4).all()):
         raise ValueError(
             f"share: shape {tuple(share.shape)}, sums {total.tolist()}, wanted [..., {len(particles)}], numbers of at "
             "least 0 whose sum is 1"

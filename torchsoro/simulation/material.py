@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from dataclasses import dataclass
 
 import torch
@@ -16,13 +17,16 @@ _TABLE_S1 = ((6.36e-4, 2.73e-1), (2.09e-3, 7.56e-3), (1.27e-2, 2.09e-4), (1.25e-
 # -1.41 at the worst b for tension and compression, -1.32 for equibiaxial tension.
 SOFTEST = 1.3
 
+Number = float | Tensor  # a number, or a floating-point tensor without axes, which may require grad
+
 
 @dataclass(frozen=True, kw_only=True)
 class Solid:
     """Nearly incompressible solid, neo-Hookean (Eqs. 3-7) or Yeoh's; the defaults are the paper's printed resin.
 
     With stretch the shear modulus grows to mu (1 + a x + b x^2), x = I1b - 3 the first isochoric invariant less three:
-    Yeoh's law with C10 = mu / 2, C20 = a mu / 4 and C30 = b mu / 6. Moduli are those at rest.
+    Yeoh's law with C10 = mu / 2, C20 = a mu / 4 and C30 = b mu / 6. Moduli are those at rest. Every number may be a
+    tensor without axes; :func:`fill` carries its gradient to the particles.
 
     Attributes:
         youngs_modulus: Equilibrium Young's modulus [Pa].
@@ -32,24 +36,26 @@ class Solid:
         quadratic_stiffening: b.
 
     Raises:
-        ValueError: for a number that is not finite and positive, a Poisson ratio outside [0, 0.5), or stiffening with
-            which some stretch makes the solid softer than it bears: b < 0, or a < -1.3 sqrt(b). Above that, tested for
-            an incompressible solid, the stress grows with every stretch and shear.
+        ValueError: for a number that is not finite and positive, a Poisson ratio outside [0, 0.5), a tensor with axes
+            or of integers, or stiffening with which some stretch makes the solid softer than it bears: b < 0, or
+            a < -1.3 sqrt(b). Above that, tested for an incompressible solid, the stress grows with every stretch and
+            shear.
     """
 
-    youngs_modulus: float = 0.44e6
-    poisson_ratio: float = 0.4
-    density: float = 1070.0
-    linear_stiffening: float = 0.0
-    quadratic_stiffening: float = 0.0
+    youngs_modulus: Number = 0.44e6
+    poisson_ratio: Number = 0.4
+    density: Number = 1070.0
+    linear_stiffening: Number = 0.0
+    quadratic_stiffening: Number = 0.0
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         _positive("youngs_modulus", self.youngs_modulus)
         _positive("density", self.density)
-        if not 0 <= self.poisson_ratio < 0.5:
-            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: wanted at least 0 and less than 0.5")
-        a, b = self.linear_stiffening, self.quadratic_stiffening
+        poisson_ratio = value_of("poisson_ratio", self.poisson_ratio)
+        if not 0 <= poisson_ratio < 0.5:
+            raise ValueError(f"poisson_ratio = {poisson_ratio}: wanted at least 0 and less than 0.5")
+        a, b = (value_of(name, getattr(self, name)) for name in ("linear_stiffening", "quadratic_stiffening"))
         if not (math.isfinite(a) and 0 <= b < math.inf and a >= -SOFTEST * math.sqrt(b)):
             raise ValueError(
                 f"linear_stiffening, quadratic_stiffening = {a}, {b}: wanted a, b with b >= 0 and a >= -1.3 sqrt(b), "
@@ -57,19 +63,19 @@ class Solid:
             )
 
     @property
-    def shear(self) -> float:
+    def shear(self) -> Number:
         """Equilibrium shear modulus mu [Pa]."""
         return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
 
     @property
-    def bulk(self) -> float:
+    def bulk(self) -> Number:
         """Bulk modulus K [Pa]."""
         return self.youngs_modulus / (3 * (1 - 2 * self.poisson_ratio))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Gas:
-    """Air in a chamber (Eqs. 9-10); the defaults are the paper's.
+    """Air in a chamber (Eqs. 9-10); the defaults are the paper's. Every number may be a tensor, as those of a solid.
 
     Attributes:
         stiffness: k [Pa]; 0 for a regulated supply, 0.14 MPa for sealed air.
@@ -81,20 +87,21 @@ class Gas:
             apart: the pressure of a chamber is uniform, and air resists no distortion.
 
     Raises:
-        ValueError: for a number that is not finite or negative (density: not positive).
+        ValueError: for a number that is not finite or negative (density: not positive), or a tensor with axes or of
+            integers.
     """
 
-    stiffness: float = 0.14e6
-    viscosity: float = 1.83e-5
-    volume_viscosity: float = 0.0
-    density: float = 100.0
-    shear: float = 3e3
+    stiffness: Number = 0.14e6
+    viscosity: Number = 1.83e-5
+    volume_viscosity: Number = 0.0
+    density: Number = 100.0
+    shear: Number = 3e3
 
     def __post_init__(self) -> None:
         """Check the numbers."""
         _positive("density", self.density)
         for name in ("stiffness", "viscosity", "volume_viscosity", "shear"):
-            value = getattr(self, name)
+            value = value_of(name, getattr(self, name))
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name} = {value}: wanted finite and at least 0")
 
@@ -181,7 +188,9 @@ class Body:
         viscosity: [..., N] Pa s; 0 if None. Solids may have one too.
         volume_viscosity: [..., N] Pa s; 0 if None.
         void_fraction: Share of a solid's stress that comes from the law of void, which bears being turned inside out
-            [..., N], 0 to 1; 0 if None. See :func:`fill`.
+            [..., N], 0 to 1; 0 if None. See :func:`fill`. At exactly 0 its gradient is the one-sided derivative. At
+            exactly 1 it is zero, as of the steps of ``fill``: the solid's law, of which a particle of void has no
+            histories, is left out there.
         drag: Drag coefficient [..., N] N s/m; 0 if None.
         stiffening: a and b of a solid, by which mu grows to mu (1 + a x + b x^2) at x = I1b - 3 (see :class:`Solid`)
             [..., N, 2], of any sign; 0 if None, which is neo-Hookean. The Maxwell elements stiffen alike.
@@ -201,6 +210,21 @@ class Body:
     stiffening: Tensor | None = None
 
 
-def _positive(name: str, value: float) -> None:
+def value_of(name: str, number: Number) -> float:
+    """The value of a number; refuses what is none, or more than one."""
+    if isinstance(number, Tensor):
+        if number.ndim or not number.is_floating_point():
+            raise ValueError(
+                f"{name}: {number.dtype} of shape {tuple(number.shape)}, wanted a number, or a floating-point tensor "
+                "without axes"
+            )
+        return float(number.detach())
+    if isinstance(number, bool) or not isinstance(number, numbers.Real):
+        raise ValueError(f"{name} = {number!r}: wanted a number")
+    return float(number)
+
+
+def _positive(name: str, number: Number) -> None:
+    value = value_of(name, number)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} = {value}: wanted finite and positive")

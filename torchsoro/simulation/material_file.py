@@ -43,7 +43,7 @@ def write_material(path: Path, material: Material) -> Path:
     """
     lines = ["# A material for torchsoro. Moduli of the Maxwell elements are relative to the equilibrium modulus.", ""]
     lines.append(f"left_out = {_quoted(material.left_out)}")
-    lines += ["", "[solid]", *(f"{key} = {getattr(material.solid, name)!r}" for key, name in _SOLID.items())]
+    lines += ["", "[solid]", *(f"{key} = {float(getattr(material.solid, name))!r}" for key, name in _SOLID.items())]
     order = material.prony.times.detach().argsort(descending=True)
     for modulus, time in zip(
         material.prony.moduli.detach()[order].tolist(), material.prony.times.detach()[order].tolist(), strict=True

@@ -22,7 +22,7 @@ from torchsoro.simulation.assembly import (
     on_lattice,
     supply_at,
 )
-from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.contact import Plane, check_offsets
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Load, attach
 from torchsoro.simulation.material import Body, Prony
@@ -227,6 +227,8 @@ class Simulator(nn.Module):
         if self.dt != "auto":
             steps, every = _steps(duration, sample_every, self.dt)
         check_body(body)
+        if self.formulation == "updated":
+            check_offsets(planes)
         if start is None:
             self._check_inside(x)
         dt = self.step(body, prony, duration=duration, sample_every=sample_every, loads=loads)

@@ -156,7 +156,7 @@ def void_piola(F, shear):
 
 @ti.func
 def void_piola_adjoint(F, shear, P_bar):
-    """Adjoint of :func:`void_piola`: gradients by F and shear modulus."""
+    """Adjoint of :func:`void_piola`: the gradient by F."""
     cof = cofactor(F)
     J = contract(cof, F) / 3
     slope = 2 - J
@@ -165,8 +165,18 @@ def void_piola_adjoint(F, shear, P_bar):
         slope = 1 / J
         curvature = -slope * slope
     along = contract(P_bar, cof)
-    F_bar = shear * (P_bar - slope * cross(F, P_bar) - (curvature * along) * cof)
-    return F_bar, contract(P_bar, F) - slope * along
+    return shear * (P_bar - slope * cross(F, P_bar) - (curvature * along) * cof)
+
+
+@ti.func
+def void_work(F, P_bar):
+    """P : P_bar for the stress P of void of unit shear modulus: the gradient of :func:`void_piola` by that modulus."""
+    cof = cofactor(F)
+    J = contract(cof, F) / 3
+    slope = 2 - J
+    if J > 1:
+        slope = 1 / J
+    return contract(P_bar, F) - slope * contract(P_bar, cof)
 
 
 @ti.func
@@ -182,7 +192,10 @@ def piola(F, Q, bulk, shear, factor, void_fraction):
 
 @ti.func
 def piola_adjoint(F, Q, bulk, shear, factor, void_fraction, P_bar):
-    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, factor and void_fraction."""
+    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, factor and void_fraction.
+
+    At a void fraction of exactly 0 the last is the derivative from above; at exactly 1 it is 0.
+    """
     F_bar = F * 0
     Q_bar = F * 0
     bulk_bar = shear * 0
@@ -196,14 +209,11 @@ def piola_adjoint(F, Q, bulk, shear, factor, void_fraction, P_bar):
         F_bar, Q_bar = (1 - void_fraction) * by_F, (1 - void_fraction) * by_Q
         bulk_bar, shear_bar = (1 - void_fraction) * by_bulk, (1 - void_fraction) * by_shear
         factor_bar = (1 - void_fraction) * by_factor
-        if void_fraction > 0:
-            void_bar -= bulk * by_bulk + shear * by_shear  # the law is linear in its moduli
+        # Both laws are linear in their moduli.
+        void_bar = shear * void_work(F, P_bar) - (bulk * by_bulk + shear * by_shear)
     if void_fraction > 0:
-        by_F, by_shear = void_piola_adjoint(F, shear, P_bar)
-        F_bar += void_fraction * by_F
-        shear_bar += void_fraction * by_shear
-        if void_fraction < 1:
-            void_bar += shear * by_shear
+        F_bar += void_fraction * void_piola_adjoint(F, shear, P_bar)
+        shear_bar += void_fraction * void_work(F, P_bar)
     return F_bar, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar
 
 

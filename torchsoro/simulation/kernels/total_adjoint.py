@@ -106,6 +106,7 @@ from torchsoro.simulation.kernels.stress import (
     stiffening_adjoint,
     viscous_piola_adjoint,
     void_piola_adjoint,
+    void_work,
 )
 from torchsoro.simulation.kernels.surface import meet_adjoint, surface_spread
 from torchsoro.simulation.kernels.tensor import (
@@ -414,7 +415,7 @@ def total_substep_adjoint(
                         step = t * ints[BATCH] * ints[CHAMBERS] + one
                         p_act, swelled = supply[ints[PRESSURE] + step], kept[ints[VOLUMES] + step]
                         pressure = chamber_pressure(ints, fixed, p_act, swelled, one)
-                        by_F, shear_bar = void_piola_adjoint(F, shear, P_bar)
+                        by_F, shear_bar = void_piola_adjoint(F, shear, P_bar), void_work(F, P_bar)
                         p_bar = -contract(P_bar, cof)
                         F_bar = by_F - pressure * cross(F, P_bar)
                         work = shear * shear_bar + pressure * p_bar
