@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import atexit
 import functools
-import os
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
-import torch
-
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")
-
 import taichi as ti
+import torch
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 P = ParamSpec("P")
