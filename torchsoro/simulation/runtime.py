@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
+import io
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
@@ -69,7 +71,8 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
         options["device_memory_GB"] = 0.3
         # Taichi would start thousands of blocks for every loop, most of them empty.
         options["saturating_grid_dim"] = 4 * torch.cuda.get_device_properties(0).multi_processor_count
-    ti.init(arch=ti.cuda if kind == "cuda" else ti.cpu, offline_cache=True, log_level=ti.WARN, **options)
+    with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints the device that it starts on
+        ti.init(arch=ti.cuda if kind == "cuda" else ti.cpu, offline_cache=True, log_level=ti.WARN, **options)
     _started = kind
 
 
