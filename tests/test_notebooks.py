@@ -1,4 +1,4 @@
-"""The notebooks run from top to bottom: losses fall, a fitted ball bounces less, an effect of one's own is found."""
+"""The notebooks run: travel grows, losses fall, a fitted ball bounces less, an effect of one's own is found."""
 
 from __future__ import annotations
 
@@ -25,11 +25,26 @@ def executed(name, last, monkeypatch, folder):
 
 
 @pytest.mark.notebook
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_cube_that_is_designed_travels_farther_and_becomes_a_watertight_part(monkeypatch, tmp_path):
+    monkeypatch.setenv("TORCHSORO_NOTEBOOK_STEPS", "3")
+    last = "print(way[-1] - way[0], grey[0] - grey[-1], part.report.watertight)"
+    notebook = executed("01_design_a_walker.ipynb", last, monkeypatch, tmp_path)
+    farther, less_grey, watertight = notebook.cells[-1].outputs[-1].text.split()
+    assert float(farther) > 0
+    assert float(less_grey) > 0
+    assert watertight == "True"
+    assert (tmp_path / "walker.stl").stat().st_size > 1000
+
+
+@pytest.mark.notebook
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")  # those of the kernel's client are not ours
 def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHSORO_NOTEBOOK_STEPS", "4")
     losses = "print(volume_loss[-1] / volume_loss[0], bend_loss[-1] - bend_loss[0])"
-    notebook = executed("01_compose_with_torch.ipynb", losses, monkeypatch, tmp_path)
+    notebook = executed("04_compose_with_torch.ipynb", losses, monkeypatch, tmp_path)
     ratio, change = map(float, notebook.cells[-1].outputs[-1].text.split())
     assert ratio < 0.8
     assert change < -0.01
@@ -38,10 +53,11 @@ def test_networks_of_pressure_and_density_learn_through_the_simulator(monkeypatc
 
 
 @pytest.mark.notebook
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHSORO_NOTEBOOK_CELLS", "4")
-    notebook = executed("02_from_sweep_to_bounce.ipynb", "print(*restitution)", monkeypatch, tmp_path)
+    notebook = executed("02_from_rheometer_to_material.ipynb", "print(*restitution)", monkeypatch, tmp_path)
     restitution = list(map(float, notebook.cells[-1].outputs[-1].text.split()))
     assert len(restitution) == 6
     assert restitution[0] > 0.85  # four cells across the ball are few
@@ -50,12 +66,13 @@ def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, t
 
 
 @pytest.mark.notebook
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_an_effect_of_ones_own_is_found_among_those_of_the_package(monkeypatch, tmp_path):
     said = (
         "print(first.ranking[0].fit.name, first.ranking[0].score, second.kind, second.chosen[0].score, fit.name, value)"
     )
-    notebook = executed("03_why_it_moves_differently.ipynb", said, monkeypatch, tmp_path)
+    notebook = executed("03_explain_a_recording.ipynb", said, monkeypatch, tmp_path)
     nearest, score, kind, higher, name, value = notebook.cells[-1].outputs[-1].text.split()
     assert (nearest, kind, name) == ("tether", "explained", "eddy_brake")
     assert float(higher) > float(score) + 5.0  # one number instead of six
