@@ -66,6 +66,7 @@ def main(options: Options) -> Path | None:
             cannot be written to.
     """
     from torchsoro.output import archive
+    from torchsoro.storage import check_folder
 
     if not options.robot:
         print("\n".join(archive.names()))
@@ -73,6 +74,9 @@ def main(options: Options) -> Path | None:
     width, height = parse_resolution(options.resolution)
     if options.pictures < 2:
         raise ValueError(f"pictures = {options.pictures}: wanted at least 2")
+    for name in ("page", "animation"):
+        if (path := getattr(options, name)) is not None:
+            check_folder(name, path.parent, [path.name])
     motion = find_motion(options.robot)
     if options.page is not None:
         from torchsoro.output.web_page import write_page

@@ -116,6 +116,8 @@ def test_the_help_names_every_setting_with_its_words_and_keeps_commands_on_their
         *[(name, bad) for name in ("duration", "frequency", "learning_rate", "dt") for bad in (0.0, -1.0, math.nan)],
         *[(name, 0) for name in ("iterations", "window", "gravity_every", "picture_every", "shape_every", "frames")],
         *[(name, -1) for name in ("gravity_steps", "halvings", "patience")],
+        *[("resolution", bad) for bad in ("", "960", "961x640", "960x100", "-960x640", "960x99999")],
+        *[("fps", bad) for bad in (0, 121)],
         *[("c_max", bad) for bad in (0.0, 0.25, math.nan)],
         ("settle", 0.0100625),  # half a substep too long
         ("duration", 0.0200625),

@@ -240,6 +240,8 @@ def test_view_names_what_is_missing_taken_or_out_of_range(view, motion, tmp_path
     assert "host = '192.0.2.1'" in refused(view, capsys, run, "--host", "192.0.2.1")
     assert "resolution = '12'" in refused(view, capsys, run, "--animation", "x.gif", "--resolution", "12")
     assert "pictures = 1" in refused(view, capsys, run, "--pictures", "1")
+    assert "is a file, wanted a folder" in refused(view, capsys, run, "--page", str(tmp_path / "motion.npz" / "x.html"))
+    assert "wanted no folder of a result's name" in refused(view, capsys, run, "--animation", str(tmp_path / "bare"))
     assert "want an .html file" in refused(view, capsys, run, "--page", str(tmp_path / "no" / "x.html"))
 
 

@@ -9,7 +9,7 @@ import meshio
 import numpy as np
 
 from torchsoro.output.motion import Motion
-from torchsoro.storage import atomic_write
+from torchsoro.storage import atomic_write, check_folder
 
 # Corners of a hexahedron in VTK's order, as offsets on the lattice.
 _CORNERS = np.array(
@@ -50,15 +50,13 @@ def export_vtu(motion: Motion, folder: str | os.PathLike[str]) -> Path:
         The .pvd file, which is written last.
 
     Raises:
-        ValueError: if the folder cannot be made, or the motion has one sample only.
+        ValueError: if the folder cannot be written to, or the motion has one sample only.
     """
     target = Path(folder)
     if len(motion.time) < 2:
         raise ValueError("motion: got one sample, wanted at least two, of which a speed can be had")
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ValueError(f"folder: cannot make {target} ({error.strerror}), wanted a folder to write to") from error
+    check_folder("folder", target, [f"{motion.name}.pvd"])
+    target.mkdir(parents=True, exist_ok=True)
     kept, cells = hexahedra(motion)
     modes = motion.modes[:, kept]
     speeds = np.gradient(motion.shift, motion.time, axis=0), np.gradient(motion.amplitude, motion.time, axis=0)

@@ -1,10 +1,9 @@
 """Movies, a one-page summary and single views of a design in motion.
 
 No display and no GPU: triangles are culled, shaded and sorted by depth in orthographic projection, and Matplotlib
-paints
-them as one flat collection, in some tens of milliseconds a frame. The up axis z is always vertical on the page. Camera
-angles follow Matplotlib: azimuth -90 degrees looks along +y, so +x points to the right; elevation 90 degrees looks
-down. Everything passed in is in SI units; everything drawn is in mm from the lower corner of the body at rest.
+paints them as one flat collection, in some tens of milliseconds a frame. The up axis z is always vertical on the page.
+Camera angles follow Matplotlib: azimuth -90 degrees looks along +y, so +x points to the right; elevation 90 degrees
+looks down. Everything passed in is in SI units; everything drawn is in mm from the lower corner of the body at rest.
 """
 
 from __future__ import annotations
