@@ -66,10 +66,12 @@ def main(options: Options) -> Path | None:
             cannot be written to.
     """
     from torchsoro.output import archive
+    from torchsoro.output.motion import FILE
     from torchsoro.storage import check_folder
 
     if not options.robot:
-        print("\n".join(archive.names()))
+        for name in archive.names():
+            print(name if (archive.DESIGNS / name / FILE).is_file() else f"{name} (without motion)")
         return None
     width, height = parse_resolution(options.resolution)
     if options.pictures < 2:

@@ -245,6 +245,18 @@ def test_view_names_what_is_missing_taken_or_out_of_range(view, motion, tmp_path
     assert "want an .html file" in refused(view, capsys, run, "--page", str(tmp_path / "no" / "x.html"))
 
 
+def test_view_without_a_robot_lists_those_that_are_archived_and_which_have_no_motion(
+    view, tmp_path, monkeypatch, capsys
+):
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "design.npz").touch()
+    (tmp_path / "one" / "motion.npz").touch()
+    monkeypatch.setattr("torchsoro.output.archive.DESIGNS", tmp_path)
+    view.cli([])
+    assert capsys.readouterr().out == "one\ntwo (without motion)\n"
+
+
 def test_view_writes_page_export_and_animation(view, motion, tmp_path):
     motion.save(tmp_path / "motion.npz")
     run = str(tmp_path / "motion.npz")

@@ -284,7 +284,7 @@ def read_motion(path: str | os.PathLike[str]) -> Motion:
     if not file.is_file():
         raise ValueError(
             f"path: there is no {file}, wanted the motion of a finished run; recipes/replay.py simulates the robot "
-            f"again and writes it"
+            f"again and writes it to its --out"
         )
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as stored:
