@@ -188,6 +188,13 @@ def test_the_sentence_names_what_is_not_stable():
     assert "even the equilibrium spring is not stable" in paper(1e-4).sentence
 
 
+def test_a_series_without_elements_loses_nothing():
+    elastic = budget(Prony.paper(0), Solid(), cell=1.75e-3, band=BAND)
+    assert (elastic.elements[0].storage_lost, elastic.elements[0].loss_lost) == (0.0, 0.0)
+    only = choose(elastic)
+    assert (len(only.moduli), only.storage_error, only.loss_error) == (0, 0.0, 0.0)
+
+
 def test_the_picture_has_every_curve(tmp_path):
     spent = paper(2e-5)
     materials = substitutes(spent, match=BAND[1])[1:]

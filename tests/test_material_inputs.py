@@ -106,6 +106,7 @@ class Captured:
         (edited(5, 0, table()[4][0]), (), r"lines 5 and 6: omega .* twice in one curve, wanted once"),
         (edited(0, 0, "omega (Hz)"), (), "an angular frequency in Hz; wanted rad/s.*--units frequency rad/s"),
         (edited(0, 1, "G_storage"), (), "no unit, wanted one of 'Pa'.*--units storage Pa"),
+        (text(table()[:4]), (), "3 points, wanted at least 5"),
         (text(table()[:1]), (), "no rows of data under the header"),
         (text(table()), ("--horizon", "-1"), "horizon = -1.0: wanted finite and positive"),
         (text(table()), ("--reference", "nan"), "reference = nan: wanted finite and above -273.15 deg C"),

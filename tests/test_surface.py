@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from torchsoro.design.mesh import Surface, read_surface
 from torchsoro.sim2real.data.experiment import read_experiment
-from torchsoro.sim2real.data.surface import Surface, read_surface
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.twin.ensemble import SAFETY, Ensemble

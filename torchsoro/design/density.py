@@ -53,7 +53,8 @@ def fill(
 
     Args:
         domain: Lattice and regions.
-        gamma: Density of every particle [..., N]; differentiable. Gas particles ignore theirs.
+        gamma: Density of every particle [..., N]; differentiable. Gas particles and those outside of the body
+            ignore theirs.
         solid: The printed material; its numbers may require grad.
         gas: The chambers' gas; the paper's if None. Its numbers may require grad.
         epsilon: See :func:`simp`.
@@ -81,6 +82,8 @@ def fill(
     gas = gas or Gas()
     like = {"dtype": gamma.dtype, "device": gamma.device}
     air = (domain.region == Region.GAS).to(gamma.device)
+    if domain.body is not None:
+        gamma = gamma.masked_fill(domain.outside.to(gamma.device), 0.0)
     scale = simp(gamma, epsilon=epsilon, power=power)
     zero = torch.zeros((), **like)
     void = None if void_range is None else torch.where(air, zero, _void(gamma, *void_range))

@@ -1,4 +1,6 @@
-"""The undeformed robot: a box body on a regular particle lattice, with air chambers cut into it.
+"""The undeformed robot: a body on a regular particle lattice, with air chambers cut into it.
+
+Body and chambers are boxes, or of closed surfaces (``torchsoro.design.mesh``).
 
 Everything is in SI units, z points up, and all positions (the body's, the chambers', a marker's) share one frame.
 Particles are numbered with z fastest: ``index = (ix * ny + iy) * nz + iz``.
@@ -8,16 +10,21 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import functools
 import itertools
 import math
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from torchsoro.design.mesh import Surface, check_fit, lined
 
 _ON_PLANE = 1e-6  # how far a chamber face may be from a lattice plane, in particle spacings
 _CUBIC = 1e-9  # relative difference allowed between the spacings along the three axes
 _AXES = ("x", "y", "z")
+_NOT_GIVEN = (math.nan, math.nan, math.nan)
 
 Box = tuple[tuple[int, int, int], tuple[int, int, int]]  # lower and upper lattice planes
 
@@ -31,32 +38,45 @@ class Region(enum.IntEnum):
     """Chamber wall: always solid."""
     GAS = 2
     """Air inside a chamber."""
+    OUTSIDE = 3
+    """Of the lattice, but not of the body: always void."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Chamber:
-    """A box-shaped pneumatic actuator: air enclosed in a wall of constant thickness.
+    """A pneumatic actuator: air enclosed in a wall of constant thickness.
 
     Args:
         name: Name of the chamber, unique within its domain.
-        center: Centre in the frame of the body, m.
-        size: Outer edge lengths, wall included, m.
-        wall: Wall thickness, m.
+        center: Centre of a box in the frame of the body, m; follows from ``shape`` if that is given.
+        size: Outer edge lengths of a box, wall included, m; of the box around ``shape`` and its wall.
+        wall: Wall thickness, m; around a shape, whole layers of particles of at least that.
+        shape: Closed surface of the air in the frame of the body, instead of a box.
 
     Raises:
         ValueError: A length is not positive and finite, there is no wall, or the wall leaves no room for air.
     """
 
     name: str
-    center: tuple[float, float, float]
-    size: tuple[float, float, float]
+    center: tuple[float, float, float] = _NOT_GIVEN
+    size: tuple[float, float, float] = _NOT_GIVEN
     wall: float
+    shape: Surface | None = None
 
     def __post_init__(self) -> None:
         """Check the lengths on their own; their fit on the lattice is the domain's to check."""
         if not isinstance(self.name, str) or not self.name:
             raise ValueError(f"name: got {self.name!r}, want a non-empty string")
         where = f"chamber {self.name!r}"
+        if self.shape is not None:
+            if not (self.center is _NOT_GIVEN and self.size is _NOT_GIVEN):
+                raise ValueError(f"{where}: center, size: got {self.center}, {self.size} with a shape, want neither")
+            if not (math.isfinite(self.wall) and self.wall > 0.0):
+                raise ValueError(f"{where}: wall: got {self.wall!r} m: a chamber without wall, want a thickness > 0")
+            corner, edges = self.shape.origin, self.shape.size
+            object.__setattr__(self, "center", tuple(o + e / 2 for o, e in zip(corner, edges, strict=True)))
+            object.__setattr__(self, "size", tuple(e + 2 * self.wall for e in edges))
+            return
         object.__setattr__(self, "center", _triple(f"{where}: center", self.center))
         object.__setattr__(self, "size", _triple(f"{where}: size", self.size, positive=True))
         if not (math.isfinite(self.wall) and self.wall > 0.0):
@@ -70,7 +90,7 @@ class Chamber:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Domain:
-    """A box body filled with a regular lattice of particles, two per axis and grid cell, cell-centred.
+    """A box filled with a regular lattice of particles, two per axis and grid cell, cell-centred.
 
     Tensors are made on first use, live on the CPU, and are shared: do not write to them.
 
@@ -78,7 +98,9 @@ class Domain:
         size: Edge lengths of the body, m.
         particles: Number of particles along x, y, z. The spacing must come out equal along the three axes.
         origin: Lower corner of the body, m.
-        chambers: Air chambers. Every face, inner and outer, lies on a lattice plane.
+        chambers: Air chambers. Every face of a box, inner and outer, lies on a lattice plane; of a shape, the particles
+            whose centres lie inside are air.
+        body: Closed surface of the body within the box; the whole box if None.
 
     Raises:
         ValueError: A length or count is not positive and finite; the spacing is not cubic; a chamber leaves the body,
@@ -97,6 +119,7 @@ class Domain:
     particles: tuple[int, int, int]
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     chambers: tuple[Chamber, ...] = ()
+    body: Surface | None = None
 
     def __post_init__(self) -> None:
         """Check that body, lattice and chambers fit together."""
@@ -114,14 +137,17 @@ class Domain:
                 f"particles: got {counts} on a body of {self.size} m, a spacing of "
                 f"{tuple(float(f'{h:.6g}') for h in spacings)} m, want the same spacing along the three axes"
             )
+        if self.body is not None:
+            check_fit("body", self.body, self.origin, self.size, self.spacing)
         for chamber in self.chambers:
             if not isinstance(chamber, Chamber):
                 raise ValueError(f"chambers: got {chamber!r}, want Chamber objects")
-            self._cavity(chamber)
+            if not self._masks(chamber)[1].any():
+                raise ValueError(f"chambers: chamber {chamber.name!r} holds no particle, want more particles")
         for one, other in itertools.combinations(self.chambers, 2):
             if one.name == other.name:
                 raise ValueError(f"chambers: got two named {one.name!r}, want unique names")
-            if _overlap(self._shell(one), self._shell(other)):
+            if (self._masks(one)[0] & self._masks(other)[0]).any():
                 raise ValueError(f"chambers: got {one.name!r} overlapping {other.name!r}, want them apart")
 
     # The lattice ------------------------------------------------------------------------------------------------
@@ -166,9 +192,11 @@ class Domain:
     def region(self) -> Tensor:
         """What each particle is made of, a :class:`Region` value, int64 [N]."""
         region = torch.full(self.shape, int(Region.DESIGN), dtype=torch.int64)
+        region[~torch.from_numpy(self._filled)] = int(Region.OUTSIDE)
         for chamber in self.chambers:
-            region[_slices(self._shell(chamber))] = int(Region.WALL)
-            region[_slices(self._cavity(chamber))] = int(Region.GAS)
+            shell, cavity = self._masks(chamber)
+            region[torch.from_numpy(shell)] = int(Region.WALL)
+            region[torch.from_numpy(cavity)] = int(Region.GAS)
         return region.flatten()
 
     @cached_property
@@ -176,7 +204,7 @@ class Domain:
         """For a gas particle the index of its chamber in ``chambers``, for every other one -1; int32 [N]."""
         chamber = torch.full(self.shape, -1, dtype=torch.int32)
         for index, one in enumerate(self.chambers):
-            chamber[_slices(self._cavity(one))] = index
+            chamber[torch.from_numpy(self._masks(one)[1])] = index
         return chamber.flatten()
 
     @cached_property
@@ -193,6 +221,11 @@ class Domain:
     def gas(self) -> Tensor:
         """Which particles are air, bool [N]."""
         return self.region == Region.GAS
+
+    @cached_property
+    def outside(self) -> Tensor:
+        """Which particles of the lattice are no part of the body, bool [N]."""
+        return self.region == Region.OUTSIDE
 
     # Views and look-ups -----------------------------------------------------------------------------------------
 
@@ -251,6 +284,44 @@ class Domain:
 
     # Chambers on the lattice ------------------------------------------------------------------------------------
 
+    @cached_property
+    def _filled(self) -> np.ndarray:
+        """Which particles the body has, bool [nx, ny, nz]."""
+        return np.ones(self.shape, bool) if self.body is None else self._inside(self.body)
+
+    def _inside(self, surface: Surface) -> np.ndarray:
+        """Which particles' centres lie inside of a surface, bool [nx, ny, nz]."""
+        axes = [start + (np.arange(n) + 0.5) * self.spacing for start, n in zip(self.origin, self.shape, strict=True)]
+        return surface.filled(*axes)
+
+    @functools.lru_cache(maxsize=32)  # noqa: B019  # a domain lives as long as its program
+    def _masks(self, chamber: Chamber) -> tuple[np.ndarray, np.ndarray]:
+        """Particles of a chamber with its wall, and those of its air, bool [nx, ny, nz]; checks that they fit."""
+        where = f"chambers: chamber {chamber.name!r}"
+        if chamber.shape is None:
+            shell, cavity = np.zeros(self.shape, bool), np.zeros(self.shape, bool)
+            shell[_slices(self._shell(chamber))] = True
+            cavity[_slices(self._cavity(chamber))] = True
+        else:
+            check_fit(f"{where}: shape", chamber.shape, self.origin, self.size, self.spacing)
+            if chamber.wall < self.spacing * (1 - _CUBIC):
+                raise ValueError(
+                    f"{where}: wall: got {chamber.wall} m, want at least one spacing ({self.spacing:.6g} m)"
+                )
+            cavity = self._inside(chamber.shape)
+            around = lined(cavity, chamber.wall / self.spacing)
+            pad = (around.shape[0] - self.shape[0]) // 2
+            shell = around[pad:-pad, pad:-pad, pad:-pad]
+            if around.sum() > shell.sum():
+                raise ValueError(
+                    f"{where}: shape: got a wall of {chamber.wall} m that leaves the domain, want it inside"
+                )
+        if (shell & ~self._filled).any():
+            raise ValueError(
+                f"{where}: got {int((shell & ~self._filled).sum())} particles outside of the body, want none"
+            )
+        return shell, cavity
+
     def _shell(self, chamber: Chamber) -> Box:
         """Lattice planes of the outer faces of a chamber."""
         return self._planes(chamber, 0.0)
@@ -300,11 +371,6 @@ def _triple(name: str, values: tuple[float, float, float], *, positive: bool = F
     if not all(math.isfinite(value) and (value > 0.0 or not positive) for value in (x, y, z)):
         raise ValueError(f"{name}: got {values!r}, want {want}")
     return x, y, z
-
-
-def _overlap(one: Box, other: Box) -> bool:
-    """Whether two lattice boxes share a particle."""
-    return all(max(one[0][axis], other[0][axis]) < min(one[1][axis], other[1][axis]) for axis in range(3))
 
 
 def _slices(box: Box) -> tuple[slice, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 from torchsoro.design.density import AIR, fill, without_void
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.field import DesignField
+from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
 from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.errors import SimulationDiverged
@@ -71,11 +73,15 @@ class Robot(nn.Module):
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
         center = (0.0, 0.0, s.size[2] / 2)
+        inside: dict[str, Any] = {"center": center, "size": s.chamber}
+        if s.chamber_mesh is not None:
+            inside = {"shape": read_surface(s.chamber_mesh, UNITS[s.mesh_unit])}
         self.domain = Domain(
             size=s.size,
             particles=s.particles,
             origin=(-half[0], -half[1], 0.0),
-            chambers=(Chamber(name="chamber", center=center, size=s.chamber, wall=s.wall),),
+            chambers=(Chamber(name="chamber", wall=s.wall, **inside),),
+            body=None if s.body_mesh is None else read_surface(s.body_mesh, UNITS[s.mesh_unit]),
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)

@@ -53,6 +53,12 @@ class Settings:
     """Outer edges of the air chamber in the middle [m]."""
     wall: _Length = 0.00175
     """Thickness of the chamber wall [m]."""
+    body_mesh: Path | None = None
+    """Closed surface of the body within ``size``, whose lower face is at z = 0 and centred at x = y = 0: STL or MSH."""
+    chamber_mesh: Path | None = None
+    """Closed surface of the chamber's air, in place of ``chamber``; a wall of ``wall`` is laid around it."""
+    mesh_unit: Literal["m", "cm", "mm", "um", "in"] = "mm"
+    """Unit of both meshes."""
     room: AtLeastZero = 0.07
     """Space around the body in the analysis box [m]."""
 
@@ -179,7 +185,7 @@ class Settings:
                 f"offset = {self.offset:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
             )
         cavity = min(self.chamber) - 2 * self.wall
-        if self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
+        if self.chamber_mesh is None and self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
             low = 0.05 * cavity
             raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
         for flags in (("resume", "overwrite"), ("amend", "overwrite")):

@@ -240,6 +240,6 @@ def print_part(robot: Robot, density: np.ndarray) -> Part:
     """The printable part, with an air port at the rear: against the travel, or downward for a climber."""
     s = robot.settings
     rear = tuple(-d for d in robot.direction)
-    cavity = min(c - 2 * s.wall for c in s.chamber)
+    cavity = min(c - 2 * s.wall for c in robot.domain.chambers[0].size)
     port = AirPort(direction=(rear[0], rear[1], rear[2]), diameter=s.port or 0.4 * cavity)
     return fabricate(robot.domain, density, density=s.density, offset=s.offset, port=port)

@@ -315,7 +315,7 @@ def _density(domain: Domain, gamma: Any) -> np.ndarray:
         raise ValueError(f"gamma: got {int((~np.isfinite(values)).sum())} numbers that are not finite, want 0 to 1")
     if values.min() < -1e-3 or values.max() > 1 + 1e-3:
         raise ValueError(f"gamma: got {values.min():.4g} to {values.max():.4g}, want 0 to 1")
-    return values
+    return np.where(as_array(domain.outside), 0.0, values)
 
 
 def _check_port(domain: Domain, port: AirPort) -> None:

@@ -200,7 +200,7 @@ def budget(
     for k, step in enumerate(steps):
         number = courant_number(solid, float(felt[:k].sum()), dt=dt, cell=cell, formulation=formulation)
         kept = slice(k - 1 if k else len(moduli))
-        lost = 1 - moduli_over(moduli[kept], times[kept], omega) / full
+        lost = 1 - _over(moduli_over(moduli[kept], times[kept], omega), full)
         rows.append(
             Element(
                 number=k,
@@ -340,13 +340,18 @@ def _omega(band: tuple[float, float]) -> np.ndarray:
     return np.geomspace(*band, max(2, math.ceil(_POINTS * math.log10(band[1] / band[0]))))
 
 
+def _over(moduli: np.ndarray, full: np.ndarray) -> np.ndarray:
+    """Moduli over those of the full series; 1 where both are zero, as the loss modulus without elements."""
+    return np.divide(moduli, full, out=np.where(moduli > 0, np.inf, 1.0), where=full > 0)
+
+
 def _material(name: str, budget: Budget, moduli: np.ndarray, times: np.ndarray, viscosity: float = 0.0) -> Material:
     low, high = budget.band
     below, above = _omega((1e-6 * low, low)), _omega((high, 1e6 * high))
     omega = np.concatenate([below[:-1], _omega(budget.band), above[1:]])
     full = moduli_over(budget.moduli, budget.times, omega)
     here = moduli_over(moduli, times, omega, viscosity / float(budget.solid.shear))
-    off = np.abs(here / full - 1)
+    off = np.abs(_over(here, full) - 1)
     storage, loss = (float(v) for v in off[:, (omega >= low) & (omega <= high)].max(axis=1))
     bad, middle = omega[(off > 0.1).any(axis=0)], math.sqrt(low * high)
     good = float(bad[bad <= middle].max(initial=0.0)), float(bad[bad >= middle].min(initial=math.inf))

@@ -17,6 +17,7 @@ from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 from torchsoro.rheology.residuals import relative_residuals
 
 BEYOND = 100.0  # factor beyond the data to which relaxation times are tried
+LEAST = 5  # points of all curves: fewer determine neither an element nor the noise
 POINTS = 200  # of a curve that are looked at, at most
 SWAPPED = 0.5  # share of the residual below which storage and loss fit the other way round
 POOR = 0.15  # root mean square of relative residuals from which on a fit is reported as poor
@@ -43,9 +44,13 @@ def check_curves(where: str, curves: Sequence[Sweep] | Sequence[Relaxation] | Se
         curves: Isothermal curves.
 
     Raises:
-        ValueError: for frequencies, times or moduli that no experiment has; storage and loss modulus that fit only when
-            swapped; and curves that the best spectrum misses by more than half of their values (root mean square).
+        ValueError: for fewer than five points; frequencies, times or moduli that no experiment has; storage and loss
+            modulus that fit only when swapped; and curves that the best spectrum misses by more than half of their
+            values (root mean square).
     """
+    count = sum(len(getattr(curve, curve.axis)) for curve in curves)
+    if count < LEAST:
+        raise ValueError(f"{where}: {count} points, wanted at least {LEAST}")
     for curve in curves:
         at = f"{where}: the curve at {curve.temperature:.4g} deg C" if math.isfinite(curve.temperature) else where
         moduli = 1 / curve.compliance if isinstance(curve, Creep) else getattr(curve, curve.ordinates[0])

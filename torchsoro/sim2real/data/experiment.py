@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from torchsoro.design.mesh import Surface, read_surface
 from torchsoro.sim2real.data.recording import Recording, brief, read_table
 from torchsoro.sim2real.data.schema import (
     LENGTH,
@@ -35,7 +36,6 @@ from torchsoro.sim2real.data.schema import (
     read_tables,
     validated,
 )
-from torchsoro.sim2real.data.surface import Surface, read_surface
 from torchsoro.simulation.actuation import Waveform
 
 SHORTEST = 0.03  # s, three times the standard deviation of a clock's offset

@@ -1,4 +1,4 @@
-"""Bodies that are no boxes: a closed surface, where it has flat faces, and what lies inside of it."""
+"""Closed surfaces from files: where they have flat faces, what lies inside, and whether they fit on a lattice."""
 
 from __future__ import annotations
 
@@ -7,11 +7,17 @@ import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
+import meshio
 import numpy as np
 import trimesh
+from scipy import ndimage
 
 FLAT = 0.999  # cosine of the angle to an axis, above which a triangle lies across it
 WIDE = 0.05  # of the area of the body's box across an axis, from which on faces at one place count
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # [m]; a file of triangles states none
+SAMPLES = 400  # points of a surface at which its thickness is measured
+THIN = 0.1  # share of them that may be thinner than a lattice spacing: at sharp edges every body is
+BESIDE = 0.75  # beyond the wall's thickness [spacings], so that a layer covers edges and corners, too
 SHARP = 0.5  # rad between two triangles, from which on their edge is drawn
 
 
@@ -85,7 +91,7 @@ def read_surface(path: Path, scale: float = 1.0, origin: tuple[float, float, flo
     """Read a closed surface.
 
     Args:
-        path: STL, OBJ or PLY file.
+        path: STL, OBJ or PLY file; or gmsh's .msh, of triangles, or of tetrahedra whose outside is taken.
         scale: Metres for each unit of the file.
         origin: Where the lower corner of its box is to be [m]; where it is in the file if None.
 
@@ -103,9 +109,9 @@ def read_surface(path: Path, scale: float = 1.0, origin: tuple[float, float, flo
 @functools.lru_cache(maxsize=4)
 def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, float] | None) -> Surface:
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = _gmsh(path) if path.suffix.lower() == ".msh" else trimesh.load_mesh(path)
     except Exception as error:  # whatever the reader of that format raises
-        raise ValueError(f"{path}: {error}; wanted a surface as STL, OBJ or PLY") from error
+        raise ValueError(f"{path}: {error}; wanted a surface as STL, OBJ, PLY or MSH") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise ValueError(f"{path}: holds no surface, wanted triangles")
     if not mesh.is_watertight:
@@ -114,3 +120,74 @@ def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, flo
     if origin is not None:
         mesh.apply_translation(np.array(origin) - mesh.bounds[0])
     return Surface(mesh=mesh)
+
+
+def _gmsh(path: Path) -> trimesh.Trimesh:
+    """The triangles of a mesh of gmsh, or the faces that only one of its tetrahedra has."""
+    mesh = meshio.read(path)
+    faces = mesh.get_cells_type("triangle")
+    if not len(faces) and len(tetrahedra := mesh.get_cells_type("tetra")):
+        sides = tetrahedra[:, [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]]].reshape(-1, 3)
+        _, first, counts = np.unique(np.sort(sides, axis=1), axis=0, return_index=True, return_counts=True)
+        faces = sides[first[counts == 1]]
+    return trimesh.Trimesh(mesh.points, faces)
+
+
+def check_fit(
+    name: str, surface: Surface, low: tuple[float, float, float], size: tuple[float, float, float], spacing: float
+) -> None:
+    """Refuse a surface that a lattice cannot hold.
+
+    Args:
+        name: Of the argument, for messages.
+        surface: The surface.
+        low: Lower corner of the lattice's box [m].
+        size: Its edges [m].
+        spacing: Between two particles [m].
+
+    Raises:
+        ValueError: if the surface is larger than the box, leaves it, or is thinner than a spacing at more than a tenth
+            of its area.
+    """
+    has = " x ".join(f"{length:.4g}" for length in surface.size)
+    box = " x ".join(f"{length:.4g}" for length in size)
+    if any(length > edge * (1 + 1e-6) for length, edge in zip(surface.size, size, strict=True)):
+        raise ValueError(
+            f"{name}: {has} m in a domain of {box} m, wanted one that fits: is the unit of the file right?"
+        )
+    if max(surface.size) < spacing:
+        raise ValueError(
+            f"{name}: {has} m in a domain of {box} m, wanted more than its spacing of {spacing:.4g} m: is the file's "
+            "unit right?"
+        )
+    reach = [1e-6 * edge for edge in size]
+    for axis, letter in enumerate("xyz"):
+        begin, end = surface.origin[axis], surface.origin[axis] + surface.size[axis]
+        if begin < low[axis] - reach[axis] or end > low[axis] + size[axis] + reach[axis]:
+            raise ValueError(
+                f"{name}: from {begin:.4g} to {end:.4g} m along {letter}, wanted within {low[axis]:.4g} to "
+                f"{low[axis] + size[axis]:.4g} m, the domain"
+            )
+    points, faces = trimesh.sample.sample_surface(surface.mesh, SAMPLES, seed=0)[:2]
+    inwards = -surface.mesh.face_normals[faces]
+    thickness = trimesh.proximity.longest_ray(surface.mesh, points + 1e-6 * max(surface.size) * inwards, inwards)
+    thin = float((thickness < spacing).mean())
+    if thin > THIN:
+        raise ValueError(
+            f"{name}: thinner than the spacing of {spacing:.4g} m at {thin:.0%} of its surface, wanted at least that: "
+            "take more particles or a thicker shape"
+        )
+
+
+def lined(cavity: np.ndarray, thickness: float) -> np.ndarray:
+    """A cavity and a wall around it.
+
+    Args:
+        cavity: Which particles are air, bool [X, Y, Z].
+        thickness: Of the wall [spacings].
+
+    Returns:
+        bool [X + 2 p, Y + 2 p, Z + 2 p], with p = ceil(thickness) + 1 particles more on every side.
+    """
+    padded = np.pad(cavity, int(np.ceil(thickness)) + 1)
+    return np.asarray(ndimage.distance_transform_edt(~padded)) < thickness + BESIDE
