@@ -93,7 +93,7 @@ class Robot(nn.Module):
         if s.material is not None:
             found = read_material(s.material)
             self.solid, self.prony = found.solid, found.prony
-        self.pressure = _pressure(s, self.solid.youngs_modulus)
+        self.pressure = _pressure(s, float(self.solid.youngs_modulus))
         angle = math.atan(s.slope)
         # Uphill along +x, with the ground kept level: gravity leans back instead.
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
