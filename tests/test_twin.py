@@ -387,7 +387,7 @@ def test_a_variation_that_breaks_down_is_said_to_be_unsound(trial):
 def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
     free = type(effect).__name__ in ("InitialTilt", "InitialSpin")
     load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
-    stick = "stick" if type(effect).__name__ == "Slip" else 0.4
+    stick = "stick" if type(effect).__name__ == "Sliding" else 0.4
     t = hollow(
         trial,
         loads=(load,),

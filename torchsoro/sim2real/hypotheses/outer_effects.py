@@ -330,9 +330,7 @@ class InitialTilt(Hypothesis):
 
 
 def turned(v: Tensor, turn: Tensor) -> Tensor:
-    """Vectors [..., 3] rotated by vectors [..., 3] rad."""
-    angle = turn.norm(dim=-1, keepdim=True)
-    k = turn / angle.clamp(min=1e-12)
-    v, k = torch.broadcast_tensors(v, k)
-    along = (k * v).sum(-1, keepdim=True)
-    return v * angle.cos() + torch.cross(k, v, dim=-1) * angle.sin() + k * along * (1 - angle.cos())
+    """Vectors [..., 3] rotated by rotation vectors [..., 3] rad."""
+    units = torch.eye(3, dtype=turn.dtype)
+    transposed = torch.linalg.cross(turn.unsqueeze(-2).expand(*turn.shape[:-1], 3, 3), units.expand(*turn.shape, 3))
+    return (v.unsqueeze(-2) @ torch.linalg.matrix_exp(transposed)).squeeze(-2)

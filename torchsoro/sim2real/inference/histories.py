@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchsoro.sim2real.inference.fit import STEP, FitProblem
+from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.twin.twin import MarkerMotion
 

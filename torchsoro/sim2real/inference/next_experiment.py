@@ -11,7 +11,8 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Load, Marker, Setup, Trial, Vector
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
-from torchsoro.sim2real.inference.fit import STEP, FitProblem
+from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.isolability import Even, changes, errors_of, prior_residual_of, shortened
 from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.inference.noise import NoiseModel

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
+from scipy.spatial.transform import Rotation
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.twin.twin import MarkerMotion
@@ -16,16 +18,16 @@ CLOCK_LIMIT = 3.0  # standard deviations of a clock offset, beyond which it is n
 
 @dataclass(frozen=True, kw_only=True)
 class Priors:
-    """Standard deviations of measurement errors, which are fitted always and are not physics.
+    """Standard deviations of the Gaussian priors of measurement errors, which are fitted always and are no effect.
 
     Attributes:
         clock: Offset of each trial's clock [s].
-        rate: Relative error of the clock.
-        scale: Relative error of a video's scale.
-        metres: The same where the recording is in metres.
+        rate: Relative error of the clock's rate.
+        scale: Relative error of the lengths in a video.
+        metres: The same of a recording in metres.
         rotation: Of the recording's frame about each axis [rad].
-        place: Of a marker, along each axis [m].
-        slip: Of a marker that has slipped, along each axis [m].
+        place: Error of a marker's stated place along each axis [m].
+        slip: Shift of a marker that slips along each axis [m].
     """
 
     clock: float = 0.01
@@ -39,12 +41,12 @@ class Priors:
 
 @dataclass(frozen=True, kw_only=True)
 class MarkerSlip:
-    """A marker that moves on the body during a recording.
+    """A marker that is shifted on the body within 10 ms of a recording.
 
     Attributes:
-        trial: Its name.
+        trial: Name of the trial.
         marker: Number of the marker.
-        start: When [s], by the recording's clock; it is over 10 ms later.
+        start: Beginning of the shift by the recording's clock [s].
     """
 
     trial: str
@@ -52,21 +54,26 @@ class MarkerSlip:
     start: float
 
     def course(self, time: np.ndarray) -> np.ndarray:
-        """Share of the way [T]."""
+        """Share of the shift that has happened at times [T] s."""
         return np.clip((time - self.start) / 0.01, 0.0, 1.0)
 
 
 class ObservationModel:
-    """From motions of all trials to what would have been recorded, and its derivatives by the measurement errors.
+    """Maps motions of the markers to recordings, with derivatives by the measurement errors.
 
-    The errors are one vector: a clock offset for each trial; clock rate, ln of the scale, rotation about x, y, z; then
-    the displacement of each marker in the undeformed body; then of each slip, as recorded.
+    The measurement errors are one vector [K]: the clock offset of each trial [s]; error of the clock's rate, ln of the
+    scale, rotation about x, y and z [rad]; displacement of each marker in the undeformed body [m]; shift of each slip
+    in the frame of the recording [m].
 
     Args:
         setup: Of the experiment.
         trials: With recordings.
         priors: Of the errors.
-        slips: Markers that have slipped.
+        slips: Markers that slip.
+
+    Attributes:
+        names: Of the measurement errors.
+        deviations: Their prior standard deviations [K].
     """
 
     def __init__(
@@ -85,14 +92,14 @@ class ObservationModel:
         self.names += [f"slip_{s.trial}_{setup.markers[s.marker].name}_{a}_m" for s in slips for a in "xyz"]
 
     def until(self, number: int) -> float:
-        """When trial ``number`` may have ended by the body's clock at the latest [s]: its clock may be behind."""
+        """Time to simulate trial ``number`` to [s]: a clock may be late, and its last sample lie after the end."""
         trial, clock, rate = self.trials[number], self.deviations[number], self.deviations[len(self.trials)]
         assert trial.recording is not None
         last = float(trial.recording.time[-1])
         return max(trial.setup.duration, (last + CLOCK_LIMIT * clock) * (1 + CLOCK_LIMIT * rate))
 
     def observe(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> np.ndarray:
-        """What trial ``number`` would have recorded.
+        """The recording of trial ``number``.
 
         Args:
             motion: Of that trial, without a batch.
@@ -100,7 +107,7 @@ class ObservationModel:
             errors: Measurement errors [K].
 
         Returns:
-            Places [T, M, A] m.
+            Coordinates at the times of the recording [T, M, A] m.
         """
         own, place, frame = self._view(motion, number, errors)
         return self._recorded(_at(motion, own, place)[0] @ frame.T, number, errors)
@@ -111,7 +118,7 @@ class ObservationModel:
         own, place, frame = self._view(motion, number, errors)
         body, velocity, gradient = _at(motion, own, place)
         seen = body @ frame.T
-        # The clock does nothing before the motion begins and after it ends.
+        # Before the simulated motion begins and after it ends it is constant, whatever the clock.
         turned = (velocity * ((own > 0) & (own < float(motion.time[-1])))[:, None, None]) @ frame.T
         by = np.zeros((*seen.shape, len(errors)))
         by[..., number] = -turned / (1 + rate)
@@ -134,7 +141,7 @@ class ObservationModel:
         rate, ln_scale = errors[count : count + 2]
         own = np.clip((recording.time - errors[number]) / (1 + rate), 0.0, float(motion.time[-1]))
         place = errors[count + 5 : count + 5 + 3 * self.markers].reshape(self.markers, 3)
-        return own, place, math.exp(ln_scale) * _rotation(errors[count + 2 : count + 5])
+        return own, place, math.exp(ln_scale) * Rotation.from_rotvec(errors[count + 2 : count + 5]).as_matrix()
 
     def _slipping(self, number: int) -> list[tuple[int, int, np.ndarray]]:
         """Markers that slip in a trial: which, where its errors begin, and share of the way [T]."""
@@ -155,29 +162,12 @@ class ObservationModel:
 
 
 def _at(motion: MarkerMotion, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places and velocities at times, by Hermite's cubic between samples, and deformation gradients.
+    """Places [T, M, 3] m and velocities [T, M, 3] m/s at times, and deformation gradients [T, M, 3, 3].
 
-    The places are of points that lie so far [M, 3] m from the motion's own in the undeformed body.
+    The places are of points at a distance ``beside`` [M, 3] m from the motion's own in the undeformed body.
     """
-    t = motion.time
-    at = np.clip(np.searchsorted(t, time, side="right") - 1, 0, len(t) - 2)
-    h = (t[at + 1] - t[at])[:, None, None]
-    s = (time - t[at])[:, None, None] / h
-    begin, end = motion.place[at], motion.place[at + 1]
-    chord = (end - begin) / h
-    first, last = motion.velocity[at] - chord, motion.velocity[at + 1] - chord
-    place = begin + s * (end - begin) + h * s * (1 - s) * ((1 - s) * first - s * last)
-    velocity = chord + (1 - s) * (1 - 3 * s) * first + s * (3 * s - 2) * last
-    s = s[..., None]
-    gradient = (1 - s) * motion.gradient[at] + s * motion.gradient[at + 1]
-    return place + np.einsum("tmij,mj->tmi", gradient, beside), velocity, gradient
-
-
-def _rotation(turn: np.ndarray) -> np.ndarray:
-    """Rotation by a vector [rad]."""
-    angle = float(np.linalg.norm(turn))
-    x, y, z = turn
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    if angle < 1e-12:
-        return np.eye(3) + cross
-    return np.eye(3) + math.sin(angle) / angle * cross + (1 - math.cos(angle)) / angle**2 * cross @ cross
+    course = CubicHermiteSpline(motion.time, motion.place, motion.velocity)
+    last = np.clip(np.searchsorted(motion.time, time, side="right") - 1, 0, len(motion.time) - 2)
+    s = ((time - motion.time[last]) / (motion.time[last + 1] - motion.time[last]))[:, None, None, None]
+    gradient = (1 - s) * motion.gradient[last] + s * motion.gradient[last + 1]
+    return course(time) + np.einsum("tmij,mj->tmi", gradient, beside), course(time, 1), gradient

@@ -1,0 +1,179 @@
+"""Gauss-Newton on simulated residuals, with measurement errors eliminated in every step.
+
+A search is a generator: it asks for simulations and waits, so that those of many searches can be simulated together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchsoro.sim2real.inference.likelihood import Effects, Likelihood, Request
+from torchsoro.sim2real.twin.twin import MarkerMotion
+
+STEP = 0.05  # of an unknown, in its scale, for difference quotients
+LONGEST_STEP = 0.5  # of a search, over the unknown's size plus four scales
+LONGEST_MOVE = 1.5  # of a place in a step, in tenths of the body's size
+DAMPING = 1e-2  # of the first step (Levenberg and Marquardt), times the diagonal of the normal matrix
+DAMPING_LIMITS = (1e-4, 10.0)  # least damping of a step; a search ends that would need more than the most
+
+Search = Generator[Request, list[MarkerMotion], "Point | None"]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Point:
+    """Where a search stands.
+
+    Attributes:
+        chi2: Whitened sum of squares over recordings, measurement errors and prior residuals.
+        at: Unknowns that are simulated, in their scales [K].
+        errors: Measurement errors that are best there [L].
+        r: Whitened residual [N].
+        J: Its derivatives by the measurement errors, with their sign changed [N, L].
+        columns: The same by the unknowns [N, K].
+        motions: Of each trial.
+    """
+
+    chi2: float
+    at: np.ndarray
+    errors: np.ndarray
+    r: np.ndarray
+    J: np.ndarray
+    columns: np.ndarray
+    motions: list[MarkerMotion]
+
+
+class GaussNewton:
+    """Searches for the best values of some effects.
+
+    Args:
+        likelihood: What chi-squared is of.
+        effects: That are fitted, along with modulus and pressure.
+
+    Attributes:
+        held: Unknowns that stay as stated: the modulus beside an effect that is the modulus without its prior.
+        eager: Whether derivatives are asked for with every step, as where there is room for their simulations.
+    """
+
+    def __init__(self, likelihood: Likelihood, effects: Effects) -> None:
+        self.likelihood, self.effects, self.eager = likelihood, effects, False
+        common = likelihood.common
+        self.low, self.high = likelihood.bounds(effects)
+        held = [any(isinstance(e, type(one)) for e in effects) for one, _ in common]
+        self.held = np.array(held + [False] * (len(self.low) - len(held)))
+        places = [[False] * len(e.quantities) + [True] * (3 * e.local) for e in effects]
+        self.places = np.array([False] * len(common) + [p for own in places for p in own])
+        self.weight = 1 / likelihood.observation.deviations  # of the measurement errors
+
+    def search(self, start: np.ndarray | None, errors: np.ndarray, rounds: int, *, settle: bool) -> Search:
+        """A search from a point.
+
+        Args:
+            start: Unknowns, in scales; zero if None.
+            errors: Measurement errors to begin with.
+            rounds: Steps at most.
+            settle: Whether derivatives are taken at the last point, which intervals need.
+
+        Returns:
+            The last point; None where the simulation of the first breaks down.
+        """
+        at = np.zeros(len(self.low)) if start is None else np.clip(np.asarray(start, float), self.low, self.high)
+        at = np.where(self.held, 0.0, at)
+        damping, moving = DAMPING, np.flatnonzero(~self.held)
+        current = yield from self.linearise(at, errors, moving)
+        if current is None:
+            return None
+        fresh = True  # whether the derivatives were simulated at this point
+        for _ in range(rounds):
+            step = self.step(current, damping)
+            if not step.any():
+                break
+            eager = self.eager
+            ahead = yield from self.linearise(current.at + step, current.errors, moving if eager else moving[:0])
+            gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
+            if ahead is not None and gained > 0:
+                if not eager:
+                    ahead = dataclasses.replace(ahead, columns=_updated(current, ahead))
+                converged = fresh and gained < max(0.5, 1e-3 * ahead.chi2)
+                current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), eager
+                if converged:
+                    break
+            elif fresh:
+                if damping > DAMPING_LIMITS[1]:
+                    break
+                damping *= 10
+                continue
+            # Derivatives that were updated along the way no longer lead far.
+            if not fresh and gained < 0.3 * current.chi2:
+                again = yield from self.linearise(current.at, current.errors, moving)
+                if again is None:
+                    break
+                current, fresh = again, True
+        if settle and not fresh:
+            again = yield from self.linearise(current.at, current.errors, moving)
+            current = again or current
+        return current
+
+    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray) -> Search:
+        """A point with its derivatives by the unknowns ``moving``; None if its simulation breaks down."""
+        likelihood = self.likelihood
+        steps = np.where(at + STEP > self.high, -STEP, STEP)
+        motions = yield self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
+        if not np.all([m.sound for m in motions]):
+            return None
+        base = [m.alone(0) for m in motions]
+        chi2, errors, r, J = likelihood.measure(base, errors)
+        columns = np.zeros((len(r), len(at)))
+        for k, i in enumerate(moving, start=1):
+            left = likelihood.residual([m.alone(k) for m in motions], errors)
+            columns[:, i] = (r - left) / steps[i]
+        chi2 += float((likelihood.prior_residual(at, self.held)[0] ** 2).sum())
+        if not (math.isfinite(chi2) and np.isfinite(columns).all()):
+            return None
+        return Point(chi2=chi2, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
+
+    def step(self, point: Point, damping: float) -> np.ndarray:
+        """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""
+        fixed, step = self.held.copy(), np.zeros_like(point.at)
+        prior, slope = self.likelihood.prior_residual(point.at, self.held)
+        most = np.where(self.places, LONGEST_MOVE, LONGEST_STEP * (np.abs(point.at) + 4.0))
+        for _ in range(len(step)):
+            free = ~fixed
+            whole = np.concatenate([point.columns[:, free], point.J], 1)
+            H = whole.T @ whole + np.diag(np.concatenate([slope[free] ** 2, self.weight**2]))
+            n = int(free.sum())
+            H[np.arange(n), np.arange(n)] *= 1 + damping
+            H[np.arange(n), np.arange(n)] += 1e-6
+            pull = np.concatenate([slope[free] * prior[free], self.weight**2 * point.errors])
+            step = np.zeros_like(point.at)
+            step[free] = np.linalg.solve(H, whole.T @ point.r - pull)[:n]
+            step = np.clip(step, -most, most)
+            ahead = point.at + step
+            below, above = (ahead < self.low) & (point.at <= self.low), (ahead > self.high) & (point.at >= self.high)
+            beyond = free & (below | above)
+            if not beyond.any():
+                break
+            fixed |= beyond
+        return np.clip(point.at + step, self.low, self.high) - point.at
+
+    def covariance(self, point: Point) -> np.ndarray:
+        """Of the unknowns at a point, in scales [K, K]; zero where they are held."""
+        free = ~self.held
+        _, slope = self.likelihood.prior_residual(point.at, self.held)
+        whole = np.concatenate([point.columns[:, free], point.J], 1)
+        prior = np.concatenate([slope[free] ** 2 + 1e-9, self.likelihood.observation.deviations**-2])
+        n = int(free.sum())
+        found = np.zeros((len(point.at), len(point.at)))
+        found[np.ix_(free, free)] = np.linalg.pinv(whole.T @ whole + np.diag(prior))[:n, :n]
+        return found
+
+
+def _updated(before: Point, after: Point) -> np.ndarray:
+    """Derivatives by the unknowns that agree with what a step did (Broyden's update)."""
+    step = after.at - before.at
+    expected = before.r - before.columns @ step - before.J @ (after.errors - before.errors)
+    return before.columns - np.outer(after.r - expected, step) / float(step @ step)
