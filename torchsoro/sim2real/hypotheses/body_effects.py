@@ -1,4 +1,4 @@
-"""What may have been left out of the body: stiffness, viscosity, mass, and what hangs on it."""
+"""Effects of the body: stiffness, viscosity, mass, and what hangs on it."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class SoftSide(Hypothesis):
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
     def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
-        """The slopes, and what a soft half has less than the other, which looks alike: 1 - exp(-2/3 of the slope)."""
+        """The slopes, and what a soft half lacks that moves nearly the same: 1 - exp(-2/3 of the slope)."""
         lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
         return {**super().reported(values, scenario), "fraction": (lost, "1")}
 

@@ -1,4 +1,6 @@
-"""What may have been left out: modules of at most three parameters that change a scenario, exactly nothing at zero.
+"""Hypotheses: effects that a setup may lack, as modules of a few parameters that change a scenario.
+
+At zero strength a hypothesis leaves the scenario as it is, exactly.
 
 A hypothesis of one's own is a subclass of :class:`Hypothesis`:
 
@@ -22,7 +24,9 @@ from torch import Tensor, nn
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
 
-LAW = 0.35  # see Hypothesis.form; of cases whose truth is known, what covers 90 %
+# Model-form standard deviation of an effect that stands for a law; set so that 90 % intervals hold the truth in 90 % of
+# cases whose truth is known.
+LAW = 0.35
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,7 @@ class Quantity:
     Attributes:
         name: For reports.
         unit: SI.
-        scale: A strength that one would notice: the fit counts in these.
+        scale: Size of a noticeable change; unknowns of a fit are in these.
         least: Lower bound, in scales.
         most: Upper bound, in scales.
     """
@@ -49,14 +53,17 @@ class Hypothesis(nn.Module):
 
     Attributes:
         name: Of the effect.
-        affected_quantity: What of the simulation it changes, for people.
+        affected_quantity: Quantity of the simulation that it changes, in words.
         quantities: Its parameters.
-        local: Whether it acts at a place, which is then inferred along with them.
-        starts: Strengths to look at first, in scales: alternatives, or, if ``joint``, one of each parameter.
-        joint: Whether the parameters add up, as components of a vector do.
-        mass: Number of the parameter, if any, that is a mass: off the middle of a body, its weight bends that.
-        form: Share of a parameter that stays unknown, as nature's form of the effect is not the hypothesis': small for
-            a number that a body has, larger for one that stands for a law.
+        local: Whether it acts at one place, which is then fitted as well.
+        starts: Values of the quantities at the probe points, in scales: alternatives, or, if ``joint``, one along each.
+        joint: Whether the quantities are components that add up, as those of a vector.
+        mass: Number of the quantity, if any, that is a mass, whose weight bends a body off its middle.
+        ratios: Reported quantities that are exponentials of an unknown, so that their interval is a ratio.
+        nonnegative: Reported quantities that cannot be negative.
+        model_form_deviation: Relative standard deviation of a quantity that remains with any amount of data, since the
+            effect in the body follows another law than the hypothesis: small for a constant of the body, larger for a
+            parameter that stands for a law.
     """
 
     name: ClassVar[str]
@@ -85,7 +92,7 @@ class Hypothesis(nn.Module):
         return True
 
     def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
-        """Values [K] as people say them: numbers and units by name.
+        """Values [K] as they are reported: numbers and units by name.
 
         Args:
             values: In the units of ``quantities``, without a place.
@@ -103,18 +110,18 @@ class Hypothesis(nn.Module):
         return values[len(self.quantities) :] if self.local else None
 
     def varies(self, values: np.ndarray) -> float:
-        """By how much ln of the modulus is higher on the stiff side than on average: it may be what is believed."""
+        """Excess of ln of the modulus on the stiffest side over its mean: the stated one may be that of this side."""
         return 0.0
 
     def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
-        """The effect that it comes to at values [K], by name, and that one's values."""
+        """A simpler effect that is the same at values [K]: its name and its values; None if there is none."""
         return None
 
     def probe_points(self, twin: Twin) -> list[np.ndarray]:
-        """What to look at first: alternatives, each with directions [D, K] in scales, which add up.
+        """Points at which the response is simulated: alternatives, each with directions [D, K] in scales.
 
-        Strengths of what adds up need not be tried; others may change the motion so much that nothing is linear.
-        A place is in tenths of the body's size, and stays when a direction is scaled.
+        The response to directions of one alternative is taken as additive. A place is in tenths of the body's size and
+        is not scaled with the direction.
         """
         starts = np.array(self.starts)
         alternatives = [starts] if self.joint else [start[None] for start in starts]
@@ -123,16 +130,16 @@ class Hypothesis(nn.Module):
         return [np.concatenate([a, np.tile(p, (len(a), 1))], 1) for p in _places(twin) for a in alternatives]
 
     def weak_probe_points(self, twin: Twin, strength: float) -> list[np.ndarray]:
-        """Looks that are so weak that the motion changes in proportion; of those that differ in strength only, one.
+        """Probe points at a small strength, where responses are nearly linear; one of those that differ in strength.
 
         Args:
             twin: The body.
-            strength: Of the looks, in their own.
+            strength: Over that of :meth:`probe_points`.
         """
         kinds = len(self.quantities)
-        # What has no end at zero, as the logarithm of a time, is a form and no strength.
-        form = np.array([q.least < 0 for q in self.quantities]) & (np.arange(kinds) > 0)
-        shrink = np.concatenate([np.where(form & ~self.joint, 1.0, strength), np.ones(3 * self.local)])
+        # A second quantity that may be negative, as the logarithm of a time, is a shape and no strength.
+        shape = np.array([q.least < 0 for q in self.quantities]) & (np.arange(kinds) > 0)
+        shrink = np.concatenate([np.where(shape & ~self.joint, 1.0, strength), np.ones(3 * self.local)])
         if self.joint:
             return [d * shrink for d in self.probe_points(twin)]
         found: dict[bytes, np.ndarray] = {}
@@ -140,14 +147,14 @@ class Hypothesis(nn.Module):
             found.setdefault(np.where(shrink == 1, d[0], 0.0).tobytes(), d * shrink)
         return list(found.values())
 
-    def with_masses_aside(self, probe: np.ndarray, twin: Twin) -> np.ndarray:
-        """A look of a local effect [D, K], with its mass on the sides of the body as well [D + 4, K]."""
+    def with_masses_aside(self, directions: np.ndarray, twin: Twin) -> np.ndarray:
+        """Directions of a probe point [D, K], and those with a local mass on the sides of the body [D + 4, K]."""
         if self.mass is None:
-            return probe
+            return directions
         s, kinds = twin.setup, len(self.quantities)
         longest = int(np.argmax(s.size))
-        row = probe[np.flatnonzero(probe[:, self.mass])[0]]
-        rows = [probe]
+        row = directions[np.flatnonzero(directions[:, self.mass])[0]]
+        rows = [directions]
         for axis in (a for a in range(3) if a != longest):
             for side in (s.origin[axis], s.origin[axis] + s.size[axis]):
                 aside = row.copy()

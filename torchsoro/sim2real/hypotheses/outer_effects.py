@@ -1,4 +1,4 @@
-"""What may have been left out around the body: supply, fluid, planes, gravity, start."""
+"""Effects around the body: supply, fluid, planes, gravity, start."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""What whitened changes share: linear algebra on columns, which knows no twin.
+"""Detectability of effects and cosines between them, from whitened responses.
 
-Every effect changes what would be recorded. Counted in noise, and without what measurement errors, modulus and pressure
-within their beliefs can take up, that change has a length, which says whether the effect is seen, and a direction,
-which other effects may share.
+The response of an effect is the change that it makes in a recording. Whitened by the noise, and projected off the
+responses of measurement errors, modulus and pressure under their priors, its squared length is the gain in chi-squared,
+and the cosine between two responses says how much of one effect another can imitate.
 """
 
 from __future__ import annotations
@@ -14,12 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import least_squares, nnls, root_scalar
 
-SCORE = 40.0  # squared length of a whitened change at which it stands out
-FARTHEST = 1e4  # times the largest strength that was simulated, beyond which an effect counts as never seen
+SCORE = 40.0  # squared length of a whitened response at which an effect is detectable
+FARTHEST = 1e4  # strength over the largest that was simulated, above which an effect counts as not detectable
 
-PriorResidual = Callable[
-    [np.ndarray], np.ndarray
-]  # what values of the common unknowns cost: residuals [C] of values [C]
+PriorResidual = Callable[[np.ndarray], np.ndarray]  # residuals [C] by the priors of the common unknowns at values [C]
 
 
 def cleared(changes: np.ndarray, nuisances: np.ndarray, slopes: np.ndarray) -> np.ndarray:
@@ -31,8 +29,8 @@ def cleared(changes: np.ndarray, nuisances: np.ndarray, slopes: np.ndarray) -> n
         slopes: One over the standard deviation of each nuisance [L], positive.
 
     Returns:
-        What is left [N + L, K]; the last rows are what the nuisances cost. The squared length of a column is its
-        generalised least-squares misfit.
+        The rest [N + L, K]; the last rows are the cost of the nuisances. The squared length of a column is its
+        generalised least-squares chi-squared.
     """
     padded = np.concatenate([changes, np.zeros((len(slopes), changes.shape[1]))])
     basis, _ = np.linalg.qr(np.concatenate([nuisances, np.diag(slopes)]))
@@ -40,7 +38,7 @@ def cleared(changes: np.ndarray, nuisances: np.ndarray, slopes: np.ndarray) -> n
 
 
 def imitation(change: np.ndarray, directions: np.ndarray, free: np.ndarray) -> float:
-    """How much of a change directions can make: the cosine of its angle to their cone, 0 to 1.
+    """Cosine of the angle between a change and the cone of directions, 0 to 1.
 
     Args:
         change: [N].
@@ -64,7 +62,7 @@ class Response:
         paths: Alternatives: strengths, in scales, from the smallest on [S], and changes at them [N, S].
         cones: Alternatives: what the effect can do at all, as directions that add up [N, D], and which of them may be
             taken backwards, bool [D].
-        either: Whether strengths of both signs make sense.
+        either: Whether strengths of both signs are possible.
     """
 
     paths: tuple[tuple[np.ndarray, np.ndarray], ...]
@@ -73,15 +71,15 @@ class Response:
 
 
 def settle(change: np.ndarray, common: np.ndarray, prior_residual: PriorResidual) -> tuple[float, np.ndarray]:
-    """What the common unknowns leave of a change.
+    """The rest of a change that the common unknowns cannot take up under their priors.
 
     Args:
         change: [N].
         common: Change by each of them [N, C].
-        prior_residual: What their values cost.
+        prior_residual: Of their values.
 
     Returns:
-        Length of what is left, beliefs included, and slopes [C] of the Gaussian priors that cost as much there.
+        Length of the rest, prior residuals included, and slopes [C] of the Gaussian priors that cost as much there.
     """
     basis, root = np.linalg.qr(common)
     inner = basis.T @ change
@@ -96,14 +94,14 @@ def settle(change: np.ndarray, common: np.ndarray, prior_residual: PriorResidual
 def first_seen(
     strengths: np.ndarray, changes: np.ndarray, common: np.ndarray, prior_residual: PriorResidual, score: float
 ) -> tuple[float, np.ndarray]:
-    """The strength at which an effect stands out, and its change there; straight lines between what was simulated.
+    """The strength at which an effect is detectable, and its response there, interpolated between simulations.
 
     Args:
         strengths: In scales, from the smallest on [S].
         changes: At each [N, S].
         common: Change by each common unknown [N, C].
-        prior_residual: What their values cost.
-        score: Squared length at which a change stands out.
+        prior_residual: Of their values.
+        score: Squared length at which a response is detectable.
     """
     at = np.append(0.0, strengths)
     known = np.concatenate([np.zeros((len(changes), 1)), changes], 1)
@@ -130,17 +128,17 @@ def first_seen(
 def compare(
     responses: Sequence[Response], common: np.ndarray, prior_residual: PriorResidual, score: float = SCORE
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which effects are seen, and which of them are alike.
+    """Strengths from which effects are detectable, and cosines between them.
 
     Args:
         responses: Of E effects, without what measurement errors take up.
         common: Change by each common unknown [N, C].
-        prior_residual: What their values cost.
-        score: Squared length at which a change stands out.
+        prior_residual: Of their values.
+        score: Squared length at which a response is detectable.
 
     Returns:
-        Strengths at which they stand out [E], in scales, infinite for what is never seen; and how much of the change
-        that effect i makes then effect j can imitate [E, E].
+        Strengths at which they are detectable [E], in scales, infinite for one that never is; and how much of the
+        change by effect i at that strength effect j can imitate [E, E], 0 to 1.
     """
     count = len(responses)
     detectable, cosines = np.full(count, np.inf), np.eye(count)

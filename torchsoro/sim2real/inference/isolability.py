@@ -1,6 +1,6 @@
-"""Which effects an experiment can tell apart, before any place is recorded: times, markers, noise and numerics do.
+"""Which effects an experiment can detect and tell apart, by its times, markers, noise and discretization error.
 
-Everything is simulated at what is believed, weakly, and counts per strength; see
+The recorded coordinates do not enter. Responses are simulated at the setup as stated, at small strengths; see
 :mod:`torchsoro.sim2real.inference.cosines`.
 """
 
@@ -24,19 +24,19 @@ from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
-SAME = 0.97  # of a change that another effect imitates, above which the two are not told apart
-SMALL = 0.1  # of the least strength that is looked at, at which changes are still proportional to it
-NOTHING = 0.05  # length of a change below which single precision may have made it
+SAME = 0.97  # cosine above which one effect passes for another
+SMALL = 0.1  # strength of a weak response, over that of the weakest probe point: it is linear there
+ROUNDING = 0.05  # whitened length of a response, below which it may be rounding in single precision
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Isolability:
-    """What an experiment can tell.
+    """Which effects an experiment can detect and tell apart.
 
     Attributes:
         effects: Names of E effects.
         quantities: First quantity of each, and its unit.
-        detectable: Strength at which each stands out, in that unit [E]; infinite if never.
+        detectable: Strength at which each is detectable, in that unit [E]; infinite if never.
         cosines: How much of the change by effect i, where it is first detectable, effect j can imitate [E, E], 0 to 1.
     """
 
@@ -46,12 +46,12 @@ class Isolability:
     cosines: np.ndarray
 
     def confused(self, threshold: float = SAME) -> list[tuple[str, str]]:
-        """Pairs of effects, the second of which can pass for the first: this experiment cannot tell them apart."""
+        """Pairs of effects, of which the second can imitate the first: the experiment cannot tell them apart."""
         pairs = np.argwhere(self.cosines - np.eye(len(self.effects)) > threshold)
         return [(self.effects[i], self.effects[j]) for i, j in pairs]
 
     def as_json(self) -> dict[str, Any]:
-        """For explanation.json; null is what is never seen."""
+        """For explanation.json; null where an effect is never detectable."""
         return {
             "effects": list(self.effects),
             "detectable": [
@@ -66,15 +66,15 @@ class Isolability:
 def isolability(
     problem: FitProblem, effects: Sequence[Hypothesis] | None = None, *, score: float = SCORE
 ) -> Isolability:
-    """Which effects an experiment would see, and tell apart, by one simulation of each of their looks.
+    """Which effects an experiment can detect and tell apart, by one simulation of each probe point.
 
     Args:
         problem: Recordings, of which only the times count, and twin.
-        effects: What is thought of; of the library what applies, if None.
-        score: Squared length of a whitened change at which it stands out.
+        effects: Hypotheses; those of the library that apply if None.
+        score: Gain in chi-squared at which an effect is detectable.
 
     Raises:
-        ValueError: if what is believed breaks down.
+        ValueError: if the simulation of the setup as stated breaks down.
     """
     effects = problem.thought_of(library() if effects is None else effects)
     n = len(problem.common)
@@ -133,7 +133,7 @@ class Even(Ensemble):
 
 
 def prior_residual_of(problem: FitProblem) -> PriorResidual:
-    """What values of modulus and pressure cost, in tolerances."""
+    """Prior residuals of modulus and pressure at values in tolerances."""
     return lambda x: problem.prior_residual(x, np.zeros(len(x), bool))[0]
 
 
@@ -166,16 +166,16 @@ def errors_of(
 
 
 def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, observation: ObservationModel) -> np.ndarray:
-    """Changes without what measurement errors take up, in as few rows as keep all lengths and angles."""
+    """Changes projected off the measurement errors, in as few rows as keep all lengths and angles."""
     left = cleared(np.concatenate(blocks, 1), by, 1 / observation.deviations)
     return np.asarray(np.linalg.qr(left, mode="r"))
 
 
 def _probe_points(effect: Hypothesis, problem: FitProblem) -> list[np.ndarray]:
-    """What to simulate of an effect: alternatives, each with directions [D, K] in scales, weak ones first.
+    """Probe points of an effect: alternatives, each with directions [D, K] in scales, weak ones first.
 
-    An effect that grows from nothing is known by a weak one. One that begins at some strength, as sliding on a plane
-    does, is looked at there, too.
+    A weak one suffices for an effect whose response begins at zero strength. One that has a threshold, as sliding on a
+    plane, is also simulated at full strengths.
     """
     weak = effect.weak_probe_points(problem.twin, SMALL)
     if effect.joint:  # of many places, every other
@@ -187,7 +187,7 @@ def _probe_points(effect: Hypothesis, problem: FitProblem) -> list[np.ndarray]:
 
 
 def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
-    """An effect's changes [N, K] by look; what breaks down is left out."""
+    """An effect's changes [N, K] by probe point, without those whose simulation breaks down."""
     kinds = len(effect.quantities)
     backwards = np.array([q.least < 0 for q in effect.quantities])
     numbers = np.split(np.arange(len(sound)), np.cumsum([len(d) for d in probe_points])[:-1])
@@ -197,13 +197,13 @@ def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.nd
         for directions, mine in kept:
             cones.append((mine, backwards[np.abs(directions[:, :kinds]).argmax(1)]))
             # Strengths are in the first quantity's unit: directions in that unit count, the most visible of them.
-            alike = [q.unit == effect.quantities[0].unit for q in effect.quantities]
-            some = mine[:, directions[:, :kinds][:, alike].any(1)]
+            same_unit = [q.unit == effect.quantities[0].unit for q in effect.quantities]
+            some = mine[:, directions[:, :kinds][:, same_unit].any(1)]
             turn = np.linalg.svd(some, full_matrices=False)[2][:1]
             paths.append((np.array([SMALL]), some @ turn.T * (1 if turn.sum() > 0 else -1)))
         return Response(paths=tuple(paths), cones=tuple(cones), either=bool(backwards[0]))
-    if kinds == 1 and not effect.local and kept and np.linalg.norm(kept[0][1]) < NOTHING:
-        # It begins at some strength.
+    if kinds == 1 and not effect.local and kept and np.linalg.norm(kept[0][1]) < ROUNDING:
+        # Its response has a threshold.
         strong = [(d[0, 0], mine) for d, mine in kept if d[0, 0] * kept[-1][0][0, 0] > 0]
         course = np.concatenate([mine for _, mine in strong], 1)
         paths = [(np.abs([d for d, _ in strong]), course)]

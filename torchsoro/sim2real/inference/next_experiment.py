@@ -36,8 +36,8 @@ class Proposal:
 
     Attributes:
         words: What to do.
-        alike: How much of what one explanation changes in it the other can imitate, 0 to 1.
-        distance: Squared length of what it cannot, in noise: what the trial would tell.
+        cosine: How much of the change by one explanation the other can imitate, 0 to 1.
+        distance: Squared whitened length of the rest: gain in chi-squared by which the trial tells them apart.
     """
 
     words: str
@@ -115,8 +115,7 @@ def advice(proposals: Sequence[Proposal]) -> str:
         return "None of the trials that were thought of would tell them apart."
     return (
         f"To tell them apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
-        f"deviations and are {100 * best.cosine:.0f} % alike, where the same trial once more gives "
-        f"{same.distance**0.5:.1f} and {100 * same.cosine:.0f} %."
+        f"deviations, in the same trial once more by {same.distance**0.5:.1f}."
     )
 
 

@@ -10,25 +10,25 @@ from scipy.linalg import solve_triangular
 
 from torchsoro.sim2real.data.recording import Recording
 
-CORRELATION = 0.03  # s over which the twin's own error lasts, and a part of the noise
-LASTING = 0.25  # of the variance of the noise
+CORRELATION = 0.03  # correlation time of the twin's own error, and of the lasting part of the noise [s]
+LASTING = 0.25  # share of the noise's variance that is correlated in time
 
 
 class NoiseModel:
-    """How far residuals may be off: noise, and what the twin's numerics get wrong; both may last for a while.
+    """Covariance of residuals: noise, a share of it correlated in time, and the twin's own error, wholly correlated.
 
     Args:
         recording: Of the trial.
         noise: Standard deviation of the noise [m].
-        numerics: That of the twin's error, by marker and axis [M, A] m.
-        lasting: Share of the noise's variance that lasts from sample to sample.
+        discretization: That of the twin's own error, by marker and axis [M, A] m.
+        lasting: Share of the noise's variance that is correlated.
     """
 
     def __init__(
         self, recording: Recording, noise: float, discretization: np.ndarray, lasting: float = LASTING
     ) -> None:
         lag = np.abs(recording.time[:, None] - recording.time[None, :])
-        alike = np.exp(-lag / CORRELATION)
+        correlation = np.exp(-lag / CORRELATION)
         self.channels: list[tuple[np.ndarray, list[tuple[int, int]], np.ndarray]] = []
         known: dict[tuple[bytes, float], int] = {}
         for m, a in np.ndindex(*discretization.shape):
@@ -41,13 +41,13 @@ class NoiseModel:
                 continue
             known[key] = len(self.channels)
             slow = lasting * noise**2 + discretization[m, a] ** 2
-            covariance = (1 - lasting) * noise**2 * np.eye(len(rows)) + slow * alike[np.ix_(rows, rows)]
+            covariance = (1 - lasting) * noise**2 * np.eye(len(rows)) + slow * correlation[np.ix_(rows, rows)]
             root = np.linalg.cholesky(covariance)
             self.channels.append((rows, [(m, a)], solve_triangular(root, np.eye(len(rows)), lower=True)))
         self.count = sum(len(rows) * len(pairs) for rows, pairs, _ in self.channels)
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
-        """Divide by what may be: [T, M, A, ...] to [samples, ...], of variance 1 if nothing is wrong."""
+        """Residuals [T, M, A, ...] to [samples, ...] of unit covariance, if noise and twin are as stated."""
         parts = []
         for rows, pairs, inverse in self.channels:
             v = np.stack([values[rows, m, a] for m, a in pairs])

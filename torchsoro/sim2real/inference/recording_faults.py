@@ -16,11 +16,11 @@ from torchsoro.sim2real.inference.observation import MarkerSlip
 def find_slips(
     trials: Sequence[Trial], noise_models: Sequence[NoiseModel], left: Sequence[np.ndarray]
 ) -> list[MarkerSlip]:
-    """The marker whose slipping would explain most of what is left, if that is half of it all.
+    """The marker whose slip explains most of the residuals, if that is half of their excess over noise.
 
     Args:
         trials: With recordings.
-        noise_models: How far residuals may be off, of each trial.
+        noise_models: Of each trial.
         left: Residuals of each trial [T, M, A] m, not whitened.
     """
     markers = left[0].shape[1]
@@ -55,7 +55,7 @@ def find_slips(
 
 
 def reordered(experiment: Experiment) -> tuple[Experiment, str]:
-    """The experiment with the columns of markers that were confused put right, and what was, in words.
+    """The experiment with the columns of confused markers put right, and a sentence that says which.
 
     Only where recordings begin with the body as it is stated, and the stated order is far off.
     """
