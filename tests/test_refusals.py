@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from problems import DT, H, block, constant, simulator, vector
+from problems import DT, H, block, constant, simulator, vector, ways
 
 from torchsoro import Gas, Prony, Simulator, Solid, ground, stable_step
 
@@ -89,7 +89,6 @@ def test_bad_bodies_are_refused(body, message):
         ({"probes": torch.tensor([-1, 3])}, r"probes: -1 to 3, wanted 0 to 63"),
         ({"weight": torch.ones(5)}, r"weight: shape \(5,\), wanted \[\.\.\., 64\]"),
         ({"weight": torch.zeros(64)}, r"weight: .*wanted .*positive sum"),
-        ({"start": torch.zeros(1, 24, 5).double()}, r"state: shape \(1, 24, 5\), wanted \(1, 24, 64\)"),
         ({"gravity": torch.zeros(2, 3), "planes": [ground(torch.zeros(3))]}, r"leading axes .* wanted .*broadcast"),
     ],
 )
@@ -97,6 +96,38 @@ def test_bad_arguments_are_refused(arguments, message):
     _, body = block()
     with pytest.raises(ValueError, match="^" + message):
         simulator()(body, **{"duration": 10 * DT, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda s: s[..., :-1],
+            r"a state of shape \(1, .*\), wanted \(1, .*\), as for 1 simulation\(s\) of this body with 0",
+        ),
+        (lambda s: s.expand(2, *s.shape[1:]), r"a state of shape \(2, .*\), wanted \(1, "),
+        (lambda s: s.float(), r"torch\.float32 on cpu, wanted torch\.float64 on cpu as body\.position"),
+        (lambda s: s.to("meta"), r"torch\.float64 on meta, wanted torch\.float64 on cpu"),
+        (lambda s: s * math.nan, r"a state with values that are not finite"),
+        (lambda s: s.tolist(), r"list, wanted a Trajectory or its final state"),
+    ],
+)
+@ways("apic", "total")
+def test_bad_start_is_refused_by_its_name(way, change, message):
+    _, body = block()
+    sim = simulator(**way)
+    start = change(sim(body, duration=DT).final)
+    with pytest.raises(ValueError, match="^start: " + message):
+        sim(body, duration=10 * DT, start=start)
+
+
+def test_start_of_the_other_formulation_is_refused():
+    _, body = block()
+    updated, total = simulator(), simulator(formulation="total")
+    with pytest.raises(ValueError, match=r"^start: a state of shape .*in the 'updated' formulation"):
+        updated(body, duration=DT, start=total(body, duration=DT))
+    with pytest.raises(ValueError, match=r"^start: a state of shape .*in the 'total' formulation"):
+        total(body, duration=DT, start=updated(body, duration=DT))
 
 
 def test_pressure_of_too_few_chambers_is_refused():
@@ -114,12 +145,12 @@ def test_a_step_above_the_limit_is_refused(elements):
     step = 1.05 * limit
     with pytest.raises(
         ValueError, match=rf"^dt = {step:g} s: above the limit of about [\d.e-]+ s, set by elastic"
-    ) as told:
+    ) as refusal:
         simulator(dt=step)(body, duration=step, prony=prony)
-    said = float(str(told.value).split("about ")[1].split(" s")[0])
+    said = float(str(refusal.value).split("about ")[1].split(" s")[0])
     # What it says is near, and on the safe side or hardly off: stiffness falls as the step grows.
     assert said == pytest.approx(limit, rel=0.05)
-    assert ("Maxwell element" in str(told.value)) == (elements > 0)
+    assert ("Maxwell element" in str(refusal.value)) == (elements > 0)
 
 
 def test_the_limit_of_the_gas_is_refused_by_name():

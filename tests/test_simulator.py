@@ -13,9 +13,9 @@ from problems import DT, WAYS, H, block, constant, falling, momenta, simulator, 
 from torch import Tensor
 
 from torchsoro import Plane, Prony, Waveform, ground, stable_step
+from torchsoro.simulation.checkpoints import plan_checkpoints
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops import segment
-from torchsoro.simulation.simulator import plan_checkpoints
 
 FREE = (0.0, 0.0, 0.0)
 COUNT = 64
@@ -365,6 +365,25 @@ def test_gradient_by_initial_velocity_and_start(way):
     whole = sim(body, duration=30 * DT, gravity=FREE, start=half.final)
     (by,) = torch.autograd.grad(whole.center_of_gravity[-1].sum(), v)
     torch.testing.assert_close(by, torch.full((3,), 50 * DT, dtype=torch.float64), rtol=1e-10, atol=0)
+
+
+@ways("apic", "total")
+def test_gradient_by_start_equals_central_difference(way):
+    _, body = block((4, 4, 6), air=True)
+    body = replace(body, velocity=0.1 * noise(96, 3))
+    sim, prony = simulator(**way), Prony.paper(2)
+    state = sim(body, duration=20 * DT, prony=prony, pressure=constant(300.0)).final.detach()
+    along = state * noise(*state.shape, seed=1)
+
+    def loss(start: Tensor) -> Tensor:
+        run = sim(body, duration=20 * DT, prony=prony, pressure=constant(300.0), start=start)
+        return 1e6 * ((run.final - state) * noise(*state.shape, seed=2)).sum() + run.chamber_pressure.sum()
+
+    leaf = state.clone().requires_grad_()
+    (by,) = torch.autograd.grad(loss(leaf), leaf)
+    step = 1e-5
+    far, near = ((loss(state + e * along) - loss(state - e * along)) / (2 * e) for e in (2 * step, step))
+    torch.testing.assert_close((by * along).sum(), (4 * near - far) / 3, rtol=1e-6, atol=0)
 
 
 @ways("apic", "total")

@@ -1,26 +1,97 @@
-"""From a body and what acts on it to the tensors of the operator, and what is wrong with them, if anything."""
+"""From a body and its loads to the tensors of the operator, with the checks of every argument."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.checkpoints import MEMORY
+from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached
 from torchsoro.simulation.material import Body
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.scene import Inputs, Scene
 
-MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # bytes that a rollout may keep for its gradient, by device
+Wide = Callable[[Tensor, int], Tensor]
+"""From a tensor and the number of its axes that are not a batch to the same tensor with one batch axis [B, ...]."""
+
+
+def assemble(
+    attached: Attached,
+    *,
+    prony: Tensor,
+    pressure: Tensor,
+    gravity: Tensor,
+    planes: Sequence[Plane],
+    forces: Sequence[Tensor],
+    weight: Tensor,
+    low: tuple[float, float, float],
+) -> tuple[torch.Size, Inputs, Wide]:
+    """Broadcast all arguments of a call to one batch.
+
+    Args:
+        attached: The body with its loads.
+        prony: Maxwell elements [..., M, 3].
+        pressure: [..., chambers, T + 1] Pa.
+        gravity: [..., T, 3] m/s2.
+        planes: Contact planes.
+        forces: [..., T, 3] N each.
+        weight: [..., N].
+        low: Lower corner of the analysis box [m].
+
+    Returns:
+        The leading axes, the operator's inputs, and the function that broadcasts a tensor likewise.
+
+    Raises:
+        ValueError: if the leading axes do not broadcast against each other.
+    """
+    x = attached.body.position
+    numbers = [[torch.as_tensor(n, dtype=x.dtype, device=x.device) for n in plane.numbers()] for plane in planes]
+    ranks = [(x, 2), (prony, 2), (pressure, 2), (gravity, 2), (weight, 1), *((f, 2) for f in forces)]
+    ranks += [(n, 0) for plane in numbers for n in plane]
+    ranks += body_tensors(attached)
+    leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
+    try:
+        lead = torch.broadcast_shapes(*leads)
+    except RuntimeError:
+        seen = ", ".join(map(str, sorted({axes for axes in leads if axes})))
+        raise ValueError(f"leading axes {seen}: wanted batches that broadcast against each other") from None
+    batch, steps = math.prod(lead), gravity.shape[-2]
+
+    def wide(t: Tensor, rank: int) -> Tensor:
+        tail = t.shape[t.ndim - rank :]
+        return t.expand((*lead, *tail)).reshape((batch, *tail))
+
+    plane_rows = [torch.stack([wide(n, 0) for n in plane], -1) for plane in numbers]
+    all_planes = torch.stack(plane_rows, 1) if planes else x.new_zeros(batch, 0, layout.PLANE)
+    all_forces = [wide(f, 2).transpose(0, 1) for f in forces]
+    # A grid node of each simulation: on the first plane of each axis, else at the lower corner of the box.
+    origin = []
+    for axis in range(3):
+        first = next((i for i, plane in enumerate(planes) if plane.axis == axis), None)
+        origin.append(x.new_full((batch,), low[axis]) if first is None else all_planes[:, first, layout.PLANE_OFFSET])
+    inputs = Inputs(
+        coefficients=coefficients(attached, wide),
+        prony=wide(prony, 2),
+        pressure=wide(pressure, 2).permute(2, 0, 1),
+        gravity=wide(gravity, 2).transpose(0, 1),
+        force=torch.stack(all_forces, 2) if forces else x.new_zeros(steps, batch, 0, 3),
+        planes=all_planes,
+        origin=torch.stack(origin, -1),
+    )
+    return lead, inputs, wide
 
 
 def on_lattice(
     scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, weight: Tensor
 ) -> tuple[Scene, Inputs, Tensor, Tensor, Tensor]:
-    """From particles to the points of their lattice, in everything that counts particles."""
+    """From particles to the points of their lattice, in all data by particle."""
     lattice = Lattice.around(x[0], scene.cell)
     offset = (x - x[:1]).detach()
     if bool(((offset - offset[:, :1]).abs() > 1e-3 * scene.cell).any()):
@@ -55,7 +126,7 @@ def body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
     return pairs + [(t, 2) for t in (body.velocity, body.stiffening, attached.anchor) if t is not None]
 
 
-def coefficients(attached: Attached, wide) -> Tensor:
+def coefficients(attached: Attached, wide: Wide) -> Tensor:
     """Particle coefficients [B, COEFFICIENTS, N]; ``wide`` broadcasts a tensor over the batch."""
     body = attached.body
     zero = torch.zeros_like(body.volume)
@@ -81,12 +152,12 @@ def coefficients(attached: Attached, wide) -> Tensor:
     return torch.stack(rows, 1)
 
 
-def supply_at(body: Body, pressure: Waveform | None, times: Tensor, **like) -> Tensor:
+def supply_at(body: Body, pressure: Waveform | None, times: Tensor) -> Tensor:
     """Supply pressure [..., chambers, T + 1]."""
     chambers = int(body.chamber.max()) + 1
     if pressure is None:
-        return torch.zeros(chambers, len(times), **like)
-    values = pressure.at(times.to(pressure.time)).to(**like)
+        return times.new_zeros(chambers, len(times))
+    values = pressure.at(times.to(pressure.time))
     if values.ndim == 1:
         values = values.unsqueeze(0)
     if values.shape[-2] != chambers:
@@ -94,7 +165,7 @@ def supply_at(body: Body, pressure: Waveform | None, times: Tensor, **like) -> T
     return values
 
 
-def gravity_at(gravity, times: Tensor, **like) -> Tensor:
+def gravity_at(gravity, times: Tensor) -> Tensor:
     """Gravity at each substep [..., T, 3]."""
     if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
         wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
@@ -102,9 +173,9 @@ def gravity_at(gravity, times: Tensor, **like) -> Tensor:
             raise ValueError(
                 f"gravity: shape {tuple(gravity[1].shape)}, wanted [..., S, 3] over {len(gravity[0])} times"
             )
-        values = wave.at(times.to(gravity[0])).transpose(-1, -2).to(**like)
+        values = wave.at(times.to(gravity[0])).transpose(-1, -2)
     else:
-        constant = torch.as_tensor(gravity, **like)
+        constant = gravity if isinstance(gravity, Tensor) else torch.as_tensor(gravity, dtype=times.dtype)
         if constant.shape[-1:] != (3,):
             raise ValueError(f"gravity: shape {tuple(constant.shape)}, wanted [..., 3]")
         values = constant.unsqueeze(-2).expand(*constant.shape[:-1], len(times), 3)
@@ -172,6 +243,29 @@ def check_weight(weight: Tensor, count: int) -> Tensor:
     if not bool(torch.isfinite(weight.detach()).all() & (weight.detach().sum(-1) > 0).all()):
         raise ValueError("weight: not finite or all zero, wanted finite numbers with a positive sum")
     return weight
+
+
+def check_start(start: Tensor, scene: Scene, inputs: Inputs, formulation: str) -> None:
+    """Refuse a state to start from that is not one of this body and formulation."""
+    if not isinstance(start, Tensor):
+        raise ValueError(f"start: {type(start).__name__}, wanted a Trajectory or its final state")
+    like, elements = inputs.coefficients, inputs.prony.shape[1]
+    batch, _, points = like.shape
+    if scene.lattice is None:
+        wanted = (batch, layout.state_components(elements), points)
+    else:
+        wanted = (batch, layout.lattice_components(scene.lattice.nodes, points, elements))
+    if tuple(start.shape) != wanted:
+        raise ValueError(
+            f"start: a state of shape {tuple(start.shape)}, wanted {wanted}, as for {batch} simulation(s) of this body "
+            f"with {elements} Maxwell elements in the {formulation!r} formulation"
+        )
+    if start.dtype != like.dtype or start.device != like.device:
+        raise ValueError(
+            f"start: {start.dtype} on {start.device}, wanted {like.dtype} on {like.device} as body.position"
+        )
+    if not bool(torch.isfinite(start.detach()).all()):
+        raise ValueError("start: a state with values that are not finite, wanted finite numbers")
 
 
 def check_probes(probes: Tensor, count: int) -> None:

@@ -1,4 +1,4 @@
-"""The simulator: a body, what acts on it, and how long, to a named trajectory; differentiable in all of them."""
+"""The simulator: from a body, its loads and a duration to a trajectory, differentiable in all of them."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from torch import Tensor, nn
 
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.assembly import (
-    MEMORY,
-    body_tensors,
+    assemble,
     check_body,
     check_probes,
+    check_start,
     check_weight,
-    coefficients,
     gravity_at,
     on_lattice,
     supply_at,
 )
+from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
 from torchsoro.simulation.contact import Plane, check_offsets
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.loads import Load, attach
+from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.ops.affine import velocity_gradient
 from torchsoro.simulation.ops.rollout import initial_state, refuse_transforms, rollout
@@ -35,19 +35,17 @@ from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
 
 TRANSFERS = {"apic": 0.0, "flip": 1.0}
 FORMULATIONS = ("updated", "total")
-_LARGEST = 2**31 - 1  # Taichi indexes a buffer with 32 bits
-_NODE_SHARE = 1.15  # what is kept of the nodes, for each byte of particle state
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """What was recorded; the leading batch is there only if something simulated had one.
+    """Recorded motion; with a leading batch if any argument of the simulation had one.
 
     Attributes:
         time: [S] s, from the start of the first of the runs that went on from each other.
         position: Probes [..., S, P, 3] m.
         velocity: Probes [..., S, P, 3] m/s.
-        center_of_gravity: [..., S, 3] m, weighted as asked for.
+        center_of_gravity: [..., S, 3] m, weighted by ``weight`` of the call.
         center_velocity: [..., S, 3] m/s.
         chamber_volume: Gas volume of each chamber [..., S, chambers] m3.
         chamber_pressure: Mean gas pressure (Eq. 10) of each chamber [..., S, chambers] Pa.
@@ -66,50 +64,6 @@ class Trajectory:
     probes: Tensor
     final: Tensor
     dt: float
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """How a rollout is kept for its gradient.
-
-    Attributes:
-        segment: Substeps between two kept states.
-        keep: Keep every state of a segment in the forward pass, so that backward need not compute it again.
-        memory: What this takes [bytes].
-    """
-
-    segment: int
-    keep: bool
-    memory: int
-
-
-def plan_checkpoints(
-    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = _NODE_SHARE
-) -> Plan:
-    """Choose a plan within a memory budget: everything kept if it fits, else segments.
-
-    Args:
-        steps: Substeps of the rollout.
-        state_bytes: Bytes of one state.
-        element_bytes: Bytes of a number, 4 or 8.
-        budget: Bytes.
-        node_share: What is kept of a step in all, over the state.
-
-    Raises:
-        ValueError: if no plan fits; says the smallest budget that does.
-    """
-    each = int(state_bytes * node_share)
-    most = max(1, _LARGEST * element_bytes // state_bytes - 1)
-    if each * (steps + 1) <= budget and steps <= most:
-        return Plan(segment=steps, keep=True, memory=each * (steps + 1))
-    # Long segments cost little more than short ones to begin with, so the longest that leave room for their starts.
-    segment = min(most, steps, math.isqrt(steps) + 1)
-    least = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
-    if least > budget:
-        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")
-    segment = min(most, max(segment, (budget - least) // each))
-    memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
-    return Plan(segment=segment, keep=False, memory=memory)
 
 
 class Simulator(nn.Module):
@@ -136,7 +90,7 @@ class Simulator(nn.Module):
             rad/s with a substep of 0.1 ms loses in five turns, with apic, 0.02, 0.05 and 0.11 % of its speed for edges
             of 2, 4 and 6 cells; with flip 25, 6.8 and 2.8 %.
         formulation: "updated" or "total".
-        memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 16 GiB on CUDA if None.
+        memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 6 GiB on CUDA if None.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
         safety: Share of the largest stable step that dt = "auto" takes.
 
@@ -200,13 +154,13 @@ class Simulator(nn.Module):
         """Simulate.
 
         Args:
-            body: Particles; leading axes are a batch of independent simulations, and so are those of what follows.
+            body: Particles; leading axes are a batch of independent simulations, as are those of the arguments below.
             duration: [s], a whole number of substeps.
             prony: Maxwell elements of the solids.
             pressure: Gauge pressure p_act of the chambers [..., chambers, S], or [S] for a single chamber.
             gravity: [..., 3] m/s2; or a pair of times [S] and values [..., S, 3], interpolated linearly.
             planes: Ground and walls.
-            loads: What is attached.
+            loads: Forces, point masses, springs and drag.
             sample_every: Time between two samples [s], a whole number of substeps; about a hundred samples if None.
             probes: Particles to record, int64 [P]; none if None.
             weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None.
@@ -223,7 +177,6 @@ class Simulator(nn.Module):
         """
         refuse_transforms()
         x = body.position
-        like = {"dtype": x.dtype, "device": x.device}
         if self.dt != "auto":
             steps, every = _steps(duration, sample_every, self.dt)
         check_body(body)
@@ -239,79 +192,64 @@ class Simulator(nn.Module):
         state = start.final if isinstance(start, Trajectory) else start
         began, times = self._clock(start, steps, dt, prony)
         times = times.to(x.device)
-        supply = supply_at(body, pressure, times, **like)
-        pull = gravity_at(gravity, times[:-1], **like)
-        forces = [force.at(times[:-1]).to(**like) for force in attached.forces]
-        maxwell = torch.zeros(0, 3, **like) if prony is None else prony.discrete(dt).to(**like)
-        numbers = [[torch.as_tensor(n, **like) for n in plane.numbers()] for plane in planes]
-        mass = body.mass if weight is None else check_weight(weight, x.shape[-2]).to(**like)
+        maxwell = x.new_zeros(0, 3) if prony is None else prony.discrete(dt).to(x)
+        mass = body.mass if weight is None else check_weight(weight, x.shape[-2]).to(x)
+        where = x.new_zeros(0, dtype=torch.int64) if probes is None else probes.to(x.device)
+        check_probes(where, x.shape[-2])
 
-        ranks = [(x, 2), (maxwell, 2), (supply, 2), (pull, 2), (mass, 1), *((f, 2) for f in forces)]
-        ranks += [(n, 0) for plane in numbers for n in plane]
-        ranks += [(t, t_rank) for t, t_rank in body_tensors(attached)]
-        leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
-        try:
-            lead = torch.broadcast_shapes(*leads)
-        except RuntimeError:
-            seen = ", ".join(map(str, sorted({axes for axes in leads if axes})))
-            raise ValueError(f"leading axes {seen}: wanted batches that broadcast against each other") from None
-        batch = math.prod(lead)
-
-        def wide(t: Tensor, rank: int) -> Tensor:
-            tail = t.shape[t.ndim - rank :]
-            return t.expand((*lead, *tail)).reshape((batch, *tail))
-
-        planes_tensor = torch.zeros(batch, 0, 3, **like)
-        if planes:
-            planes_tensor = torch.stack([torch.stack([wide(n, 0) for n in p], -1) for p in numbers], 1)
-        force_tensor = torch.zeros(steps, batch, 0, 3, **like)
-        if forces:
-            force_tensor = torch.stack([wide(f, 2).transpose(0, 1) for f in forces], 2)
-        whole = Inputs(
-            coefficients=coefficients(attached, wide),
-            prony=wide(maxwell, 2),
-            pressure=wide(supply, 2).permute(2, 0, 1),
-            gravity=wide(pull, 2).transpose(0, 1),
-            force=force_tensor,
-            planes=planes_tensor,
-            origin=self._origin(planes, planes_tensor, batch, **like),
+        lead, whole, wide = assemble(
+            attached,
+            prony=maxwell,
+            pressure=supply_at(body, pressure, times).to(x),
+            gravity=gravity_at(gravity, times[:-1]).to(x),
+            planes=planes,
+            forces=[force.at(times[:-1]).to(x) for force in attached.forces],
+            weight=mass,
+            low=self.low,
         )
-        scene = Scene(
+        scene = self._scene(attached, planes, where, dt)
+        velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
+        x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
+        if self.formulation == "total":
+            scene, whole, x, velocity, weights = on_lattice(scene, whole, x, velocity, weights)
+        if state is not None:
+            check_start(state, scene, whole, self.formulation)
+        else:
+            state = self._state(scene, whole, x, velocity, moving=body.velocity is not None)
+        samples = sorted({*range(0, steps + 1, every), steps})
+        observed, final = self._integrate(scene, whole, state, weights, samples, began)
+        shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in observed]
+        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
+
+    def _scene(self, attached: Attached, planes: Sequence[Plane], probes: Tensor, dt: float) -> Scene:
+        """Constant data of the run, by particle."""
+        body = attached.body
+        kind = body.chamber.to(device=probes.device, dtype=torch.int32)
+        contact = [[plane.axis, plane.side, int(plane.sticks)] for plane in planes]
+        return Scene(
             dt=dt,
             cell=self.cell,
             blend=TRANSFERS[self.transfer],
             low=self.low,
             high=self.high,
-            kind=body.chamber.to(device=x.device, dtype=torch.int32),
+            kind=kind,
             share=attached.share,
-            plane_kind=torch.tensor(
-                [[p.axis, p.side, int(p.sticks)] for p in planes], dtype=torch.int32, device=x.device
-            ).reshape(-1, 3),
+            plane_kind=kind.new_tensor(contact).reshape(-1, 3),
             springs=attached.spring is not None,
             viscous=_present(body, body.viscosity, body.volume_viscosity),
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
-            probes=torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device),
+            probes=probes,
         )
-        check_probes(scene.probes, x.shape[-2])
-        velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
-        x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
-        if self.formulation == "total":
-            scene, whole, x, velocity, weights = on_lattice(scene, whole, x, velocity, weights)
-        if state is None and scene.lattice is not None:
-            there = scene.kind != layout.ABSENT
-            state = total_state(scene.lattice, x, velocity, there, maxwell.shape[-2])
-        elif state is None:
-            spin = None
-            if body.velocity is not None:
-                spin = velocity_gradient(x, velocity, origin=whole.origin, cell=self.cell)
-            state = initial_state(x, velocity, maxwell.shape[-2], affine=spin)
-        samples = sorted({*range(0, steps + 1, every), steps})
-        seen, final = self._march(scene, whole, state, weights, samples, began)
-        shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in seen]
-        where = torch.zeros(0, dtype=torch.int64, device=x.device) if probes is None else probes.to(x.device)
-        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
 
-    def _march(
+    def _state(self, scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
+        """State of the undeformed body."""
+        elements = whole.prony.shape[1]
+        if scene.lattice is not None:
+            return total_state(scene.lattice, x, velocity, scene.kind != layout.ABSENT, elements)
+        spin = velocity_gradient(x, velocity, origin=whole.origin, cell=self.cell) if moving else None
+        return initial_state(x, velocity, elements, affine=spin)
+
+    def _integrate(
         self, scene: Scene, whole: Inputs, state: Tensor, weight: Tensor, samples: list[int], began: int
     ) -> tuple[list[Tensor], Tensor]:
         """Run the segments of the plan one after the other; ``began`` substeps went before."""
@@ -321,13 +259,13 @@ class Simulator(nn.Module):
         )
         segment, keep = steps, False
         if differentiable:
-            budget = self.memory_budget or MEMORY[state.device.type]
+            share = {} if scene.lattice is None else {"node_share": 1 + 3 * scene.lattice.nodes / state.shape[1]}
             plan = plan_checkpoints(
                 steps=steps,
                 state_bytes=state.numel() * state.element_size(),
-                node_share=_NODE_SHARE if scene.lattice is None else 1 + 3 * scene.lattice.nodes / state.shape[1],
                 element_bytes=state.element_size(),
-                budget=budget,
+                budget=self.memory_budget or MEMORY[state.device.type],
+                **share,
             )
             segment, keep = (plan.segment, plan.keep) if self.segment is None else (self.segment, False)
         parts: list[tuple[Tensor, ...]] = []
@@ -382,18 +320,18 @@ class Simulator(nn.Module):
         sample_every: float | None = None,
         loads: Sequence[Load] = (),
     ) -> float:
-        """The substep [s] of a call, which every call asks for first.
+        """The substep [s] of a call.
 
         Args:
             body: Particles.
             prony: Maxwell elements of the solids.
             duration: [s].
             sample_every: Time between two samples [s].
-            loads: What is attached.
+            loads: Forces, point masses, springs and drag.
 
         Raises:
-            ValueError: if a given step is above the stability limit of the body with its loads; says the term that sets
-                it.
+            ValueError: if a given step is above the stability limit of the body with its loads; the
+                message names the term that sets it.
         """
         if self.dt == "auto":
             limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation, loads=loads)
@@ -407,15 +345,6 @@ class Simulator(nn.Module):
                 f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {STABLE_COURANT})"
             )
         return self.dt
-
-    def _origin(self, planes: Sequence[Plane], numbers: Tensor, batch: int, **like) -> Tensor:
-        """A grid node of each simulation: on the first plane of each axis, else the box's lower corner."""
-        columns = []
-        for axis in range(3):
-            first = next((i for i, plane in enumerate(planes) if plane.axis == axis), None)
-            low = torch.full((batch,), self.low[axis], **like)
-            columns.append(low if first is None else numbers[:, first, layout.PLANE_OFFSET])
-        return torch.stack(columns, -1)
 
 
 def _named(seen: list[Tensor]) -> dict[str, Tensor]:
@@ -437,7 +366,7 @@ def _steps(duration: float, sample_every: float | None, dt: float) -> tuple[int,
 
 
 def _whole(name: str, value: float, dt: float) -> int:
-    """How many substeps a time is."""
+    """A time as a number of substeps."""
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} = {value}: wanted finite and positive")
     steps = round(value / dt)
@@ -447,7 +376,7 @@ def _whole(name: str, value: float, dt: float) -> int:
 
 
 def _present(body: Body, *coefficients: Tensor | None) -> bool:
-    """Whether a solid has any of these coefficients [..., N], or one that is yet to be found."""
+    """Whether any of these coefficients [..., N] of the solid differs from zero or requires a gradient."""
     given = [v for v in coefficients if v is not None]
     return any(v.requires_grad or bool((v[..., body.chamber < 0] != 0).any()) for v in given)
 

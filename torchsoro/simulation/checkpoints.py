@@ -1,0 +1,54 @@
+"""Memory of a rollout for its gradient: all states, or checkpoints between which states are computed again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # default budget by device, bytes
+_LARGEST = 2**31 - 1  # most numbers in a buffer, which Taichi indexes with 32 bits
+_NODE_SHARE = 1.15  # bytes kept of particles and nodes, over those of the particles alone
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a rollout keeps for its gradient.
+
+    Attributes:
+        segment: Substeps between two kept states.
+        keep: Keep every state of a segment in the forward pass, so that backward need not compute it again.
+        memory: Memory of the plan [bytes].
+    """
+
+    segment: int
+    keep: bool
+    memory: int
+
+
+def plan_checkpoints(
+    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = _NODE_SHARE
+) -> Plan:
+    """Choose a plan within a memory budget: everything kept if it fits, else segments.
+
+    Args:
+        steps: Substeps of the rollout.
+        state_bytes: Bytes of one state.
+        element_bytes: Bytes of a number, 4 or 8.
+        budget: Bytes.
+        node_share: Bytes kept of a substep, over those of its state.
+
+    Raises:
+        ValueError: if no plan fits; says the smallest budget that does.
+    """
+    each = int(state_bytes * node_share)
+    most = max(1, _LARGEST * element_bytes // state_bytes - 1)
+    if each * (steps + 1) <= budget and steps <= most:
+        return Plan(segment=steps, keep=True, memory=each * (steps + 1))
+    # Long segments cost little more than short ones to begin with, so the longest that leave room for their starts.
+    segment = min(most, steps, math.isqrt(steps) + 1)
+    least = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    if least > budget:
+        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")
+    segment = min(most, max(segment, (budget - least) // each))
+    memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
+    return Plan(segment=segment, keep=False, memory=memory)
