@@ -1,4 +1,4 @@
-"""What explanations are compared with: names that are known in advance, forces that were planted, files."""
+"""Baselines: names that are known in advance, forces that were planted, and the files that they write."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def baselines() -> ModuleType:
     return importlib.import_module("baselines")
 
 
-def test_terms_that_are_not_there_are_dropped(baselines):
+def test_sequential_thresholding_keeps_the_two_terms_of_six_that_made_the_data(baselines):
     rng = np.random.default_rng(0)
     A = rng.normal(size=(400, 6)) * np.array([1.0, 100.0, 1.0, 0.01, 1.0, 1.0])
     y = 3.0 * A[:, 0] - 200.0 * A[:, 3] + 0.1 * rng.normal(size=400)
@@ -28,7 +28,7 @@ def test_terms_that_are_not_there_are_dropped(baselines):
     assert x[[0, 3]] == pytest.approx([3.0, -200.0], rel=0.02)
 
 
-def test_a_derivative_of_a_track_bears_lost_samples(baselines):
+def test_second_derivative_of_a_sine_with_lost_samples_within_0_3(baselines):
     time = np.linspace(0.0, 1.0, 201)
     track = np.sin(5 * time)
     track[[7, 50, 51, 120]] = np.nan
@@ -36,7 +36,7 @@ def test_a_derivative_of_a_track_bears_lost_samples(baselines):
     assert found[10:-10] == pytest.approx(-25 * np.sin(5 * baselines.even_times(time))[10:-10], abs=0.3)
 
 
-def test_a_network_learns_a_force_against_the_velocity(baselines):
+def test_force_network_correlates_with_a_force_against_the_velocity_above_0_9(baselines):
     rng = np.random.default_rng(1)
     x = torch.from_numpy(rng.uniform(-1, 1, size=(3, 4, 10, 7)))
     force = -0.02 * x[..., 4:7].numpy()
@@ -51,14 +51,16 @@ def test_a_network_learns_a_force_against_the_velocity(baselines):
     ("method", "verdict", "named"),
     [
         ("modulus-and-damping", "explained", {"modulus"}),  # all that it knows
-        ("all-parameters", "cannot_distinguish", {"density"}),
-        ("force-network", "unknown_physics", set()),  # a network has no names
+        pytest.param("all-parameters", "cannot_distinguish", {"density"}, marks=pytest.mark.slow),
+        pytest.param("force-network", "unknown_physics", set(), marks=pytest.mark.slow),  # a network has no names
         ("sparse-regression", None, set()),
-        ("one-trial", "explained", {"density"}),
-        ("force-map", "unknown_physics", set()),  # no names either, but a place
+        pytest.param("one-trial", "explained", {"density"}, marks=pytest.mark.slow),
+        pytest.param("force-map", "unknown_physics", set(), marks=pytest.mark.slow),  # no names either, but a place
     ],
 )
-def test_a_body_of_another_density(baselines, tmp_path, method, verdict, named):
+def test_baselines_answer_in_the_words_of_explain_on_a_body_of_another_density(
+    baselines, tmp_path, method, verdict, named
+):
     case = ROOT / "tests" / "judged" / "cases" / "case-111"
     baselines.main(baselines.Options(experiment=case, out=tmp_path, method=method, budget=0.5))
     report = json.loads((tmp_path / "explanation.json").read_text())

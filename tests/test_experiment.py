@@ -49,7 +49,7 @@ def experiment(folder: Path, setup: str = SETUP, markers: str | None = None) -> 
     return folder
 
 
-def test_reads_what_is_written(tmp_path):
+def test_setup_values_defaults_and_marker_places_are_read(tmp_path):
     found = read_experiment(experiment(tmp_path))
     setup, (trial,) = found.setup, found.trials
     assert setup.size == (0.04, 0.02, 0.02) and setup.axes == (0, 2) and setup.prony == ((0.5, 0.01),)
@@ -57,7 +57,7 @@ def test_reads_what_is_written(tmp_path):
     np.testing.assert_allclose(trial.recording.place[:, 0], [[0.04 + 1e-3 * k, 0.02 - 1e-3 * k] for k in range(5)])
 
 
-def test_a_trial_replaces_tables_of_the_setup(tmp_path):
+def test_tables_of_trial_toml_replace_those_of_setup_toml(tmp_path):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "trial.toml").write_text(
         "[start]\nvelocity = [1.0, 0.0, 0.0]\n[[load]]\nbox = [[0,0,0],[0.01,0.01,0.01]]\nforce = [0.0, 0.0, -1.0]\n"
@@ -123,7 +123,7 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path):
         ),
     ],
 )
-def test_what_does_not_fit_is_named(tmp_path, old, new, message):
+def test_setup_values_out_of_range_are_refused_by_table_and_key(tmp_path, old, new, message):
     assert old in SETUP
     with pytest.raises(ValueError, match=message):
         read_experiment(experiment(tmp_path, SETUP.replace(old, new)))
@@ -150,12 +150,12 @@ def test_what_does_not_fit_is_named(tmp_path, old, new, message):
         ("time_s\n", r"1 lines, wanted names of columns and numbers below"),
     ],
 )
-def test_bad_tables_are_refused(tmp_path, table, message):
+def test_marker_tables_that_do_not_fit_are_refused_by_line_or_marker(tmp_path, table, message):
     with pytest.raises(ValueError, match=message):
         read_experiment(experiment(tmp_path, markers=table))
 
 
-def test_a_simulation_of_ones_own_is_read_along_all_axes(tmp_path):
+def test_simulated_csv_is_read_along_three_axes(tmp_path):
     table = tmp_path / "trials" / "a" / "simulated.csv"
     folder = experiment(tmp_path)
     assert read_experiment(folder).trials[0].simulated is None
@@ -173,20 +173,20 @@ def test_a_simulation_of_ones_own_is_read_along_all_axes(tmp_path):
         ("0,40,10,20\n0.05,40,10,20\n0.1,40,10,20", "is it in millimetres"),
     ],
 )
-def test_a_simulation_that_says_too_little_is_refused(tmp_path, rows, message):
+def test_simulated_csv_with_gaps_or_too_short_is_refused(tmp_path, rows, message):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "simulated.csv").write_text(f"time_s,tip_x_m,tip_y_m,tip_z_m\n{rows}\n")
     with pytest.raises(ValueError, match=rf"simulated\.csv.*{message}"):
         read_experiment(folder)
 
 
-def test_what_is_recorded_after_the_end_is_not_used(tmp_path):
+def test_samples_after_the_duration_are_left_out(tmp_path):
     rows = "\n".join(f"{0.01 * k},{0.04 + 1e-3 * k},0.02" for k in range(-2, 30))
     recording = read_experiment(experiment(tmp_path, markers=f"time_s,tip_x_m,tip_z_m\n{rows}\n")).trials[0].recording
     assert recording.time[[0, -1]] == pytest.approx([-0.02, 0.1])
 
 
-def test_another_frame_is_refused(tmp_path):
+def test_a_marker_far_from_its_stated_place_is_refused(tmp_path):
     table = "time_s,tip_x_m,tip_z_m\n0,0.34,0.02\n0.02,0.34,0.02\n0.04,0.34,0.02\n"
     with pytest.raises(ValueError, match=r"tip begins at \[0\.34, 0\.02\], .* in the frame of setup\.toml"):
         read_experiment(experiment(tmp_path, markers=table))
@@ -196,7 +196,7 @@ def test_another_frame_is_refused(tmp_path):
     )
 
 
-def test_a_trial_that_differs_in_what_a_twin_is_built_of_is_refused(tmp_path):
+def test_a_trial_with_another_body_is_refused(tmp_path):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "trial.toml").write_text("[body]\nsize = [0.05, 0.02, 0.02]\n")
     with pytest.raises(ValueError, match=r"trial\.toml: table body, wanted the same in all trials"):
@@ -210,7 +210,7 @@ def test_a_pressure_without_a_chamber_is_refused(tmp_path):
         read_experiment(folder)
 
 
-def test_a_name_is_that_of_one_trial(tmp_path):
+def test_a_trial_name_in_trials_and_heldout_is_refused(tmp_path):
     folder = experiment(tmp_path)
     shutil.copytree(folder / "trials", folder / "heldout")
     with pytest.raises(ValueError, match="a in both trials and heldout"):
@@ -225,7 +225,7 @@ def test_no_trial_is_refused(tmp_path):
         read_experiment(folder)
 
 
-def test_a_chamber_needs_its_pressure(tmp_path):
+def test_a_chamber_without_pressure_csv_is_refused(tmp_path):
     chamber = '[[chamber]]\nname = "c"\nbox = [[0.01, 0.005, 0.005], [0.03, 0.015, 0.015]]\n'
     with pytest.raises(ValueError, match=r"no pressure\.csv"):
         read_experiment(experiment(tmp_path, SETUP + chamber))
@@ -233,7 +233,7 @@ def test_a_chamber_needs_its_pressure(tmp_path):
     assert read_experiment(tmp_path).trials[0].pressure.pressure.tolist() == [[0.0, 1000.0]]
 
 
-def test_recordings_check_themselves():
+def test_recordings_of_wrong_shape_or_infinite_places_are_refused():
     time = np.array([0.0, 0.1, 0.2])
     with pytest.raises(ValueError, match="wanted \\[T, M, 3\\]"):
         Recording(time=time, place=np.zeros((3, 1, 2)))
@@ -241,7 +241,7 @@ def test_recordings_check_themselves():
         Recording(time=time, place=np.full((3, 1, 3), math.inf))
 
 
-def test_tables_keep_their_order(tmp_path):
+def test_columns_keep_their_order_and_empty_cells_are_nan(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("a, b\n1,2\n3,\n")
     found = read_table(path)

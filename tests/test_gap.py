@@ -39,7 +39,7 @@ def simulated(found):
     return np.stack([t.simulated.place[:: round(0.005 / 0.001)] for t in found.trials])
 
 
-def test_every_hidden_effect_has_a_name_and_is_not_in_what_is_believed(hide):
+def test_hidden_effects_are_in_the_recording_and_not_in_the_setup(hide):
     plain, truth = hide("nothing")
     assert truth == {} and [t.name for t in plain.heldout] == ["kept"]
     assert np.ptp(track(plain), axis=1).max() > 1e-5
@@ -66,7 +66,7 @@ def test_every_hidden_effect_has_a_name_and_is_not_in_what_is_believed(hide):
     assert all(t.simulated is None for t in hide("nothing", simulated=False)[0].trials)
 
 
-def test_the_twin_of_a_robot_stands_on_its_ground(hide):
+def test_twin_of_a_walker_stays_within_5_mm_of_its_ground(hide):
     found, _ = hide("nothing")
     twin = Twin(found.setup, edge=0.01, walls=1)
     assert twin.grid.cut

@@ -27,7 +27,7 @@ def made(recipe, name, out, **options):
 
 
 @recordings
-def test_the_bar_is_let_go_with_and_without_its_load(recipe, tmp_path):
+def test_sag_of_the_published_bar_with_and_without_its_load(recipe, tmp_path):
     found = made(recipe, "silicone-cantilever-beam", tmp_path)
     assert [t.name for t in found.trials] == ["load_a", "weight_a"]
     assert [t.name for t in found.heldout] == ["load_b", "weight_b"]
@@ -66,14 +66,14 @@ def test_the_arm_bends_away_from_the_chamber_that_is_inflated(recipe, tmp_path):
 @pytest.mark.parametrize(
     "name, message", [("other", "wanted a folder named"), ("silicone-cantilever-beam", "no beam_")]
 )
-def test_what_is_not_there_is_refused(recipe, tmp_path, name, message):
+def test_a_folder_without_recordings_is_refused(recipe, tmp_path, name, message):
     with pytest.raises(ValueError, match=message):
         recipe.main(recipe.Options(recordings=tmp_path / name, out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
 @recordings
-def test_the_bellows_are_held_by_a_force_that_ends(recipe, tmp_path):
+def test_bellows_begin_on_an_arc_of_16_9_degrees_held_by_a_force_that_ends(recipe, tmp_path):
     found = made(recipe, "bellows-actuator", tmp_path)
     (trial,) = found.trials
     (load,) = trial.setup.loads
@@ -89,7 +89,7 @@ def test_the_bellows_are_held_by_a_force_that_ends(recipe, tmp_path):
     assert np.abs(place[-1] - [0.064, found.setup.size[2] / 2]).max() < 1e-3
 
 
-def test_an_experiment_is_not_mixed_with_another(recipe, tmp_path):
+def test_a_folder_that_holds_an_experiment_is_refused(recipe, tmp_path):
     (tmp_path / "trials").mkdir()
     with pytest.raises(ValueError, match="holds an experiment already, wanted a new folder"):
         recipe.fresh(tmp_path)

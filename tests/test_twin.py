@@ -57,7 +57,7 @@ def hollow(trial, pascal=2e3, **changes):
     st.lists(st.floats(0.1, 1.0), min_size=1, max_size=4), st.lists(st.integers(1, 4), min_size=4, max_size=4),
     st.floats(0.05, 0.6), st.lists(st.floats(0.0, 1.0), min_size=5, max_size=5),
 )  # fmt: skip
-def test_splines_are_exact_for_parabolas(lengths, least, edge, shares):
+def test_splines_on_uneven_cells_reproduce_parabolas(lengths, least, edge, shares):
     breaks = [0.0, *np.cumsum(lengths)]
     axis = Axis(divide(breaks, least, edge))
     assert set(np.round(breaks, 9)) <= set(np.round(axis.planes, 9))
@@ -72,7 +72,7 @@ def test_splines_are_exact_for_parabolas(lengths, least, edge, shares):
     np.testing.assert_allclose((weights * square[nodes]).sum(-1), x**2, atol=1e-9)
 
 
-def test_a_body_has_its_mass_centre_and_walls(trial):
+def test_mass_centre_and_wall_areas_of_a_chambered_box_match_its_geometry(trial):
     t = hollow(trial)
     twin = Twin(t.setup, edge=EDGE, walls=2)
     solid = math.prod(t.setup.size) - 0.02 * 0.008 * 0.005
@@ -91,7 +91,7 @@ def test_a_body_has_its_mass_centre_and_walls(trial):
     np.testing.assert_allclose(areas, [0.02 * 0.02, 0.04 * 0.02, 0.04 * 0.02])
 
 
-def test_markers_follow_an_affine_motion(trial):
+def test_markers_and_their_gradients_are_exact_in_an_affine_motion(trial):
     markers = [Marker(name=f"m{i}", at=at) for i, at in enumerate(
         [(0.04, 0.01, 0.02), (0.04, 0.0, 0.0), (0.021, 0.013, 0.026), (0.013, 0.007, 0.011)]
     )]  # fmt: skip
@@ -108,14 +108,14 @@ def test_markers_follow_an_affine_motion(trial):
 
 
 @pytest.mark.parametrize("place", [(0.03, 0.01, 0.01), (0.04, 0.02, 0.02), (0.0391, 0.0012, 0.0197)])
-def test_what_is_attached_is_centred_on_its_place(trial, place):
+def test_shares_of_an_attached_mass_have_its_place_as_centroid(trial, place):
     twin = Twin(trial.setup, edge=EDGE)
     share = twin.at(torch.tensor([place], dtype=torch.float64))[0]
     assert bool((share >= 0).all())
     torch.testing.assert_close(share @ twin.places, torch.tensor(place, dtype=torch.float64))
 
 
-def test_a_load_acts_in_the_middle_of_its_box(trial):
+def test_centroid_of_a_load_is_the_middle_of_its_box(trial):
     box = ((0.03, 0.006, 0.012), (0.04, 0.013, 0.02))
     t = changed(trial, loads=(Load(box=box, force=(0.0, 0.0, -0.1)),))
     push = Twin(t.setup, edge=EDGE)
@@ -131,7 +131,7 @@ def test_a_load_acts_in_the_middle_of_its_box(trial):
         ({"loads": (Load(box=((0.1, 0, 0), (0.2, 0.1, 0.1)), force=(0, 0, 1)),)}, "wanted a box that meets it"),
     ],
 )
-def test_what_the_twin_cannot_do_is_refused(trial, changes, message):
+def test_clamps_chambers_and_loads_that_miss_the_body_are_refused(trial, changes, message):
     t = changed(trial, **changes)
     with pytest.raises(ValueError, match=message):
         Twin(t.setup, edge=EDGE).scenario(t)
@@ -159,7 +159,7 @@ def cantilever(trial, length, width, **changes):
 
 
 @pytest.mark.parametrize("across", [3, 4])
-def test_a_clamped_bar_has_the_frequency_of_its_length(trial, across):
+def test_cantilever_frequency_matches_beam_theory(trial, across):
     from structures import timoshenko
 
     length, width = 0.1, 0.025
@@ -182,7 +182,7 @@ def test_a_clamped_bar_has_the_frequency_of_its_length(trial, across):
     assert abs(fitted[2]) / (2 * math.pi) == pytest.approx(exact, rel=0.006)
 
 
-def test_a_bar_that_was_pulled_aside_rings_when_it_is_let_go(trial):
+def test_a_bar_rings_once_a_load_that_held_it_ends(trial):
     from structures import timoshenko
 
     length, width, force = 0.1, 0.025, 0.02
@@ -212,7 +212,7 @@ def test_a_bar_that_was_pulled_aside_rings_when_it_is_let_go(trial):
 
 
 @pytest.mark.parametrize("stiffening", [0.0, 4.0])
-def test_moves_as_the_particles_of_the_simulator_do(trial, stiffening):
+def test_motion_of_a_loaded_bar_matches_the_material_point_simulator(trial, stiffening):
     """Same laws, other shape functions: a viscoelastic bar that swings far."""
     t = changed(trial, prony=((0.5, 0.01), (0.2, 0.002)), duration=0.15, gravity=(0.0, 0.0, -20.0))
     law = torch.tensor([stiffening, stiffening / 2], dtype=torch.float64)
@@ -248,7 +248,7 @@ def test_moves_as_the_particles_of_the_simulator_do(trial, stiffening):
     assert np.abs(mine).max() > 0.003
 
 
-def test_a_free_body_keeps_its_momentum_and_falls(trial):
+def test_centre_and_spin_of_a_free_body_match_rigid_free_fall(trial):
     t = changed(trial, clamps=(), velocity=(0.3, 0.0, 0.5), angular_velocity=(0.0, 20.0, 0.0), duration=0.1)
     markers = tuple(
         Marker(name=str(i), at=tuple(t.setup.origin[a] + s * t.setup.size[a] for a, s in enumerate(c)))
@@ -268,7 +268,7 @@ def test_a_free_body_keeps_its_momentum_and_falls(trial):
     np.testing.assert_allclose(np.linalg.norm(edge, axis=-1), t.setup.size[0], rtol=0.01)
 
 
-def test_a_fluid_slows_a_free_body_as_its_drag_says(trial):
+def test_velocity_of_a_free_body_in_a_fluid_matches_quadratic_drag(trial):
     t = changed(trial, clamps=(), loads=(), gravity=(0.0, 0.0, 0.0), velocity=(0.5, 0.0, 0.0), duration=0.1)
     twin, drag = Twin(t.setup, edge=EDGE), next(e for e in library() if e.name == "drag")
     through = drag(twin.scenario(t), torch.tensor([[1600.0]], dtype=torch.float64), twin)
@@ -280,7 +280,7 @@ def test_a_fluid_slows_a_free_body_as_its_drag_says(trial):
     assert way < 0.049
 
 
-def test_a_spin_that_was_left_out_is_one_that_is_believed(trial):
+def test_initial_motion_effect_equals_a_spin_stated_in_the_setup(trial):
     t = changed(trial, clamps=(), velocity=(0.0, 0.0, 0.0), duration=0.05)
     effect = next(e for e in library() if type(e).__name__ == "InitialSpin")
     twin = Twin(t.setup, edge=EDGE)
@@ -290,7 +290,7 @@ def test_a_spin_that_was_left_out_is_one_that_is_believed(trial):
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
-def test_a_block_slides_as_far_as_friction_lets_it(trial, tilt):
+def test_sliding_distance_on_a_slope_matches_coulomb_friction(trial, tilt):
     """On a plane, level or not, which is the same to the block if gravity is as steep to it."""
     turn = np.array([[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]])
     low = np.array(trial.setup.origin)
@@ -317,7 +317,7 @@ def test_a_block_slides_as_far_as_friction_lets_it(trial, tilt):
 
 
 @pytest.mark.parametrize(("gap", "speed", "expected"), [(0.0, 0.2, 0.03**0.5), (3e-4, 0.0, -0.05), (6e-4, 0.0, 0.0)])
-def test_adhesion_pulls_as_far_as_it_reaches(trial, gap, speed, expected):
+def test_adhesion_acts_within_its_reach_only(trial, gap, speed, expected):
     """A block that is thrown off loses what it takes to separate; one within reach is drawn in, one beyond is not."""
     low = np.array(trial.setup.origin)
     t = changed(
@@ -340,7 +340,7 @@ def test_adhesion_pulls_as_far_as_it_reaches(trial, gap, speed, expected):
     assert motion.velocity[last, :, 2].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
 
 
-def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
+def test_chamber_volume_grows_with_pressure_and_less_with_air_stiffness(trial):
     t = hollow(trial, duration=0.2, gravity=(0.0, 0.0, 0.0))
     grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).place for k in (0.0, 2e4)]
     moved = [np.abs(p[-1] - p[0]).max() for p in grown]
@@ -358,7 +358,7 @@ def test_a_chamber_grows_with_its_pressure_and_less_with_its_own_air(trial):
     assert abs((free.place[-1] - free.place[0]).mean(0)[0]) < 2e-4
 
 
-def test_variations_move_as_alone(trial):
+def test_variations_in_a_batch_equal_single_simulations(trial):
     twin = Twin(trial.setup, edge=EDGE)
     loaded = changed(trial, loads=(Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.05)),))
     tether = next(e for e in library() if e.name == "tether")
@@ -373,7 +373,7 @@ def test_variations_move_as_alone(trial):
             np.testing.assert_allclose(part.place[18 + row], part.place[row], atol=1e-6)
 
 
-def test_a_variation_that_breaks_down_is_said_to_be_unsound(trial):
+def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
     twin = Twin(trial.setup, edge=EDGE)
     s = twin.scenario(trial)
     wild = s.replace(velocity=s.velocity + torch.tensor([0.0, 1e5])[:, None, None] * torch.ones(1, twin.grid.nodes, 3))
@@ -384,7 +384,7 @@ def test_a_variation_that_breaks_down_is_said_to_be_unsound(trial):
 
 
 @pytest.mark.parametrize("effect", library(), ids=lambda e: type(e).__name__)
-def test_effects_are_nothing_at_zero_and_something_else(trial, effect):
+def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwise(trial, effect):
     free = type(effect).__name__ in ("InitialTilt", "InitialSpin")
     load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
     stick = "stick" if type(effect).__name__ == "Sliding" else 0.4

@@ -27,7 +27,7 @@ def updated(recipes):
     return importlib.import_module("updated")
 
 
-def test_a_force_follows_its_load(updated):
+def test_force_over_time_follows_start_ramp_and_end_of_a_load(updated):
     x = torch.tensor([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     box = ((0.45, 0.0, 0.0), (1.0, 0.1, 0.1))
     t = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6], dtype=torch.float64)
@@ -42,7 +42,7 @@ def test_a_force_follows_its_load(updated):
         np.testing.assert_allclose(force.at(t).numpy(), expected, atol=1e-12)
 
 
-def test_markers_move_with_what_is_linear(updated):
+def test_marker_shares_reproduce_a_linear_motion(updated):
     x = torch.rand(400, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
     at = torch.tensor([[1.0, 0.5, 1.0], [0.4, 0.5, 0.6]], dtype=torch.float64)
     near, shares = updated.around(x, at)
@@ -51,7 +51,7 @@ def test_markers_move_with_what_is_linear(updated):
     np.testing.assert_allclose((shares[..., None] * (x @ A)[near]).sum(1), at @ A, atol=1e-10)
 
 
-def test_a_free_body_falls(updated, tmp_path):
+def test_path_of_a_free_body_matches_free_fall(updated, tmp_path):
     folder = experiment(tmp_path, FREE)
     updated.main(updated.Options(experiments=(folder,)))
     (trial,) = read_experiment(folder).trials
@@ -74,7 +74,7 @@ def off(folder):
     return np.sqrt(((course - same) ** 2).mean(0))[1:] / moved
 
 
-def test_a_clamped_and_loaded_bar_moves_as_the_twin_does(updated, tmp_path):
+def test_loaded_cantilever_matches_the_twin_within_9_percent(updated, tmp_path):
     folder, other = experiment(tmp_path / "one", LOADED), experiment(tmp_path / "other", LOADED)
     assert updated.main(updated.Options(experiments=(folder, other), transfer="flip")) == 1
     tables = [(f / "trials" / "a" / "simulated.csv").read_text() for f in (folder, other)]
@@ -84,7 +84,7 @@ def test_a_clamped_and_loaded_bar_moves_as_the_twin_does(updated, tmp_path):
     assert (off(folder) < np.minimum(0.09, 0.6 * coarse)).all()
 
 
-def test_what_it_is_not_made_for_is_refused(updated, tmp_path):
+def test_half_clamped_faces_oblique_planes_and_uneven_edges_are_refused(updated, tmp_path):
     (trial,) = read_experiment(experiment(tmp_path)).trials
     options = updated.Options(experiments=())
     half = ((-0.001, -0.001, -0.001), (0.0001, 0.011, 0.021))

@@ -1,10 +1,10 @@
-"""Simulate what is believed about experiments by the paper's own formulation, as a simulation of one's own.
+"""Simulate the setups of experiments by the updated formulation, as simulated.csv for explain.py.
 
     python recipes/baselines/updated.py my-experiment another-experiment
     python recipes/explain.py my-experiment --out runs/explained     # what is missing from *that* simulation
 
-Writes ``simulated.csv`` into each folder of ``trials``. Asked is then what the updated material point method left
-out, its own errors included, and not the twin of explain.py: so can be seen what the formulation of a twin is worth.
+Writes ``simulated.csv`` into each folder of ``trials``. explain.py then compares the recordings with this simulation,
+its discretization error included, instead of its own twin: a test of how much the formulation matters.
 For boxes without chambers, clamped at whole faces, and planes along the axes. Trials that are believed to be the same
 are simulated once, in however many experiments they are.
 """
@@ -29,10 +29,10 @@ from torchsoro.sim2real.data.schema import Load
 from torchsoro.sim2real.twin.twin import Twin
 
 FINE = 1e-3  # s, between samples
-BEHIND = 2  # cells behind a clamp, where planes hold every node
-HELD = 1e12  # Pa, that it would take to leave them
+BEHIND = 2  # cells of body behind a clamped face, whose nodes adhesive planes hold
+HELD = 1e12  # Pa, adhesion of those planes: more than any traction
 AROUND = 27  # particles, from whose motion a marker's is interpolated
-SWITCH = 1e-6  # s, in which a force comes that comes at once
+SWITCH = 1e-6  # s, duration of a jump of a force
 MOST = 80  # particles across the shortest edge
 
 

@@ -1,4 +1,4 @@
-"""Scenarios of a body, many variations at once: sixteen to a group and a group to a thread, or all of them on a GPU."""
+"""Simulations of one body in many variations: groups of sixteen, one group to a thread, or all of them on a GPU."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
 from torchsoro.simulation.material import Prony
 
-SAMPLE = 2.5e-3  # s between two samples, between which motion is a cubic
-SAFETY = 1.4  # of the largest step that is surely stable near rest; free blocks and bars are stable up to 1.6
-CUT = 1.0  # the same where cells are body in part only, and nodes may have next to no mass
+SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
+SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars were stable up to 1.6
+CUT = 1.0  # the same where cells are filled in part, whose nodes may have little mass
 SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 THREADS = os.cpu_count() or 1
 
@@ -30,7 +30,7 @@ Lane = tuple[int, int]  # number of the scenario, and of its variation
 
 
 def safety(grid: Grid) -> float:
-    """By how much a step may be longer than what is surely stable."""
+    """Step in use over the bound of a stable step near rest."""
     return CUT if grid.cut else SAFETY
 
 
@@ -39,11 +39,11 @@ class Ensemble:
 
     Args:
         twin: The body.
-        threads: That work side by side.
+        threads: Number of threads.
         device: "cpu", "cuda", or "auto" for a GPU where there is one.
 
     Attributes:
-        room: Variations that take no longer than one.
+        room: Number of variations that take as long as one.
 
     Raises:
         ValueError: for "cuda" without a GPU that Numba can use.
@@ -72,7 +72,7 @@ class Ensemble:
             scenarios: Each with a batch of variations [B], or none.
 
         Returns:
-            For each, its motions [B, ...]; those that broke down are not ``sound``.
+            For each scenario, its motions [B, ...]; diverged ones are not ``sound``.
 
         Raises:
             ValueError: if one is so stiff that no step is short enough.
@@ -136,7 +136,7 @@ class Ensemble:
         ]
 
     def stable(self, s: Scenario) -> np.ndarray:
-        """Largest stable step of each variation [B] s; an element counts with what the fastest oscillation feels."""
+        """Largest stable step of each variation [B] s; a Maxwell element counts by its stiffness within one step."""
         nu = s.poisson_ratio.unsqueeze(-1)
         bulk, shear = s.stiffness / (3 * (1 - 2 * nu)), s.stiffness / (2 * (1 + nu))
         bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch).numpy() for m in (bulk, shear))
@@ -242,7 +242,7 @@ class Ensemble:
 
 
 def _common(s: Scenario) -> object:
-    """What the lanes of a group have in common."""
+    """What the variations of a group must have in common: numbers of elements, planes and springs."""
     elements = 0 if s.prony is None else s.prony.elements
     planes = tuple((tuple(g.normal.tolist()), g.friction is None) for g in s.grounds)
     return elements, planes, len(s.springs)

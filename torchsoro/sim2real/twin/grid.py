@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 
 GAUSS = 0.5 / math.sqrt(3.0)
-BODY, OUTSIDE = -1, -2  # what a cell is that belongs to no chamber
-PARTS = 4  # along each axis of a cell, of which each is body or not
-LEAST = 0.05  # of a cell that is body, below which it is left out
-OUTER = 1.3  # outermost cells are wider than their neighbours, as a spline that ends there is steeper
+BODY, OUTSIDE = -1, -2  # kinds of cells that belong to no chamber
+PARTS = 4  # subdivisions of a cell along each axis, by which its filled share is sampled
+LEAST = 0.05  # filled share of a cell, below which the cell is left out
+OUTER = 1.3  # width of outermost cells over that of their neighbours: the end splines are steeper
 
 
 def divide(breaks: Sequence[float], least: Sequence[int], edge: float) -> np.ndarray:
@@ -43,7 +43,7 @@ class Axis:
 
     Args:
         planes: Of the cells [cells + 1] m.
-        creases: Planes where slopes may jump, so that what is on one side does not hold what is on the other.
+        creases: Planes where slopes may jump (double knots), so that two walls do not share a node.
     """
 
     def __init__(self, planes: np.ndarray, creases: Sequence[float] = ()) -> None:
@@ -82,7 +82,7 @@ class Axis:
 
     @cached_property
     def steep(self) -> float:
-        """The largest sum of N'^2 / N [1/m2] at a point: with it goes the fastest oscillation."""
+        """The largest sum of N'^2 / N [1/m2] at a point, proportional to the square of the highest frequency."""
         weight, slope = self.table
         return float((slope**2 / weight).sum(-1).max())
 
@@ -125,7 +125,7 @@ class Grid:
         self.volumes = (size[:, None] / 8 * mine).reshape(-1)
         """Of the points [P] m3."""
         self.cut = bool((mine < 1).any())
-        """Whether a cell is body in part only."""
+        """Whether a cell is filled in part only."""
 
     @property
     def nodes(self) -> int:

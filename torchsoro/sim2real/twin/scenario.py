@@ -15,14 +15,14 @@ from torchsoro.simulation.material import Prony
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ground:
-    """A plane that the body cannot pass.
+    """A plane that the body does not penetrate.
 
     Attributes:
         normal: Unit normal to the body's side [3].
         offset: Of the plane along it [...] m.
-        friction: Coulomb coefficient [...]; None if it holds what is pressed on it.
-        adhesion: Traction that pulls towards it, and presses on for friction [...] Pa.
-        reach: So far from it [...] m.
+        friction: Coulomb coefficient [...]; None for no slip under compression.
+        adhesion: Traction towards the plane, which also counts as normal traction for friction [...] Pa.
+        reach: Distance up to which adhesion acts [...] m.
     """
 
     normal: Tensor
@@ -81,9 +81,9 @@ class Scenario:
         fluid: Density of what surrounds the body times its drag coefficient [...] kg/m3.
         grounds: Planes.
         pushes: Dead forces.
-        springs: What else holds the body.
+        springs: Springs to the ground.
         duration: Of the trial [s].
-        until: To be simulated until then [s]: a recording whose clock is behind goes on after the trial.
+        until: End of the simulation [s]; after that of the trial where the clock of a recording may be late.
     """
 
     stiffness: Tensor

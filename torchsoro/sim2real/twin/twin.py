@@ -17,8 +17,8 @@ from torchsoro.sim2real.twin.grid import Axis, Grid, divide
 from torchsoro.sim2real.twin.scenario import Ground, Push, Scenario
 from torchsoro.simulation.material import Prony
 
-STEPS = 16  # in which a force grows
-NEAR = 0.005  # of the body, within which a flat face counts as that of a chamber, lest cells be slivers
+STEPS = 16  # of equal size, in which a force ramps up
+NEAR = 0.005  # of the body's edge, within which a flat face counts as that of a chamber, to avoid thin cells
 CELLS = 200_000  # of a grid, with which a simulation takes hours
 
 
@@ -49,7 +49,7 @@ class MarkerMotion:
         )
 
     def plus(self, other: MarkerMotion, share: float = 1.0) -> MarkerMotion:
-        """With a share of another motion [S', M, ...] added, whose last values last."""
+        """With a share of another motion [S', M, ...] added, which is constant after its last sample."""
         at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
         return dataclasses.replace(
             self,
@@ -60,7 +60,7 @@ class MarkerMotion:
 
     @property
     def sound(self) -> np.ndarray:
-        """Which of a batch did not break down, bool [...]."""
+        """Which of a batch did not diverge, bool [...]."""
         return np.asarray((np.isfinite(self.place) & (np.abs(self.place) < 1e3)).all((-3, -2, -1)))
 
 
@@ -104,10 +104,10 @@ class Twin:
             inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
             breaks = [begin, *inner, end]
             least = [walls if setup.cavities else 1] * (len(breaks) - 1)
-            # Where every interval has one cell, what is quadratic along two axes has no strain at the points.
+            # With one cell in every interval, motions quadratic along two axes have no strain at points (hourglassing).
             widest = int(np.diff(breaks).argmax())
             least[widest] = max(least[widest], 2, 0 if setup.cavities else across - len(inner))
-            # Two walls that share a node would pull at each other across the chamber.
+            # Double knots at the faces of chambers: two walls that share a node would be coupled across the chamber.
             axes.append(Axis(divide(breaks, least, edge), inner))
         x, y, z = axes
         self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
@@ -202,7 +202,7 @@ class Twin:
 
 
 def _pushes(load: Load, share: Tensor) -> list[Push]:
-    """A force that grows does so in steps, and one that ends meets its opposite."""
+    """A ramp is a sum of steps; the end of a force is an opposite force that begins then."""
     force, steps = torch.tensor(load.force, dtype=torch.float64), STEPS if load.ramp > 0 else 1
     starts = [load.start + load.ramp * (k + 0.5) / steps for k in range(steps)]
     pushes = [Push(share=share, force=force / steps, start=start) for start in starts]
