@@ -126,9 +126,9 @@ def run_touch(
 ):
     for i in range(n):
         up = ti.Vector([0.0, 0.0, 1.0], dt=ti.f64)
-        out = contact.touch(vector(u, i), up, sticks, friction, hold)
+        out = contact.response(vector(u, i), up, sticks, friction, hold)
         tensor.store_vector(r, 3 * i, 1, out)
-        by_u, by_friction, by_hold = contact.touch_adjoint(vector(u, i), up, sticks, friction, hold, vector(bar, i))
+        by_u, by_friction, by_hold = contact.response_adjoint(vector(u, i), up, sticks, friction, hold, vector(bar, i))
         tensor.store_vector(u_bar, 3 * i, 1, by_u)
         by[2 * i] = by_friction
         by[2 * i + 1] = by_hold
@@ -391,7 +391,7 @@ def test_gas_pressure():
     torch.testing.assert_close(p, torch.tensor([80e3, 94e3, 52e3], dtype=torch.float64), rtol=1e-12, atol=0)
 
 
-def touch(u, *, stick=0, friction=0.0, hold=0.0, bar=None):
+def response(u, *, stick=0, friction=0.0, hold=0.0, bar=None):
     u = torch.as_tensor(u, dtype=torch.float64).reshape(-1, 3)
     bar = torch.zeros_like(u) if bar is None else bar
     r, u_bar, by = torch.zeros_like(u), torch.zeros_like(u), out(len(u), 2)
@@ -412,22 +412,22 @@ def touch(u, *, stick=0, friction=0.0, hold=0.0, bar=None):
         ((3.0, 4.0, 3.0), {"friction": 0.5, "hold": 2.0}, (3.0, 4.0, 1.0)),  # torn off, slower
     ],
 )
-def test_touch(u, settings, wanted):
-    r, _, _ = touch(u, **settings)
+def test_contact_response_sticks_slides_or_tears_off(u, settings, wanted):
+    r, _, _ = response(u, **settings)
     torch.testing.assert_close(r[0], torch.tensor(wanted, dtype=torch.float64), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("stick", [0, 1])
 @pytest.mark.parametrize(("friction", "hold"), [(0.0, 0.0), (0.6, 0.0), (0.6, 0.8)])
-def test_adjoint_of_touch(stick, friction, hold):
+def test_adjoint_of_the_contact_response_equals_central_differences(stick, friction, hold):
     g = torch.Generator().manual_seed(12)
     u, bar, d = (torch.randn(200, 3, generator=g, dtype=torch.float64) for _ in range(3))
     e = 1e-7
-    _, u_bar, by = touch(u, stick=stick, friction=friction, hold=hold, bar=bar)
+    _, u_bar, by = response(u, stick=stick, friction=friction, hold=hold, bar=bar)
 
     def power(sign, **change):
         moved = {"friction": friction, "hold": hold, **{k: v + sign * e for k, v in change.items()}}
-        return (touch(u + (0 if change else sign * e * d), stick=stick, **moved)[0] * bar).sum(1)
+        return (response(u + (0 if change else sign * e * d), stick=stick, **moved)[0] * bar).sum(1)
 
     torch.testing.assert_close((power(1) - power(-1)) / (2 * e), (u_bar * d).sum(1), rtol=1e-6, atol=1e-6)
     if friction:

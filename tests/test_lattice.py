@@ -112,10 +112,10 @@ def test_nodal_masses_sum_to_the_mass_and_balance_about_its_centre(points, seed,
     torch.testing.assert_close(total.sum(1), mass.sum(1), rtol=1e-13, atol=0)
     torch.testing.assert_close(total @ lat.node_places, mass @ quadrature(lat), rtol=1e-12, atol=1e-12)
     # Drag takes its share of a step, implicitly; a node without mass keeps its velocity.
-    left = nodal[:, layout.NODAL_LEFT]
+    factor = nodal[:, layout.NODAL_DRAG_FACTOR]
     there = total > 0
-    torch.testing.assert_close(left[there], torch.full_like(left[there], 1 / (1 + 0.01 * drag)), rtol=1e-12, atol=0)
-    assert bool((left[~there] == 1).all())
+    torch.testing.assert_close(factor[there], torch.full_like(factor[there], 1 / (1 + 0.01 * drag)), rtol=1e-12, atol=0)
+    assert bool((factor[~there] == 1).all())
 
 
 def test_nodes_outside_of_a_face_reach_half_a_cell_to_it():

@@ -17,6 +17,7 @@ from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
+from torchsoro.simulation.kernels.simd_cells import remove_stale_code
 from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
 from torchsoro.simulation.material import Prony
 
@@ -53,6 +54,7 @@ class Ensemble:
         there = device != "cpu" and cuda_ensemble.available()
         if device == "cuda" and not there:
             raise ValueError("device = 'cuda': no GPU with CUDA that numba-cuda can use; wanted 'cpu', 'auto', or one")
+        remove_stale_code()
         self.twin, self.threads, self.device = twin, threads, device
         self.mesh = mesh_of(twin)
         self.body = cuda_ensemble.body_of(self.mesh) if there else None

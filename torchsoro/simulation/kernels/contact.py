@@ -12,7 +12,7 @@ from torchsoro.simulation.kernels.layout import (
     PLANE_STICK,
 )
 
-# Slope below which a point that lands is taken to graze the plane.
+# Slope below which a point that arrives is taken to graze the plane.
 GRAZING = 0.2
 
 
@@ -45,7 +45,7 @@ def normal_of(plane_kind: ti.template(), k, like):
 
 
 @ti.func
-def touch(u, n, stick, friction, hold):
+def response(u, n, stick, friction, hold):
     """Velocity of a node after one plane; ``hold`` is the largest pull-off speed that adhesion cancels in this step.
 
     A node that approaches (or is held back by adhesion) sticks: u = 0; or slides: its normal part vanishes and its
@@ -70,8 +70,8 @@ def touch(u, n, stick, friction, hold):
 
 
 @ti.func
-def touch_adjoint(u, n, stick, friction, hold, r_bar):
-    """Adjoint of :func:`touch`: gradients by u, friction and hold."""
+def response_adjoint(u, n, stick, friction, hold, r_bar):
+    """Adjoint of :func:`response`: gradients by u, friction and hold."""
     u_bar = r_bar
     friction_bar = u[0] * 0
     hold_bar = u[0] * 0
@@ -96,7 +96,7 @@ def touch_adjoint(u, n, stick, friction, hold, r_bar):
 
 
 @ti.func
-def touches(distance):
+def in_contact(distance):
     """Whether a node lies on a plane or behind it."""
     return distance < 1e-4
 
@@ -119,20 +119,20 @@ def contact(planes: ti.template(), plane_kind: ti.template(), at, count, x, mass
         distance = plane_distance(planes, plane_kind, at, k, x, cell)
         n = normal_of(plane_kind, k, u)
         hold = adhesive_speed(planes, at, k, distance, mass, impulse)
-        if touches(distance):
-            r = touch(r, n, plane_kind[3 * k + PLANE_STICK], planes[at + PLANE * k + PLANE_FRICTION], hold)
+        if in_contact(distance):
+            r = response(r, n, plane_kind[3 * k + PLANE_STICK], planes[at + PLANE * k + PLANE_FRICTION], hold)
     return r
 
 
 @ti.func
-def lands(u, n, gap, dt):
+def arrives(u, n, gap, dt):
     """Whether a step of dt would end behind a plane that is ``gap`` away."""
     return u.dot(n) * dt + ti.max(gap, gap * 0) < 0
 
 
 @ti.func
 def carry(u, r, n, gap, dt):
-    """Velocity that carries a point which lands onto the plane: its way until it arrives, in place of that after it.
+    """Velocity that carries a point which arrives onto the plane: its way until it arrives, in place of that after it.
 
     Where it grazes the plane, what it loses along the plane may be much more than its normal speed, and its place, so
     the gradient, would depend on ``gap`` without bound. There it counts as arriving at a slope of GRAZING.
@@ -166,38 +166,38 @@ def carry_adjoint(u, r, n, gap, dt, onto_bar):
 
 
 @ti.func
-def land(u, n, gap, dt, stick, friction, hold):
+def gap_response(u, n, gap, dt, stick, friction, hold):
     """Velocity after a step of dt towards or off a plane that is ``gap`` away, and what carries it onto the plane.
 
     A point that would end behind the plane ends on it: the second result, which is gone afterwards as the impact takes
     the velocity, moves it there. So where a body comes to rest, along the plane too, is a continuous function of where
     it came from, and has a gradient. To stop the velocity as well only when it arrives would multiply that gradient at
-    every landing. Once there, this is :func:`touch`. ``hold`` is negative where adhesion does not reach.
+    every landing. Once there, this is :func:`response`. ``hold`` is negative where adhesion does not reach.
     """
     r = u
     onto = u * 0
-    if lands(u, n, gap, dt):
-        r = touch(u, n, stick, friction, ti.max(hold, hold * 0))
+    if arrives(u, n, gap, dt):
+        r = response(u, n, stick, friction, ti.max(hold, hold * 0))
         onto = carry(u, r, n, gap, dt)
     elif u.dot(n) > 0 and hold >= 0:
-        r = touch(u, n, stick, friction, hold)
+        r = response(u, n, stick, friction, hold)
     return r, onto
 
 
 @ti.func
-def land_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, onto_bar):
-    """Adjoint of :func:`land`: gradients by u, gap, friction and hold."""
+def gap_response_adjoint(u, n, gap, dt, stick, friction, hold, r_bar, onto_bar):
+    """Adjoint of :func:`gap_response`: gradients by u, gap, friction and hold."""
     u_bar = r_bar
     gap_bar = gap * 0
     friction_bar = gap * 0
     hold_bar = gap * 0
-    if lands(u, n, gap, dt):
+    if arrives(u, n, gap, dt):
         pull = ti.max(hold, hold * 0)
-        r = touch(u, n, stick, friction, pull)
+        r = response(u, n, stick, friction, pull)
         carried, by_r, by_gap = carry_adjoint(u, r, n, gap, dt, onto_bar)
-        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, pull, r_bar + by_r)
+        by_u, by_friction, by_hold = response_adjoint(u, n, stick, friction, pull, r_bar + by_r)
         u_bar, gap_bar, friction_bar, hold_bar = by_u + carried, by_gap, by_friction, by_hold
     elif u.dot(n) > 0 and hold >= 0:
-        by_u, by_friction, by_hold = touch_adjoint(u, n, stick, friction, hold, r_bar)
+        by_u, by_friction, by_hold = response_adjoint(u, n, stick, friction, hold, r_bar)
         u_bar, friction_bar, hold_bar = by_u, by_friction, by_hold
     return u_bar, gap_bar, friction_bar, hold_bar

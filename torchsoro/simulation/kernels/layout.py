@@ -104,9 +104,9 @@ HEAD = 63
 STEP_SIZE, EDGE, CORNER, WEIGHT, SLOPE = 0, 1, 2, 5, 11
 LATTICE_NUMBERS = 17
 
-# A node's mass, the way from it to the surface of the matter that it carries, in cells, and what drag leaves of its
-# velocity in a substep.
-NODAL_MASS, NODAL_REACH, NODAL_LEFT = 0, 1, 4
+# A node's mass, the way from it to the surface of the matter that it carries, in cells, and its drag factor: the share
+# of its velocity that implicit drag leaves in a substep.
+NODAL_MASS, NODAL_REACH, NODAL_DRAG_FACTOR = 0, 1, 4
 NODAL = 5
 
 # What a point hands to the nodes: a tensor that goes with the slopes and a vector that goes with the weights; the same

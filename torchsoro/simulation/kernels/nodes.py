@@ -5,10 +5,10 @@ import taichi as ti
 from torchsoro.simulation.kernels.contact import (
     adhesive_speed,
     contact,
+    in_contact,
     normal_of,
     plane_distance,
-    touch_adjoint,
-    touches,
+    response_adjoint,
 )
 from torchsoro.simulation.kernels.layout import (
     ADJOINT_FLIP,
@@ -176,9 +176,9 @@ def node_adjoint(
             hold = adhesive_speed(planes, planes_at, k, distance, mass, impulse)
             n = normal_of(plane_kind, k, u)
             arriving = contact(planes, plane_kind, planes_at, k, x, mass, pushed, cell, dt)
-            if touches(distance):
+            if in_contact(distance):
                 stick, friction = plane_kind[3 * k + PLANE_STICK], planes[planes_at + PLANE * k + PLANE_FRICTION]
-                u_bar, friction_bar, hold_bar = touch_adjoint(arriving, n, stick, friction, hold, moved_bar)
+                u_bar, friction_bar, hold_bar = response_adjoint(arriving, n, stick, friction, hold, moved_bar)
                 moved_bar = u_bar
                 add(atomic, planes_bar, planes_bar_at + PLANE * k + PLANE_FRICTION, friction_bar)
                 if distance > -0.5:

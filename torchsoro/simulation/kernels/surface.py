@@ -1,13 +1,13 @@
 """Planes against the nodes of the total-Lagrangian lattice, and the adjoint.
 
-A node outside of a face lies half a cell in front of it, and of a design the outer layers may be void. So a node meets
-a plane not where it is itself but where the surface of the matter is that it carries: some way (``NODAL_REACH``, in
-cells, known from the masses) towards its neighbours, wherever these have moved.
+A node outside of a face lies half a cell in front of it, and of a design the outer layers may be void. So a node
+responds to a plane not where it is itself but where the surface of the matter is that it carries: some way
+(``NODAL_REACH``, in cells, known from the masses) towards its neighbours, wherever these have moved.
 """
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.contact import axis_normal, land, land_adjoint
+from torchsoro.simulation.kernels.contact import axis_normal, gap_response, gap_response_adjoint
 from torchsoro.simulation.kernels.lattice import nodes_per_axis, product
 from torchsoro.simulation.kernels.layout import (
     BATCH,
@@ -35,7 +35,7 @@ from torchsoro.simulation.kernels.tensor import add, load_vector
 
 # How far in front of a plane a node is looked at, and how near it is held by adhesion, in cells.
 LOOK = 2.0
-TOUCH = 1e-3
+CONTACT_DISTANCE = 1e-3
 
 
 @ti.func
@@ -82,13 +82,13 @@ def adhesive_hold(ints: ti.template(), fixed: ti.template(), plane, gap, mass):
     """Pull-off speed that adhesion cancels in a step; negative where it does not reach."""
     edge = fixed[EDGE]
     hold = mass * 0 - 1
-    if gap < TOUCH * edge:
+    if gap < CONTACT_DISTANCE * edge:
         hold = fixed[plane + PLANE_ADHESION] * edge * edge * fixed[STEP_SIZE] / mass
     return hold
 
 
 @ti.func
-def meet(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, n, count, mass, u):
+def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, n, count, mass, u):
     """Velocity of node i after the first ``count`` planes, one after the other, and what carries it onto them."""
     r = u
     onto = u * 0
@@ -103,14 +103,14 @@ def meet(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b,
             hold = adhesive_hold(ints, fixed, plane, gap, mass)
             normal = axis_normal(ints[kind + PLANE_AXIS], sign, u)
             stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
-            left, way = land(r, normal, gap, fixed[STEP_SIZE], stick, friction, hold)
-            r = left
+            after, way = gap_response(r, normal, gap, fixed[STEP_SIZE], stick, friction, hold)
+            r = after
             onto += way
     return r, onto
 
 
 @ti.func
-def meet_adjoint(
+def surface_response_adjoint(
     ints: ti.template(),
     fixed: ti.template(),
     state: ti.template(),
@@ -124,7 +124,7 @@ def meet_adjoint(
     r_bar,
     onto_bar,
 ):
-    """Adjoint of :func:`meet`: gradients by the velocity, by the place of the surface, and by the mass.
+    """Adjoint of :func:`surface_response`: gradients by the velocity, by the place of the surface, and by the mass.
 
     The gradients by planes and reaches go to sums of their own for each node, so that no two threads meet.
     """
@@ -143,10 +143,10 @@ def meet_adjoint(
         if sign * (node - fixed[plane + PLANE_OFFSET]) < LOOK * fixed[EDGE]:
             gap = sign * (surface - fixed[plane + PLANE_OFFSET])
             hold = adhesive_hold(ints, fixed, plane, gap, mass)
-            arriving, _ = meet(ints, fixed, state, at, b, i, n, k, mass, u)
+            arriving, _ = surface_response(ints, fixed, state, at, b, i, n, k, mass, u)
             normal = axis_normal(axis, sign, u)
             friction, stick = fixed[plane + PLANE_FRICTION], ints[kind + PLANE_STICK]
-            by_u, gap_bar, by_friction, hold_bar = land_adjoint(
+            by_u, gap_bar, by_friction, hold_bar = gap_response_adjoint(
                 arriving, normal, gap, dt, stick, friction, hold, u_bar, onto_bar
             )
             u_bar = by_u

@@ -52,7 +52,7 @@ from torchsoro.simulation.kernels.layout import (
     KIND,
     NEAR_NODES,
     NODAL,
-    NODAL_LEFT,
+    NODAL_DRAG_FACTOR,
     NODAL_MASS,
     NODES,
     NOW,
@@ -84,7 +84,7 @@ from torchsoro.simulation.kernels.layout import (
     VOLUMES,
 )
 from torchsoro.simulation.kernels.stress import least_ratio, piola, pull_back, stiffening, viscous_piola, void_piola
-from torchsoro.simulation.kernels.surface import meet
+from torchsoro.simulation.kernels.surface import surface_response
 from torchsoro.simulation.kernels.tensor import (
     cofactor,
     contract,
@@ -261,10 +261,10 @@ def total_substep(
                                 p = chamber_pressure(ints, fixed, p_act, sum_chamber(ints, scratch, one), one)
                                 f -= p * sum_node(fixed, scratch, ints[AREA_SHEETS] + one * count, i, n)
                         pull = load_vector(supply, ints[GRAVITY] + (t * ints[BATCH] + b) * 3, 1)
-                        left = fixed[ints[NODES] + (b * NODAL + NODAL_LEFT) * nodes + i]
-                        v = left * (v + dt * (pull - f / mass))
+                        drag_factor = fixed[ints[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
+                        v = drag_factor * (v + dt * (pull - f / mass))
                         store_vector(kept, ints[PUSHED] + (slot + b) * 3 * nodes + i, nodes, v)
-                        after, onto = meet(ints, fixed, state, at - i, b, i, n, ints[PLANES], mass, v)
+                        after, onto = surface_response(ints, fixed, state, at - i, b, i, n, ints[PLANES], mass, v)
                         v = after
                         d += dt * (onto + v)
                     store_vector(state, out, nodes, d)

@@ -57,7 +57,7 @@ from torchsoro.simulation.kernels.layout import (
     LINE,
     NEAR_NODES,
     NODAL,
-    NODAL_LEFT,
+    NODAL_DRAG_FACTOR,
     NODAL_MASS,
     NODES,
     NODES_BAR,
@@ -108,7 +108,7 @@ from torchsoro.simulation.kernels.stress import (
     void_piola_adjoint,
     void_work,
 )
-from torchsoro.simulation.kernels.surface import meet_adjoint, surface_spread
+from torchsoro.simulation.kernels.surface import surface_response_adjoint, surface_spread
 from torchsoro.simulation.kernels.tensor import (
     add,
     cofactor,
@@ -171,17 +171,17 @@ def node_adjoint(
             v_bar += dt * d_bar
             mass_bar = mass * 0
             if ints[PLANES] > 0:
-                u_bar, by_surface, by_mass = meet_adjoint(
+                u_bar, by_surface, by_mass = surface_response_adjoint(
                     ints, fixed, state, at, sums, b, i, n, mass, u, v_bar, dt * d_bar
                 )
                 v_bar, mass_bar = u_bar, by_mass
                 surfaces = ints[SURFACES] + ((t % 2) * ints[BATCH] + b) * 3 * nodes
                 store_vector(back, surfaces + i, nodes, by_surface)
-            left = fixed[ints[NODES] + (b * NODAL + NODAL_LEFT) * nodes + i]
-            add(False, sums, ints[NODES_BAR] + (b * NODAL + NODAL_LEFT) * nodes + i, u.dot(v_bar) / left)
-            v_bar *= left
+            drag_factor = fixed[ints[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
+            add(False, sums, ints[NODES_BAR] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i, u.dot(v_bar) / drag_factor)
+            v_bar *= drag_factor
             pull = dt * load_vector(supply, ints[GRAVITY] + slot * 3, 1)
-            mass_bar -= (u / left - v - pull).dot(v_bar) / mass
+            mass_bar -= (u / drag_factor - v - pull).dot(v_bar) / mass
             add(False, sums, ints[NODES_BAR] + (b * NODAL + NODAL_MASS) * nodes + i, mass_bar)
             store_vector(back, ints[FORCES] + b * 3 * nodes + i, nodes, (dt / mass) * v_bar)
         store_vector(bar, here + 3 * nodes, nodes, v_bar)

@@ -184,16 +184,16 @@ class Lattice:
             center = self.to_nodes(mass, along=(axis, "moment")) / safe
             way = torch.sign(center) * torch.relu(center.abs() - _DEPTH - 1e-6)
             ways.append(torch.where(there, way, torch.zeros_like(way)))
-        left = safe / (safe + dt * self.to_nodes(drag))
-        return torch.stack([total, *ways, left], 1)
+        factor = safe / (safe + dt * self.to_nodes(drag))
+        return torch.stack([total, *ways, factor], 1)
 
     def nodal_adjoint(self, mass: Tensor, drag: Tensor, dt: float, bar: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients by mass and drag [B, points], from that by :meth:`nodal` [B, 5, nodes]."""
         total, resistance = self.to_nodes(mass), dt * self.to_nodes(drag)
         there = total > 0
         safe = torch.where(there, total, torch.ones_like(total))
-        by_left = bar[:, 4] / (safe + resistance) ** 2
-        total_bar = bar[:, 0] + torch.where(there, by_left * resistance, torch.zeros_like(total))
+        by_factor = bar[:, 4] / (safe + resistance) ** 2
+        total_bar = bar[:, 0] + torch.where(there, by_factor * resistance, torch.zeros_like(total))
         mass_bar = torch.zeros_like(mass)
         for axis in range(3):
             center = self.to_nodes(mass, along=(axis, "moment")) / safe
@@ -201,7 +201,7 @@ class Lattice:
             moment_bar = torch.where(moved, bar[:, 1 + axis] / safe, torch.zeros_like(total))
             total_bar = total_bar - moment_bar * center
             mass_bar += self.to_points(moment_bar, along=(axis, "moment"))
-        return mass_bar + self.to_points(total_bar), -dt * self.to_points(by_left * safe)
+        return mass_bar + self.to_points(total_bar), -dt * self.to_points(by_factor * safe)
 
     def gradient(self, field: Tensor) -> Tensor:
         """Gradient at all places of quadrature of a nodal vector field: [B, 3, nodes] to [B, 3, 3, points]."""
