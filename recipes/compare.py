@@ -17,20 +17,20 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 import tyro
 
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import CountOrZero, options, plain_errors, progress_bar
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Outcome, Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import find, kept_iterations, load_design, load_shape
-from torchsoro.storage import atomic_write
+from torchsoro.storage import atomic_write, check_folder, read_json
 
 LONG = 2.0  # s of actuation, where a robot is watched for an extended time
 EARLY = (0, 5, 10, 20, 50, 100)
@@ -99,13 +99,14 @@ def finer(gamma: torch.Tensor, shape: tuple[int, int, int], times: int) -> torch
     return torch.nn.functional.interpolate(volume, scale_factor=times, mode="trilinear").flatten()
 
 
-def perform(folder: Path, base: Settings, check: Check) -> tuple[Robot, torch.Tensor, Outcome]:
+def perform(folder: Path, base: Settings, check: Check, stage: str) -> tuple[Robot, torch.Tensor, Outcome]:
     """Simulate one check.
 
     Args:
         folder: The robot's folder.
         base: Its settings.
         check: The check.
+        stage: Name of the check, for the progress bar.
 
     Raises:
         ValueError: if the folder lacks the design of the check's iteration.
@@ -121,8 +122,8 @@ def perform(folder: Path, base: Settings, check: Check) -> tuple[Robot, torch.Te
     at = check.iteration
     gamma = load_design(folder / "design.npz", coarse) if at is None else load_shape(folder, coarse, at)
     gamma = finer(gamma, base.particles, check.finer).to(s.target)
-    with torch.no_grad():
-        return robot, gamma, robot(gamma, everything=check.motion, void=check.void)
+    with torch.no_grad(), progress_bar(stage) as progress:
+        return robot, gamma, robot(gamma, everything=check.motion, void=check.void, progress=progress)
 
 
 def row(robot: Robot, outcome: Outcome, base: Settings, check: Check, seconds: float) -> dict[str, Any]:
@@ -176,7 +177,7 @@ def keep_motion(path: Path, robot: Robot, gamma: torch.Tensor, outcome: Outcome,
         )
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@options
 class Options:
     """What to check."""
 
@@ -186,49 +187,71 @@ class Options:
     """Folder for the results; one for each robot."""
     only: tuple[str, ...] = ()
     """Checks to do; all if none are named."""
-    iterations: tuple[int, ...] = ()
+    iterations: tuple[CountOrZero, ...] = ()
     """Early designs to look at; of 0, 5, 10, 20, 50 and 100 those that were kept if none are named."""
-    device: str = "auto"
-    """"cpu" or "cuda"."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to compute; auto takes CUDA if there is one."""
 
 
-def main(options: Options) -> dict[str, dict[str, Any]]:
+def main(chosen: Options) -> dict[str, dict[str, Any]]:
     """Perform the checks of one robot.
 
     Returns:
         The rows by name, those of earlier calls included.
 
     Raises:
-        ValueError: for a robot or a check that does not exist.
+        ValueError: for a robot, a check or an early design that does not exist, or a folder that cannot be written or
+            holds the checks of another robot.
     """
-    folder = find(options.robot)
-    base = read_settings(folder / "settings.json", device=options.device, resume=False)
-    known = checks(base, options.iterations or [k for k in EARLY if k in kept_iterations(folder)])
-    if unknown := sorted(set(options.only) - set(known)):
+    folder = find(chosen.robot)
+    base = read_settings(folder / "settings.json", device=chosen.device, resume=False)
+    known = checks(base, chosen.iterations or [k for k in EARLY if k in kept_iterations(folder)])
+    if unknown := sorted(set(chosen.only) - set(known)):
         raise ValueError(f"only = {', '.join(unknown)}: wanted some of {', '.join(known)}")
-    options.out.mkdir(parents=True, exist_ok=True)
-    for name in ("settings.json", "metrics.csv", "design.npz"):  # for the pages
-        with atomic_write(options.out / name) as copy:
+    kept = kept_iterations(folder)
+    early = [check.iteration for name, check in known.items() if name in (chosen.only or known)]
+    if gone := [k for k in early if k is not None and k not in kept]:
+        listed = ", ".join(map(str, kept)) or "none"
+        raise ValueError(f"iterations = {gone}: wanted some of those that {folder} has kept: {listed}")
+    copied = ("settings.json", "metrics.csv", "design.npz")  # for the pages
+    if missing := [name for name in copied if not (folder / name).is_file()]:
+        raise ValueError(f"robot = {chosen.robot!r}: {folder} has no {', '.join(missing)}, wanted a finished run")
+    load_design(folder / "design.npz", build(dataclasses.replace(base, device="cpu")).domain)
+    file = chosen.out / "compare.json"
+    check_folder("out", chosen.out, (*copied, file.name))
+    rows = _held(file, base.robot)
+    chosen.out.mkdir(parents=True, exist_ok=True)
+    for name in copied:
+        with atomic_write(chosen.out / name) as copy:
             copy.write((folder / name).read_bytes())
-    file = options.out / "compare.json"
-    rows: dict[str, dict[str, Any]] = {}
-    if file.exists():
-        rows = {r.pop("check"): r for r in json.loads(file.read_text(encoding="utf-8"))["rows"]}
-    for name in options.only or known:
-        if name in rows:
-            continue
+    wanted = [name for name in chosen.only or known if name not in rows]
+    for place, name in enumerate(wanted, start=1):
         check, begin = known[name], time.perf_counter()
         try:
-            robot, gamma, outcome = perform(folder, base, check)
+            robot, gamma, outcome = perform(folder, base, check, f"{name} ({place} of {len(wanted)})")
             rows[name] = row(robot, outcome, base, check, time.perf_counter() - begin)
             if check.motion:
-                keep_motion(options.out / f"motion_{name}.npz", robot, gamma, outcome, base, check)
-        except SimulationDiverged as error:
+                keep_motion(chosen.out / f"motion_{name}.npz", robot, gamma, outcome, base, check)
+        except (SimulationDiverged, ValueError) as error:  # also one that this machine cannot hold
             rows[name] = {"title": check.title, "error": str(error)}
         with atomic_write(file) as target:
             listed = [{"check": key, **value} for key, value in rows.items()]
             target.write(json.dumps({"robot": base.robot, "rows": listed}).encode())
         print(line(name, rows[name]), flush=True)
+    return rows
+
+
+def _held(file: Path, robot: str) -> dict[str, dict[str, Any]]:
+    """The rows of earlier calls, by name."""
+    if not file.exists():
+        return {}
+    held = read_json(file, dict)
+    try:
+        rows = {row.pop("check"): row for row in held["rows"]}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(f"out: {file} is damaged ({error!r}), wanted rows of checks; choose another folder") from error
+    if held.get("robot") != robot:
+        raise ValueError(f"out: {file} holds the checks of a {held.get('robot')}, wanted those of a {robot}")
     return rows
 
 

@@ -1,7 +1,7 @@
 """Show a finished robot: simulate it again, on a CPU too, and write its movie and its printable STL.
 
     python recipes/replay.py                              # the robots there are
-    python recipes/replay.py walker                       # two cycles of the archived walker, minutes on two cores
+    python recipes/replay.py walker                       # one cycle of the archived walker, a minute or two
     python recipes/replay.py climber --cycles 5 --settle 0
     python recipes/replay.py runs/walker                  # one of your own
     python recipes/replay.py --archive runs/walker --name mine    # keep a finished run among the designs
@@ -12,24 +12,25 @@ Void is left out, which halves the time (``--void`` keeps it). The archived robo
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 import tyro
+from pydantic import Field
 
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import AtLeastZero, Count, options, plain_errors
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.output import archive
-from torchsoro.output.delivery import show
+from torchsoro.output.delivery import numbers, show
+from torchsoro.storage import check_folder
 
 KEPT = (0, 5, 10, 20, 50, 100, 150, 200, 250, 300)  # iterations whose designs are archived
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@options
 class Options:
     """What to show."""
 
@@ -37,17 +38,17 @@ class Options:
     """Name of an archived robot, or a run's folder; the names there are if it is left out."""
     out: Path | None = None
     """Folder for movie and STL; runs/replay/<robot> if left out."""
-    cycles: float = 2.0
+    cycles: Annotated[float, Field(strict=True, gt=0, le=1000)] = 1.0
     """Cycles of the pressure."""
-    settle: float = 0.05
+    settle: AtLeastZero = 0.05
     """Time before the actuation starts, to come to rest [s]; the climber has none."""
     void: bool = False
     """Simulate void, too."""
-    frames: int = 60
+    frames: Count = 60
     """Pictures in the movie."""
     resolution: str = "960x640"
     """Of the movie: width x height in pixels."""
-    fps: int = 20
+    fps: Annotated[int, Field(strict=True, ge=1, le=120)] = 20
     """Pictures of the movie per second."""
     follow: bool = False
     """Let the movie's camera follow the robot."""
@@ -59,46 +60,44 @@ class Options:
     """Name of the robot to keep."""
 
 
-def main(options: Options) -> dict[str, float]:
+def main(chosen: Options) -> dict[str, float]:
     """Show a robot, or archive one.
 
     Returns:
-        What was measured (see ``results.show``); empty where nothing was simulated.
+        What was measured (see :func:`torchsoro.output.delivery.show`); empty where nothing was simulated.
 
     Raises:
-        ValueError: for a robot that does not exist.
+        ValueError: for a robot that does not exist, or a folder that cannot be written.
     """
-    if options.archive is not None:
-        if options.name in ("", "..") or Path(options.name).name != options.name:
-            raise ValueError(f"name = {options.name!r}: wanted a plain name to keep {options.archive} under")
-        domain = build(read_settings(options.archive / "settings.json", device="cpu")).domain
-        archive.archive(options.archive, archive.DESIGNS / options.name, domain, KEPT)
-        print(f"kept as {archive.DESIGNS / options.name}")
+    if chosen.archive is not None:
+        if chosen.name in ("", "..") or Path(chosen.name).name != chosen.name:
+            raise ValueError(f"name = {chosen.name!r}: wanted a plain name to keep {chosen.archive} under")
+        domain = build(read_settings(chosen.archive / "settings.json", device="cpu")).domain
+        archive.archive(chosen.archive, archive.DESIGNS / chosen.name, domain, KEPT)
+        print(f"kept as {archive.DESIGNS / chosen.name}")
         return {}
-    if not options.robot:
+    if not chosen.robot:
         print("\n".join(archive.names()))
         return {}
-    begin = time.perf_counter()
-    folder = archive.find(options.robot)
+    folder = archive.find(chosen.robot)
     designed = archive.read_result(folder)
-    movie = {name: getattr(options, name) for name in ("frames", "resolution", "fps", "follow")}
-    base = read_settings(folder / "settings.json", device=options.device, **movie)
-    duration = round(options.cycles / base.frequency / base.sample_every) * base.sample_every
-    settle = options.settle if base.settle > 0 else 0.0
+    movie = {name: getattr(chosen, name) for name in ("frames", "resolution", "fps", "follow")}
+    base = read_settings(folder / "settings.json", device=chosen.device, **movie)
+    # At least one sample, so that even a small part of a cycle can be simulated.
+    duration = max(1, round(chosen.cycles / base.frequency / base.sample_every)) * base.sample_every
+    settle = chosen.settle if base.settle > 0 else 0.0
     robot = build(dataclasses.replace(base, duration=duration, settle=settle))
-    out = options.out or Path("runs/replay") / folder.name
+    out = chosen.out or Path("runs/replay") / folder.name
+    check_folder("out", out, (f"{folder.name}.mp4", "motion.npz", "motion.html", "shape.stl", "shape.json"))
+    gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
     out.mkdir(parents=True, exist_ok=True)
     if robot.settings.target.type == "cpu":
-        torch.set_num_threads(1)
-    gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
-    found, part = show(out, robot, gamma, name=folder.name, void=options.void)
-    then = designed.get("stride")
-    there = "" if then is None else f" (in the design run, over all its cycles and with void, {1e3 * then:.2f} mm)"
-    print(
-        f"{folder.name}: {1e3 * found['stride']:.2f} mm per cycle{there}, C = {found['C']:.4f}, "
-        f"mass = {1e3 * found['mass']:.2f} g; {time.perf_counter() - begin:.0f} s; movie and STL are in {out}\n"
-        f"{part.report}"
-    )
+        torch.set_num_threads(1)  # Taichi's threads do the work
+    found, part = show(out, robot, gamma, name=folder.name, void=chosen.void)
+    print(f"{folder.name}, {chosen.cycles:g} cycles: travel {1e3 * found['L']:.2f} mm; {numbers(found)}")
+    if (then := designed.get("stride")) is not None:
+        print(f"in the design run, over all of its cycles and with void: stride {1e3 * then:.2f} mm")
+    print(f"printable part: {part.report}\nmovie and STL are in {out}")
     return found
 
 

@@ -110,7 +110,7 @@ def test_what_is_there_is_not_repeated_and_one_that_breaks_down_is_a_row(
     shutil.copytree(out, tmp_path / "again")
     error = SimulationDiverged(step=3, time=1e-3, particle=5, quantity="J <= 0", remedy="a smaller step")
 
-    def perform(folder: Path, base: Any, wanted: Any) -> Any:
+    def perform(folder: Path, base: Any, wanted: Any, stage: str) -> Any:
         assert wanted.title == "five Maxwell elements"
         raise error
 
@@ -125,6 +125,8 @@ def test_checks_and_robots_that_do_not_exist_are_refused_before_any_work(compare
         check(compare, straight[0], tmp_path / "out", "design", "slower", "iteration_5", iterations=(0, 10))
     with pytest.raises(ValueError, match=r"wanted .* a finished run's folder"):
         check(compare, tmp_path, tmp_path / "out")
+    with pytest.raises(ValueError, match=r"iterations = \[10\]: wanted some of those that .* has kept: 0$"):
+        check(compare, straight[0], tmp_path / "out", iterations=(0, 10))
     assert not (tmp_path / "out").exists()
     with pytest.raises(ValueError, match=r"only = iteration_10: wanted some of .*, iteration_0$"):
         check(compare, straight[0], tmp_path / "out", "iteration_10")

@@ -85,6 +85,7 @@ def test_the_settings_and_the_metrics_are_all_there(straight):
     assert result["stride"] == pytest.approx(result["L"])  # a single cycle
     assert 0.004 < result["mass"] < 0.05
     assert json.loads((path / "result.json").read_text()) == result
+    assert result["iteration"] == 2 and result["C_limit"] == TINY.c_max and not result["C_within_limit"]
     with (path / "metrics.csv").open(newline="") as file:
         assert result["seconds"] == pytest.approx(sum(float(row["time/iteration"]) for row in csv.DictReader(file)))
 
@@ -234,7 +235,7 @@ def test_every_preset_fits_together(recipes):
     ("recipe", "flags", "message"),
     [
         ("climber", ["--slop", "0.3"], "--slop"),
-        ("walker", ["--poisson-ratio", "0.5"], "error: poisson_ratio = 0.5: wanted at least 0 and less than 0.5\n"),
+        ("walker", ["--poisson-ratio", "0.5"], "error: poisson_ratio = 0.5: wanted less than 0.5\n"),
     ],
 )
 def test_the_command_line_refuses_without_a_traceback_and_before_any_work(recipe, flags, message, tmp_path):
@@ -374,7 +375,7 @@ def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
     robot = walker(settings)
     with torch.no_grad():
         robot.field.phi.copy_(items(settings.out)["best"]["phi"])
-        best = robot.field().half().float()  # as it is stored
+        best = robot.field()
         assert torch.equal(load_design(settings.out / "design.npz", robot.domain), best)
         assert items(settings.out)["best"]["worth"] == pytest.approx(max(kept) / robot.domain.cell, rel=1e-6)
         assert result["L"] == pytest.approx(robot(best).travel.item(), rel=1e-6)

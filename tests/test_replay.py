@@ -37,7 +37,8 @@ def play(replay: ModuleType, robot: Path | str, out: Path, **changes: Any) -> di
 def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, straight, tmp_path, capsys):
     path, result = straight
     found = play(replay, path, tmp_path / "out", void=True)
-    assert found == {name: pytest.approx(result[name], rel=1e-6) for name in ("L", "stride", "C", "mass")}
+    names = ("L", "stride", "C", "C_limit", "C_within_limit", "mass")
+    assert found == {name: pytest.approx(result[name], rel=1e-6) for name in names}
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "straight.mp4",
         "motion.npz",
@@ -49,7 +50,10 @@ def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, s
     assert trimesh.load_mesh(tmp_path / "out" / "shape.stl").is_watertight
     for name in ("shape.stl", "shape.json"):
         assert (tmp_path / "out" / name).read_bytes() == (path / name).read_bytes()
-    assert f"straight: {1e3 * result['stride']:.2f} mm per cycle" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert f"travel {1e3 * result['L']:.2f} mm; stride {1e3 * result['stride']:.2f} mm" in said.out
+    assert "limit 0.0125 NOT MET" in said.out
+    assert "simulating straight: 100 %" in said.err
 
 
 def test_a_kept_run_is_found_by_its_name_and_walks_as_long_as_is_wanted(
@@ -101,7 +105,7 @@ def test_a_run_is_kept_under_a_plain_name_only(name, replay, straight, tmp_path)
 
 
 def test_an_unfinished_run_is_not_kept(replay, tmp_path):
-    with pytest.raises(ValueError, match=r"settings\.json"):
+    with pytest.raises(ValueError, match=r"settings\.json holds no settings"):
         replay.main(replay.Options(archive=tmp_path, name="mine"))
     (tmp_path / "settings.json").write_text('{"device": "cpu", "particles": [8, 8, 8], "wall": 0.004375}')
     with pytest.raises(ValueError, match=r"has no design\.npz, .*, wanted a finished run"):

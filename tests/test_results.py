@@ -14,7 +14,8 @@ from tiny import TINY
 
 from torchsoro.design.robot import climber, walker
 from torchsoro.design.training import RunFolder
-from torchsoro.output.delivery import drawn_planes, print_part, show, show_shape
+from torchsoro.output import delivery
+from torchsoro.output.delivery import drawn_planes, numbers, print_part, show, show_shape
 
 
 def test_pictures_get_the_planes_of_the_robot():
@@ -62,7 +63,7 @@ def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run
     forward = robot.forward
     monkeypatch.setattr(robot, "forward", lambda gamma, **how: asked.append(how) or forward(gamma, **how))
     found, part = show(tmp_path, robot, gamma, name="stump", void=void)
-    assert asked == [{"everything": True, "void": void}]
+    assert [(how["everything"], how["void"]) for how in asked] == [(True, void)]
     assert {file.name for file in tmp_path.iterdir()} == {
         "stump.mp4",
         "motion.npz",
@@ -75,3 +76,22 @@ def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run
     # Body and wall, without air; of grey there is none.
     solid = (robot.design & (gamma == 1) | robot.wall).sum() * robot.domain.volume * TINY.density
     assert found["mass"] == pytest.approx(float(solid), rel=1e-3)
+
+
+def test_the_pictures_of_a_run_tell_the_numbers_of_its_result(tmp_path, monkeypatch):
+    robot = walker(dataclasses.replace(TINY, frames=2))
+    told: dict[str, dict[str, Any]] = {}
+    for name in ("movie", "summary"):
+        monkeypatch.setattr(delivery, name, lambda path, name=name, **how: told.update({name: how}))
+    history = {"objective/L": [0.0], "constraint/C": [0.2]}
+    found, _ = show(tmp_path, robot, torch.ones(robot.domain.count), name="block", history=history)
+    assert found["C"] == 0 and found["C_within_limit"]
+    for how in told.values():
+        assert how["title"] == f"block: travel L = {1e3 * found['L']:.2f} mm in 0.02 s"
+        assert how["displacement"][-1, 0] == pytest.approx(found["L"], abs=1e-9)
+    assert told["summary"]["note"] == numbers(found)
+    assert numbers(found).startswith(
+        f"stride {1e3 * found['stride']:.2f} mm (mean of whole cycles), C = 0.0000 (limit 0.0125)"
+    )
+    assert "limit 0.0125 NOT MET" in numbers({**found, "C_within_limit": False})
+    assert numbers({**found, "stride": None}).startswith("no whole cycle")

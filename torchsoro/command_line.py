@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import pydantic
 from pydantic import Field
 from pydantic.dataclasses import dataclass
+from tqdm import tqdm
 
 from torchsoro.errors import SimulationDiverged
 
@@ -77,7 +78,7 @@ def _wanted(kind: str, message: str, numbers: dict[str, Any]) -> str:
     words = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
     if kind in limits:
         key = limits[kind]
-        return "finite and positive" if (key, numbers[key]) == ("gt", 0) else f"{words[key]} {numbers[key]:g}"
+        return "finite and positive" if (key, numbers[key]) == ("gt", 0) else f"{words[key]} {numbers[key]}"
     others = {
         "finite_number": "a finite number",
         "float_type": "a number",
@@ -91,6 +92,26 @@ def _wanted(kind: str, message: str, numbers: dict[str, Any]) -> str:
     if kind == "literal_error":
         return str(numbers["expected"])
     return others.get(kind) or message[:1].lower() + message[1:]
+
+
+@contextlib.contextmanager
+def progress_bar(stage: str) -> Iterator[Callable[[int, int], None]]:
+    """Show stage, percent and time left on the error stream.
+
+    Yields:
+        A function to call with what is done and what there is to do in all; less done than before begins again.
+    """
+    interval = 0.1 if sys.stderr.isatty() else 10.0  # s; in a log file every refresh is a line
+    form = "{desc}: {percentage:3.0f} % |{bar:30}| {elapsed} so far, {remaining} left"
+    with tqdm(desc=stage, total=1, mininterval=interval, bar_format=form) as bar:
+
+        def show(done: int, total: int) -> None:
+            if done < bar.n:
+                bar.reset()
+            bar.total = total
+            bar.update(done - bar.n)
+
+        yield show
 
 
 @contextlib.contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -104,7 +105,13 @@ class Robot(nn.Module):
         s.check_memory(self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every))
 
     def forward(
-        self, gamma: Tensor, *, gravity_scale: float = 1.0, everything: bool = False, void: bool = True
+        self,
+        gamma: Tensor,
+        *,
+        gravity_scale: float = 1.0,
+        everything: bool = False,
+        void: bool = True,
+        progress: Callable[[int, int], None] | None = None,
     ) -> Outcome:
         """Simulate a design and judge it.
 
@@ -114,6 +121,7 @@ class Robot(nn.Module):
             everything: Record every particle (for pictures) and not only the centre of gravity.
             void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
                 in what is recorded, void then moves with the centre of gravity.
+            progress: See :meth:`Simulator.forward`.
 
         Returns:
             Travel, intermediate density, mass, centre of gravity, trajectory.
@@ -125,7 +133,7 @@ class Robot(nn.Module):
         body = self.filled(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory = self._simulate(body, weight, gravity_scale, everything, void)
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress)
         end = s.settle + s.duration
         distance = travel(
             trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
@@ -154,7 +162,15 @@ class Robot(nn.Module):
             void_range=s.void_range,
         )
 
-    def _simulate(self, body: Body, weight: Tensor, gravity_scale: float, everything: bool, void: bool) -> Trajectory:
+    def _simulate(
+        self,
+        body: Body,
+        weight: Tensor,
+        gravity_scale: float,
+        everything: bool,
+        void: bool,
+        progress: Callable[[int, int], None] | None,
+    ) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
         rest, keep = body.position, torch.ones_like(self.design)
@@ -173,6 +189,7 @@ class Robot(nn.Module):
                     sample_every=s.sample_every,
                     weight=weight,
                     probes=torch.arange(len(body.chamber)) if everything else None,
+                    progress=progress,
                 )
                 return self._with_void(trajectory, rest, keep) if everything and not void else trajectory
             except SimulationDiverged:

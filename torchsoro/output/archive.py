@@ -27,7 +27,7 @@ def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
         gamma: Density [N], 0 (void) to 1 (material).
 
     Returns:
-        The density as it is stored, in float16, in the type and on the device it came in: what to judge and to show.
+        The density as it is stored, in float32, in the type and on the device it came in: what to judge and to show.
 
     Raises:
         ValueError: if the density is not one number for each particle.
@@ -35,7 +35,7 @@ def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
     if gamma.shape != (domain.count,):
         raise ValueError(f"gamma: got shape {tuple(gamma.shape)}, wanted one density per particle, ({domain.count},)")
     path.parent.mkdir(parents=True, exist_ok=True)
-    stored = gamma.detach().half()
+    stored = gamma.detach().float()
     with atomic_write(path) as file:
         np.savez_compressed(
             file,
@@ -55,7 +55,7 @@ def load_design(path: Path, domain: Domain) -> Tensor:
         domain: The lattice that it has to be on.
 
     Returns:
-        Density [N], float32.
+        Density [N], float32; files of float16, as they were once written, are read as well.
 
     Raises:
         ValueError: if there is no such file, it is no design, or it is on another lattice.
@@ -66,12 +66,16 @@ def load_design(path: Path, domain: Domain) -> Tensor:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             gamma, shape = stored["gamma"], tuple(int(n) for n in stored["shape"])
             spacing = float(stored["spacing"])
+        if gamma.dtype not in (np.float16, np.float32, np.float64):
+            raise ValueError(f"densities of type {gamma.dtype}")
         if gamma.shape != (math.prod(shape),):
             raise ValueError(f"densities of shape {gamma.shape} for {shape} particles")
+        if not (np.isfinite(gamma).all() and gamma.min() >= 0 and gamma.max() <= 1):
+            raise ValueError("densities outside 0 to 1")
     except Exception as error:  # a damaged archive can fail in any way
-        raise ValueError(
-            f"path: {path} is no design ({error}), wanted an .npz with gamma, shape and spacing"
-        ) from error
+        # What numpy says of a pickle is how to read what is not safe to read.
+        said = "it holds pickled objects" if "pickle" in str(error) else error
+        raise ValueError(f"path: {path} is no design ({said}), wanted an .npz with gamma, shape and spacing") from error
     if shape != domain.shape or abs(spacing / domain.spacing - 1) > 1e-6:
         raise ValueError(
             f"path: {path} is on {shape} particles {spacing:g} m apart, wanted {domain.shape} at {domain.spacing:g} m"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import statistics
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchsoro.command_line import parse_resolution
+from torchsoro.command_line import parse_resolution, progress_bar
 from torchsoro.design.loop import optimize
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.robot import Robot
@@ -36,23 +37,24 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         name: Names the movie and the summary.
 
     Returns:
-        The final metrics (see :func:`show`), the number of iterations, and their time [s]: median of forward and
-        backward, and in all. Also written to ``result.json``.
+        The final metrics (see :func:`show`), the iteration of the design, the number of iterations, and their time
+        [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
 
     Raises:
         ValueError: see :func:`torchsoro.design.loop.optimize`; also if the design has no connected body to print.
     """
-    out = robot.settings.out
+    s = robot.settings
     optimized = optimize(robot, observe)
     history = optimized.metrics
     found = {
-        **deliver(out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
+        **deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
+        "iteration": len(history["iteration"]) - 1 if optimized.iteration is None else optimized.iteration,
         "iterations": len(history["iteration"]),
         "forward": statistics.median(history["time/forward"]),
         "backward": statistics.median(history["time/backward"]),
         "seconds": sum(history["time/iteration"]),
     }
-    with atomic_write(out / "result.json") as file:
+    with atomic_write(s.out / "result.json") as file:
         plain = {name: None if math.isnan(value) else value for name, value in found.items()}
         file.write((json.dumps(plain, indent=2) + "\n").encode())
     return found
@@ -66,14 +68,22 @@ def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -
         save_design(run.path / "shapes" / f"{iteration:05d}.npz", robot.domain, gamma)
 
 
-def report(result: dict[str, float], settings: Settings) -> str:
-    """What :func:`design` returned, in one sentence."""
+def report(result: Mapping[str, Any], settings: Settings) -> str:
+    """What :func:`design` returned, in a few lines."""
     return (
-        f"L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s, stride {1e3 * result['stride']:.2f} mm per cycle, "
-        f"C = {result['C']:.4f}, mass = {1e3 * result['mass']:.2f} g after {result['iterations']} iterations "
-        f"of {result['forward']:.1f} s forward and {result['backward']:.1f} s backward, "
-        f"{result['seconds']:.0f} s in all; everything is in {settings.out}"
+        f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n"
+        f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
+        f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}"
     )
+
+
+def numbers(found: Mapping[str, Any]) -> str:
+    """Stride, C with its limit, and mass of a design, for a picture or a line."""
+    stride = "no whole cycle"
+    if found["stride"] is not None and not math.isnan(found["stride"]):
+        stride = f"stride {1e3 * found['stride']:.2f} mm (mean of whole cycles)"
+    limit = f"limit {found['C_limit']:g}{'' if found['C_within_limit'] else ' NOT MET'}"
+    return f"{stride}, C = {found['C']:.4f} ({limit}), mass {1e3 * found['mass']:.2f} g"
 
 
 def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
@@ -105,7 +115,7 @@ def deliver(
     Args:
         path: The folder.
         robot: The robot.
-        gamma: Its density [N]; judged as it is stored, with three decimals.
+        gamma: Its density [N]; judged as it is stored.
         history: Metrics of the run, for the summary.
         name: Of the robot: names the movie and the page.
         chosen: Iteration that the design is of; the last if None.
@@ -146,18 +156,30 @@ def show(
         void: Simulate void, too.
 
     Returns:
-        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, mass [kg]; and the printable part.
+        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and whether it is met, mass
+        [kg]; and the printable part.
 
     Raises:
         ValueError: if the design has no connected body to print; movie and motion are written before.
     """
     s = robot.settings
-    outcome = robot(gamma, everything=True, void=void)
+    with progress_bar(f"simulating {name}") as progress:
+        outcome = robot(gamma, everything=True, void=void, progress=progress)
     density = gamma.cpu().numpy()
     trajectory = outcome.trajectory
     frames = trajectory.position.cpu().numpy()
     time = trajectory.time.cpu().double().numpy()
-    way = trajectory.center_of_gravity.cpu().double().numpy() @ np.array(robot.direction)
+    center = trajectory.center_of_gravity.cpu().double().numpy()
+    found = {
+        "L": float(outcome.travel),
+        "stride": mean_stride(center @ np.array(robot.direction), time, start=s.settle, period=1 / s.frequency),
+        "C": float(outcome.intermediate),
+        "C_limit": s.c_max,
+        # Rounding differs between the run's device and this one.
+        "C_within_limit": bool(outcome.intermediate <= s.c_max * (1 + 1e-4)),
+        "mass": float(outcome.mass),
+    }
+    begin = np.array([np.interp(s.settle, time, component) for component in center.T])
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
     width, height = parse_resolution(s.resolution)
@@ -168,17 +190,20 @@ def show(
         "direction": robot.direction,
         "tilt": math.degrees(math.atan(s.slope)),
     }
+    print(f"writing {path / name}.mp4", file=sys.stderr, flush=True)
+    title = f"{name}: travel L = {1e3 * found['L']:.2f} mm in {s.duration:g} s"
     movie(
         path / f"{name}.mp4",
         **shown,
         frames=frames[drawn],
         time=time[drawn],
         pressure=supply[drawn],
+        displacement=(center - begin)[drawn],
         fps=s.fps,
         width=width,
         height=height,
         follow=s.follow,
-        title=f"{name}, {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
+        title=title,
     )
     record(path, name, robot, shown, frames, time, supply)
     if history is not None:
@@ -188,22 +213,19 @@ def show(
             frames=frames,
             time=time,
             pressure=supply,
+            displacement=center - begin,
+            start=s.settle,
             history=history,
             chosen=chosen,
             limit=s.c_max,
             period=1 / s.frequency,
-            title=f"{name} ({s.preset}): L = {1e3 * float(outcome.travel):.2f} mm in {s.duration:g} s",
+            title=title,
+            note=numbers(found),
         )
     part = print_part(robot, density)
     part.save(path / "shape.stl")
     with atomic_write(path / "shape.json") as file:
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
-    found = {
-        "L": float(outcome.travel),
-        "stride": mean_stride(way, time, start=s.settle, period=1 / s.frequency),
-        "C": float(outcome.intermediate),
-        "mass": float(outcome.mass),
-    }
     return found, part
 
 

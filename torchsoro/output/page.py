@@ -59,6 +59,7 @@ class DrawnMotion:
     time: np.ndarray
     pressure: np.ndarray | None
     cog: np.ndarray
+    path: np.ndarray
     along: int
     travel: np.ndarray
 
@@ -78,8 +79,12 @@ def motion_of(
     planes: Sequence[PlaneTuple],
     direction: Any,
     level: float,
+    displacement: Any | None = None,
 ) -> DrawnMotion:
-    """Check the arrays of a movie or a summary, and deform the body in every frame."""
+    """Check the arrays of a movie or a summary, and deform the body in every frame.
+
+    Travel is along ``displacement`` [S, 3] in m, or else that of the densities' centre from the first frame on.
+    """
     check_planes(planes)
     if sorted(abs(float(c)) for c in direction) != [0.0, 0.0, 1.0]:
         raise ValueError(f"direction: got {tuple(direction)}, want a unit vector along an axis, such as (1, 0, 0)")
@@ -96,8 +101,11 @@ def motion_of(
     weight = weight if weight.sum() > 0 else np.ones(domain.count)
     cog = (np.einsum("sni,n->si", moved, weight) / weight.sum() - shape.origin) * 1e3
     along = int(np.argmax(np.abs(direction)))
-    travel = (cog - cog[0]) @ np.asarray(direction, dtype=float)
-    return DrawnMotion(shape, placed, bounds_of([v for v, _ in placed]), times, kilopascal, cog, along, travel)
+    moved = cog - cog[0] if displacement is None else 1e3 * as_array(displacement).astype(float)
+    if moved.shape != cog.shape or not np.isfinite(moved).all():
+        raise ValueError(f"displacement: got shape {moved.shape}, want finite lengths in m of shape {cog.shape}")
+    travel = moved @ np.asarray(direction, dtype=float)
+    return DrawnMotion(shape, placed, bounds_of([v for v, _ in placed]), times, kilopascal, cog, moved, along, travel)
 
 
 def canvas_of(width: int, height: int, dpi: int = 100) -> tuple[Figure, FigureCanvasAgg]:
@@ -164,9 +172,12 @@ def pressure_trace(axes: Axes, time: np.ndarray, pressure: np.ndarray) -> Any:
     return axes.plot([], [], "o", ms=7, mfc="white", mec=INK, mew=1.6, zorder=5, clip_on=False)[0]
 
 
-def last_cycle(motion: DrawnMotion, period: float | None) -> tuple[float, float]:
-    """Start and end of the last whole cycle."""
+def last_cycle(motion: DrawnMotion, period: float | None, first: float | None = None) -> tuple[float, float]:
+    """Start and end of the last whole cycle; cycles count from ``first``, or else from where the pressure rises."""
     time, pressure = motion.time, motion.pressure
+    if first is not None and period is not None and time[-1] >= first + period * (1 - 1e-6):
+        start = first + (math.floor((time[-1] - first) / period + 1e-6) - 1) * period
+        return start, min(start + period, float(time[-1]))
     rises = np.zeros(0)
     if pressure is not None and pressure.max() > 0:
         high = pressure > 0.5 * pressure.max()
@@ -190,7 +201,7 @@ def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float])
     over.set_xlabel("time [s]", color=INK)
     over.set_ylabel("travel [mm]", color=INK)
     plain(over)
-    heading(over, f"centre of gravity: {motion.travel[-1]:+.2f} mm")
+    heading(over, "travel of the centre of gravity")
     if motion.pressure is not None:
         beside = over.twinx()
         beside.fill_between(motion.time, motion.pressure, color=FULL, alpha=0.13, lw=0)
@@ -198,7 +209,7 @@ def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float])
         beside.set_axis_off()
     path = figure.add_axes((0.735, 0.48, 0.24, 0.175))
     flat = 0 if motion.along == 2 else motion.along
-    points = (motion.cog - motion.cog[0])[:, [flat, 2]]
+    points = motion.path[:, [flat, 2]]
     value = motion.time if motion.pressure is None else motion.pressure
     if len(points) > 1:
         lines = LineCollection(
@@ -250,7 +261,8 @@ def gait_panels(
     figure.text(
         0.03,
         0.405,
-        "gait in one cycle, shaded above (dashed: centre of gravity at its start)",
+        "gait in the last whole cycle of length T, shaded above, and its advance since t = 0 "
+        "(dashed: centre of gravity at that time)",
         fontsize=11,
         color=INK,
         weight="bold",
@@ -274,24 +286,24 @@ def history_panel(
     limit: float | None = None,
     chosen: int | None = None,
 ) -> None:
-    """A quantity over the iterations, its value in the ``chosen`` one, or the last, in the heading.
+    """A quantity over the iterations, counted from 0, with a dot at the ``chosen`` one, or the last.
 
     Numbers that are not finite are left out.
     """
-    iterations = 1 + np.flatnonzero(np.isfinite(values))
-    values = values[iterations - 1]
-    at = len(values) - 1 if chosen is None else int(np.searchsorted(iterations[:-1], chosen + 1))
+    iterations = np.flatnonzero(np.isfinite(values))
+    values = values[iterations]
+    at = len(values) - 1 if chosen is None else int(np.searchsorted(iterations[:-1], chosen))
     axes.plot(iterations, values, color=color, lw=1.9)
     axes.plot(iterations[at], values[at], "o", color=color, ms=5)
     axes.set_ylabel(label, color=INK)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     plain(axes)
-    heading(axes, f"{head}: {values[at]:.3g}" + (" mm" if "mm" in label else ""))
+    heading(axes, head)
     if limit is not None:
         axes.axhline(limit, color=FULL, lw=1.2, ls=(0, (4, 2)))
         axes.set_ylim(0, 1.15 * max(limit, float(values.max())))
         share = limit / axes.get_ylim()[1]
-        axes.text(0.02, share + 0.02, f"C_max = {limit:g}", transform=axes.transAxes, color=FULL, fontsize=9)
+        axes.text(0.02, share + 0.02, f"limit {limit:g}", transform=axes.transAxes, color=FULL, fontsize=9)
 
 
 def curve(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, style: Any = "-", text: str | None = None) -> None:

@@ -126,6 +126,7 @@ def movie(
     pressure: Any | None = None,
     planes: Sequence[PlaneTuple] = ((2, 0.0, 1),),
     direction: Sequence[float] = (1.0, 0.0, 0.0),
+    displacement: Any | None = None,
     fps: int = 30,
     title: str | None = None,
     azimuth: float = -65.0,
@@ -147,6 +148,8 @@ def movie(
         pressure: gauge pressure at the frames [S] in Pa.
         planes: ground and walls to draw, each (axis, position [m], side of the robot).
         direction: unit vector of the travel that is written out.
+        displacement: of the centre of gravity since the start of the actuation [S, 3] in m, whose travel is written
+            out; None takes that of the densities since the first frame.
         fps: pictures per second.
         title: written above.
         azimuth: of the camera [degrees].
@@ -168,7 +171,7 @@ def movie(
         raise ValueError(f"fps: got {fps}, want a whole number from 1 to 120")
     if min(width, height) < 160 or (target.suffix.lower() == ".mp4" and (width % 2 or height % 2)):
         raise ValueError(f"width, height: got {width} x {height}, want at least 160, and even numbers for .mp4")
-    motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level)
+    motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level, displacement)
     looks = camera_path(motion.cog, direction) if follow else None
     pictures = _pictures(motion, planes, Camera(azimuth, elevation, tilt), title, fps, (width, height), looks)
     # ffmpeg writes to a path of its own, so a movie moves to its place when it is complete.
@@ -273,9 +276,12 @@ def summary(
     pressure: Any | None = None,
     planes: Sequence[PlaneTuple] = ((2, 0.0, 1),),
     direction: Sequence[float] = (1.0, 0.0, 0.0),
+    displacement: Any | None = None,
+    start: float | None = None,
     limit: float | None = None,
     period: float | None = None,
     title: str | None = None,
+    note: str | None = None,
     azimuth: float = -65.0,
     elevation: float = 16.0,
     tilt: float = 0.0,
@@ -294,9 +300,12 @@ def summary(
         pressure: gauge pressure at the frames [S] in Pa.
         planes: ground and walls to draw, each (axis, position [m], side of the robot).
         direction: unit vector of the travel.
+        displacement: as for a movie.
+        start: of the first cycle [s]; None takes cycles from the rises of the pressure.
         limit: C_max, drawn as a line.
         period: of the actuation [s]; None takes it from the pressure, or else the whole time.
         title: written above.
+        note: written at the right of the title.
         azimuth: of the camera [degrees].
         elevation: of the camera [degrees].
         tilt: as for a movie [degrees].
@@ -313,10 +322,12 @@ def summary(
     objective, constraint = _history(history, "L", "objective/L"), _history(history, "C", "constraint/C")
     if period is not None and not (math.isfinite(period) and period > 0):
         raise ValueError(f"period: got {period} s, want a positive number")
-    motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level)
+    motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level, displacement)
     figure, canvas = canvas_of(1760, 1120, 110)
     if title:
         figure.text(0.03, 0.975, title, va="top", fontsize=17, weight="bold", color=INK)
+    if note:
+        figure.text(0.975, 0.97, note, va="top", ha="right", fontsize=11, color=INK)
     camera = Camera(azimuth, elevation, tilt)
     view = figure.add_axes((0.02, 0.46, 0.34, 0.46))
     vertices, cavity = motion.shape.place(as_array(domain.positions))
@@ -324,11 +335,11 @@ def summary(
     heading(view, "design (orange: chamber wall; inside: cavity)")
 
     upper = figure.add_axes((0.425, 0.74, 0.24, 0.175))
-    history_panel(upper, objective * 1e3, REST, "L [mm]", "objective", chosen=chosen)
+    history_panel(upper, objective * 1e3, REST, "L [mm]", "objective L (dot: this design)", chosen=chosen)
     lower = figure.add_axes((0.425, 0.48, 0.24, 0.175), sharex=upper)
-    history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density", limit, chosen)
+    history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density C (dot: this design)", limit, chosen)
     lower.set_xlabel("iteration", color=INK)
-    cycle = last_cycle(motion, period)
+    cycle = last_cycle(motion, period, start)
     path_panels(figure, motion, cycle)
     gait_panels(figure, motion, planes, camera, cycle)
     image = Image.fromarray(pixels(canvas))

@@ -202,24 +202,26 @@ def read_pressure_csv(
         raise ValueError(f"path: got {str(path)!r}, want an existing CSV file")
     times: list[float] = []
     pressures: list[float] = []
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file, skipinitialspace=True)
-        header = [name.strip() for name in next(reader, [])]
-        missing = [name for name in (time_column, pressure_column) if name not in header]
-        if missing:
-            raise ValueError(f"{path}: got columns {header}, want also {missing}")
-        columns = (header.index(time_column), header.index(pressure_column))
-        for row in reader:
-            if not any(cell.strip() for cell in row):
-                continue
-            where = f"{path}, line {reader.line_num}"
-            time, pressure = (_number(row, column, header[column], where) for column in columns)
-            if times and time <= times[-1]:
-                raise ValueError(
-                    f"{where}: got {time_column} = {time} after {times[-1]}, want strictly increasing times"
-                )
-            times.append(time)
-            pressures.append(pressure)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, skipinitialspace=True)
+            lines = [(reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path}: got no table of text ({error}), want a CSV file") from error
+    header = [name.strip() for name in lines[0][1]] if lines else []
+    missing = [name for name in (time_column, pressure_column) if name not in header]
+    if missing:
+        raise ValueError(f"{path}: got columns {header}, want also {missing}")
+    columns = (header.index(time_column), header.index(pressure_column))
+    for number, row in lines[1:]:
+        if not any(cell.strip() for cell in row):
+            continue
+        where = f"{path}, line {number}"
+        time, pressure = (_number(row, column, header[column], where) for column in columns)
+        if times and time <= times[-1]:
+            raise ValueError(f"{where}: got {time_column} = {time} after {times[-1]}, want strictly increasing times")
+        times.append(time)
+        pressures.append(pressure)
     if len(times) < 2:
         raise ValueError(f"{path}: got {len(times)} row(s) of numbers, want at least 2")
     return Waveform(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
@@ -150,6 +150,7 @@ class Simulator(nn.Module):
         probes: Tensor | None = None,
         weight: Tensor | None = None,
         start: Trajectory | Tensor | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> Trajectory:
         """Simulate.
 
@@ -167,6 +168,8 @@ class Simulator(nn.Module):
             start: Trajectory to go on from, in state and time: pressure, gravity, forces and samples continue at its
                 last time. Or a state alone (``Trajectory.final``), with which time begins at zero. The undeformed body
                 at time zero if None.
+            progress: Called between stretches of the simulation, up to a hundred without a gradient, with the substeps
+                that are done and their number in all.
 
         Returns:
             The trajectory, sampled at its start, ``sample_every`` later, ... and at the end.
@@ -217,7 +220,7 @@ class Simulator(nn.Module):
         else:
             state = self._state(scene, whole, x, velocity, moving=body.velocity is not None)
         samples = sorted({*range(0, steps + 1, every), steps})
-        observed, final = self._integrate(scene, whole, state, weights, samples, began)
+        observed, final = self._integrate(scene, whole, state, weights, samples, began, progress)
         shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in observed]
         return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
 
@@ -250,14 +253,21 @@ class Simulator(nn.Module):
         return initial_state(x, velocity, elements, affine=spin)
 
     def _integrate(
-        self, scene: Scene, whole: Inputs, state: Tensor, weight: Tensor, samples: list[int], began: int
+        self,
+        scene: Scene,
+        whole: Inputs,
+        state: Tensor,
+        weight: Tensor,
+        samples: list[int],
+        began: int,
+        progress: Callable[[int, int], None] | None,
     ) -> tuple[list[Tensor], Tensor]:
         """Run the segments of the plan one after the other; ``began`` substeps went before."""
         steps = whole.gravity.shape[0]
         differentiable = torch.is_grad_enabled() and any(
             t.requires_grad for t in (state, weight, *(getattr(whole, f.name) for f in fields(whole)))
         )
-        segment, keep = steps, False
+        segment, keep = steps if progress is None else max(64, math.ceil(steps / 100)), False
         if differentiable:
             share = {} if scene.lattice is None else {"node_share": 1 + 3 * scene.lattice.nodes / state.shape[1]}
             plan = plan_checkpoints(
@@ -280,6 +290,8 @@ class Simulator(nn.Module):
             )
             state, *seen = rollout(scene, cut, state, weight, first=began + first, samples=inside, keep=keep)
             parts.append(tuple(seen))
+            if progress is not None:
+                progress(last, steps)
         return [torch.cat(each) for each in zip(*parts, strict=True)], state
 
     def _clock(
