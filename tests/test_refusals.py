@@ -9,7 +9,7 @@ import pytest
 import torch
 from problems import DT, H, block, constant, simulator, vector, ways
 
-from torchsoro import Gas, Prony, Simulator, Solid, ground, stable_step
+from torchsoro import DesignField, Gas, Prony, Simulator, Solid, ground, stable_step, stride, travel
 
 FREE = (0.0, 0.0, 0.0)
 
@@ -168,3 +168,21 @@ def test_the_limit_grows_with_the_cell(poisson_ratio):
 def test_a_box_of_few_cells_is_refused():
     with pytest.raises(ValueError, match="over 6 cells apart"):
         Simulator(cell=0.01, dt=1e-5, low=FREE, high=(0.06, 0.1, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("cell", lambda n: Simulator(cell=n, dt=1e-4, low=(-1.0,) * 3, high=(1.0,) * 3)),
+        ("dt", lambda n: Simulator(cell=5e-3, dt=n, low=(-1.0,) * 3, high=(1.0,) * 3)),
+        ("low", lambda n: Simulator(cell=5e-3, dt=1e-4, low=(n, -1.0, -1.0), high=(1.0,) * 3)),
+        ("duration", lambda n: simulator()(block()[1], duration=n)),
+        ("sample_every", lambda n: simulator()(block()[1], duration=0.01, sample_every=n)),
+        ("end", lambda n: travel(torch.zeros(2, 3), torch.tensor([0.0, 0.01]), start=0.0, end=n, direction=(1, 0, 0))),
+        ("period", lambda n: stride(torch.zeros(2, 3), torch.arange(2.0), start=0.0, period=n, direction=(1, 0, 0))),
+        ("beta", lambda n: DesignField(block()[0], radius=0.01, beta=n)),
+    ],
+)
+def test_tensor_with_gradient_is_refused_where_only_a_number_is_taken(name, call):
+    with pytest.raises(ValueError, match=f"{name} = .*wanted a number"):
+        call(torch.tensor(0.01, dtype=torch.float64, requires_grad=True))

@@ -1,4 +1,4 @@
-"""Errors that a running simulation raises; bad input is a plain ``ValueError`` before any work."""
+"""The error of a simulation that breaks down; bad input is a plain ``ValueError`` before any work."""
 
 from __future__ import annotations
 
@@ -37,3 +37,18 @@ class SimulationDiverged(RuntimeError):
         """Rebuild from the keywords: the default would hand the message to a keyword-only constructor."""
         keywords = {name: getattr(self, name) for name in ("step", "time", "particle", "quantity", "batch", "remedy")}
         return functools.partial(type(self), **keywords), ()
+
+
+def refuse_gradients(**numbers: object) -> None:
+    """Refuse a tensor that requires a gradient where a plain number is wanted, which has none.
+
+    Args:
+        **numbers: What was given, by the name of the argument; sequences are looked through.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    for name, value in numbers.items():
+        for one in value if isinstance(value, list | tuple) else (value,):
+            if getattr(one, "requires_grad", False):
+                raise ValueError(f"{name} = {one}: requires a gradient, wanted a number, by which there is none")

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from torchsoro.design.domain import Domain
+from torchsoro.errors import refuse_gradients
 
 _AXES = ("x", "y", "z")
 
@@ -61,6 +62,7 @@ class DesignField(nn.Module):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         """Lay out the filter and the symmetry for this domain."""
+        refuse_gradients(radius=radius, beta=beta)
         longest = max(domain.size)
         if not (math.isfinite(radius) and 0.0 < radius <= longest):
             raise ValueError(f"radius: got {radius!r} m, want > 0 and at most the longest body edge ({longest} m)")

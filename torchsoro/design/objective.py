@@ -16,6 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoro.errors import refuse_gradients
+
 
 def center_of_gravity(x: Tensor, mass: Tensor) -> Tensor:
     """Centre of gravity, Eq. 14: ``x_g = sum_p m_p x_p / sum_p m_p``.
@@ -70,6 +72,7 @@ def travel(cog: Tensor, time: Tensor, *, start: float, end: float, direction: Te
     Raises:
         ValueError: Shapes do not fit, ``start`` or ``end`` is not a sample, or the direction is not a unit vector.
     """
+    refuse_gradients(start=start, end=end)
     unit = _checked_history(cog, time, direction)
     first, last = _sample(time, start, "start"), _sample(time, end, "end")
     if last <= first:
@@ -94,6 +97,7 @@ def stride(cog: Tensor, time: Tensor, *, start: float, period: float, direction:
         ValueError: Shapes do not fit, no cycle is complete, an end of a cycle is not a sample, or the direction is not
             a unit vector.
     """
+    refuse_gradients(start=start, period=period)
     unit = _checked_history(cog, time, direction)
     if not (math.isfinite(period) and period > 0.0):
         raise ValueError(f"period: got {period!r} s, want a finite time > 0")

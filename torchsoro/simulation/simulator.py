@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from torchsoro.errors import refuse_gradients
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.assembly import (
     assemble,
@@ -113,6 +114,7 @@ class Simulator(nn.Module):
     ) -> None:
         super().__init__()
         numbers = {"cell": cell, "dt": dt, "memory_budget": memory_budget, "segment": segment, "safety": safety}
+        refuse_gradients(**numbers, low=low, high=high)
         if dt == "auto":
             del numbers["dt"]
         for name, value in numbers.items():
@@ -180,6 +182,7 @@ class Simulator(nn.Module):
         """
         refuse_transforms()
         x = body.position
+        refuse_gradients(duration=duration, sample_every=sample_every)
         if self.dt != "auto":
             steps, every = _steps(duration, sample_every, self.dt)
         check_body(body)
