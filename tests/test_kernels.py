@@ -42,11 +42,10 @@ def run_spline(inverse_cell: ti.f64, x: Reals, base: Reals, w: Reals, dw: Reals,
 
 
 @ti.kernel
-def run_tensor(a: Reals, b: Reals, cof: Reals, dev: Reals, dot: Reals, back: Reals, scratch: Reals, n: ti.i32):
+def run_tensor(a: Reals, b: Reals, cof: Reals, dot: Reals, back: Reals, scratch: Reals, n: ti.i32):
     for i in range(n):
         A, B = matrix(a, i), matrix(b, i)
         put(cof, i, tensor.cofactor(A))
-        put(dev, i, tensor.deviator(A))
         dot[i] = tensor.contract(A, B)
         tensor.store_symmetric(scratch, 6 * i, 1, A + A.transpose())
         put(back, i, tensor.load_symmetric(scratch, 6 * i, 1))
@@ -217,11 +216,9 @@ def test_weights_are_continuous_where_the_nodes_change():
 
 def test_tensor_functions_agree_with_torch():
     a, b = deformations(seed=3, size=2.0), deformations(seed=4, size=2.0)
-    cof, dev, dot, back, scratch = out(32, 3, 3), out(32, 3, 3), out(32), out(32, 3, 3), out(32, 6)
-    run_tensor(*(flat(t) for t in (a, b, cof, dev, dot, back, scratch)), 32)
+    cof, dot, back, scratch = out(32, 3, 3), out(32), out(32, 3, 3), out(32, 6)
+    run_tensor(*(flat(t) for t in (a, b, cof, dot, back, scratch)), 32)
     torch.testing.assert_close(cof, torch.linalg.det(a)[:, None, None] * torch.linalg.inv(a).mT, rtol=1e-9, atol=1e-12)
-    third = a.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] / 3
-    torch.testing.assert_close(dev, a - third * torch.eye(3, dtype=torch.float64), rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(dot, (a * b).sum((1, 2)), rtol=1e-13, atol=1e-13)
     assert torch.equal(back, a + a.mT)
 

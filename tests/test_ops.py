@@ -1,4 +1,4 @@
-"""The operator: its gradients by every tensor, its reproducibility, and what it refuses."""
+"""The operator: gradients by every tensor, reproducibility, refused arguments."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_gradcheck_of_a_bare_body(form):
 
 
 @forms("apic", "total")
-def test_no_output_is_without_effect_and_undefined_gradients_are_zero(form):
+def test_every_output_has_a_gradient_by_the_state(form):
     p = problem(**form)
     leaves = p.leaves()
     for k, output in enumerate(p.run(leaves)):
@@ -147,7 +147,7 @@ def test_backward_accumulates_once_each_time(form):
 
 
 @forms("apic", "total")
-def test_gradient_flows_through_what_made_a_tensor(form):
+def test_gradient_reaches_the_leaves_behind_the_inputs(form):
     p = problem(**form)
     once = gradients(p)
     seeds = {name: (t / 2).requires_grad_() for name, t in p.tensors.items()}
@@ -159,7 +159,7 @@ def test_gradient_flows_through_what_made_a_tensor(form):
 
 
 @forms("apic", "total")
-def test_inputs_are_left_alone(form):
+def test_inputs_are_not_modified(form):
     p = problem(**form)
     copies = {name: t.clone() for name, t in p.tensors.items()}
     gradients(p)
@@ -167,7 +167,7 @@ def test_inputs_are_left_alone(form):
 
 
 @forms("mixed", "total")
-def test_gradients_do_not_depend_on_which_are_wanted(form):
+def test_gradient_by_one_tensor_equals_that_by_all(form):
     p = problem(**form)
     every = gradients(p)
     launched = (forward.substep, backward.substep_adjoint, total.total_substep, total_adjoint.total_substep_adjoint)
@@ -182,7 +182,7 @@ def test_gradients_do_not_depend_on_which_are_wanted(form):
 
 
 @forms("apic", "total")
-def test_noncontiguous_tensors_are_taken_as_they_look(form):
+def test_noncontiguous_inputs_give_the_same_bits(form):
     p = problem(batch=2, **form)
     turned = {name: t.transpose(0, -1).contiguous().transpose(0, -1) for name, t in p.tensors.items()}
     assert not turned["state"].is_contiguous()
@@ -212,7 +212,7 @@ def test_gradient_is_the_same_for_every_plan(form):
         close(dict(zip(whole, grads, strict=True)), whole, 1e-12)
 
 
-def test_a_run_over_several_active_boxes_has_the_right_gradient():
+def test_gradcheck_over_several_active_boxes():
     # Fast particles leave the active box within a few substeps, so that a segment has several.
     p = problem(steps=30, blend=0.7, samples=(3, 17, 30))
     p.tensors["state"][:, 3:6] *= 8

@@ -1,4 +1,4 @@
-"""What the simulator refuses before any work, and that it says what it saw and what it wants."""
+"""Arguments that the simulator refuses before any work, with the value seen and the value wanted."""
 
 from __future__ import annotations
 

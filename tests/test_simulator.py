@@ -1,4 +1,4 @@
-"""The simulator: exact motions, conservation, gradients through long runs, what it records, and what it refuses."""
+"""The simulator: exact motions, conservation, batches, gradients through long runs, memory plans."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_a_pressurised_chamber_swells_and_reports_eq_10(way):
 
 
 @ways("apic", "total")
-def test_a_batch_gives_each_simulation_its_own(way):
+def test_each_simulation_of_a_batch_equals_its_single_run(way):
     _, body = block((4, 4, 6), air=True)
     g = torch.tensor([[0.0, 0.0, -9.81], [2.0, 0.0, -5.0], [0.0, 0.0, 0.0]]).double()
     waves = torch.stack([constant(0.0).pressure, constant(300.0).pressure, constant(900.0).pressure])
@@ -189,7 +189,7 @@ def test_the_centre_of_gravity_is_weighted_as_asked(way):
     torch.testing.assert_close(run.center_of_gravity[0], (body.position[0] + 3 * body.position[63]) / 4)
 
 
-def test_two_simulators_do_not_disturb_each_other():
+def test_alternating_simulators_give_the_same_bits():
     _, body = block()
     coarse, fine = simulator(), simulator(cell=4 * H)
     alone = coarse(body, duration=50 * DT, planes=[ground()]).final
@@ -299,7 +299,7 @@ def test_gradient_through_2000_steps_of_smooth_contact(way, kind, step):
 
 
 @ways("apic", "total")
-def test_gradient_across_contact_events_is_reported(way):
+def test_gradient_across_contact_events_is_finite(way):
     # As the block bounces, contact comes and goes at every node: the travel jumps there, and a difference over a
     # longer step, which straddles such jumps, is not held to any bound.
     bouncing = Rollout(pulse=1e3, **way)
@@ -314,7 +314,7 @@ def test_gradient_across_contact_events_is_reported(way):
 
 
 @ways("apic", "total")
-def test_float32_gradient_is_within_a_hundredth(way):
+def test_float32_gradient_agrees_with_float64_within_1_percent(way):
     slopes, vectors = [], []
     for dtype in (torch.float64, torch.float32):
         rollout = Rollout(dtype=dtype, **(GENTLE if way == WAYS["total"] else LIVELY), **way)
@@ -387,7 +387,7 @@ def test_gradient_by_start_equals_central_difference(way):
 
 
 @ways("apic", "total")
-def test_no_memory_is_spent_without_gradients(way):
+def test_budget_does_not_bind_without_gradients(way):
     _, body = block()
     run = simulator(memory_budget=1, **way)(body, duration=500 * DT)
     assert not run.final.requires_grad

@@ -1,4 +1,4 @@
-"""The one place that starts Taichi, on the device that the tensors live on."""
+"""Start of Taichi, on the device of the tensors; exclusion of functions from ``torch.compile``."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ T = TypeVar("T")
 
 _started: str | None = None
 
-# What is compiled goes to the cache on disk when Taichi ends, which by itself it may not do.
+# Taichi writes compiled kernels to its cache on disk when it is reset, which it does not always do at exit.
 atexit.register(ti.reset)
 
 
 def _remember_positions() -> None:
-    """Describe the place of a kernel's node, for messages, once and not each time that its function is inlined.
+    """Cache the source positions of kernel nodes, which Taichi formats for messages at every inlining.
 
-    A third to a half of the time that Taichi takes to read the adjoint kernels, in the cache or not, goes into that.
+    This formatting takes a third to a half of the time in which Taichi parses the adjoint kernels, cached or not.
     """
     describe, known = ASTTransformerContext.get_pos_info, {}
 
@@ -64,9 +64,9 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
     if _started == kind and threads is None:
         return
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
-    # On a CPU, LLVM's own passes do as well in a tenth of the time that Taichi's take on the large adjoint kernels.
+    # On a CPU, code of LLVM's passes alone is as fast; Taichi's take ten times as long on the large adjoint kernels.
     options["advanced_optimization"] = kind == "cuda"
-    # Memory comes from torch; Taichi needs next to none on the GPU.
+    # Tensors are allocated by torch, so that Taichi needs little memory of its own on the GPU.
     if kind == "cuda":
         options["device_memory_GB"] = 0.3
         # Taichi would start thousands of blocks for every loop, most of them empty.

@@ -96,16 +96,6 @@ def cross(m, n):
 
 
 @ti.func
-def deviator(m):
-    """The deviatoric part, m - tr(m)/3 I."""
-    third = m.trace() / 3
-    d = m
-    for i in ti.static(range(3)):
-        d[i, i] -= third
-    return d
-
-
-@ti.func
 def contract(a, b):
     """The inner product a : b."""
     s = a[0, 0] * b[0, 0]

@@ -4,6 +4,11 @@ Adjoint and memory are explicit: the rollout returns, beside its results, the re
 ``torch.ops.torchsoro.rollout_backward`` reads. The scene is passed by its handle. Operators are registered by
 ``torch.library.define``: ``torch.library.custom_op`` makes the same of a function, but imports ``torch._dynamo`` at its
 first call (1.5 to 3 s) in programs that compile nothing.
+
+Against an ``autograd.Function`` that keeps its memory on the context, values and gradients are the same bit for bit
+(on a CPU, and in the total-Lagrangian form on CUDA), the time is the same within its scatter, and peak memory is 2 to
+5 % higher in the updated form on CUDA, where the buffers of all chunks are joined (bodies of 512 and 13,824 particles,
+200 and 400 substeps, one H100).
 """
 
 from __future__ import annotations
