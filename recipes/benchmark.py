@@ -29,7 +29,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from torchsoro.benchmark.naive import Naive
@@ -48,7 +47,7 @@ from torchsoro.benchmark.timing import (
     skipping,
     table,
 )
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import run
 
 PAPER_STEPS = 75_000
 SIZES = {"cpu": (2000, 4096, 8000, 16_384), "cuda": (16_384, 64_000, 216_000, 512_000, 2_000_376)}
@@ -389,13 +388,8 @@ def main(options: Options) -> dict[str, Any]:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Measure what the command line asks for.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """Measure what the command line asks for."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

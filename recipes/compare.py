@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import tyro
 
-from torchsoro.command_line import CountOrZero, options, plain_errors, progress_bar
+from torchsoro.command_line import CountOrZero, options, progress_bar, run
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Outcome, Robot, build
@@ -267,13 +267,8 @@ def line(name: str, found: Mapping[str, Any]) -> str:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Perform the checks of a robot as the command line says.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """Perform the checks of a robot as the command line says."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import tyro
 
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import run
 from torchsoro.sim2real.data.recording import AXES, write_table
 from torchsoro.sim2real.data.tracking import LIKELIHOOD, Frame, Tracked, read
 from torchsoro.storage import check_folder
@@ -96,13 +96,8 @@ def main(options: Options) -> None:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Convert what the command line names.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """Convert what the command line names."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

@@ -13,9 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import tyro
-
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import run
 from torchsoro.sim2real.options import Options
 
 
@@ -27,13 +25,8 @@ def main(options: Options) -> None:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Explain an experiment, or predict a trial, as the command line says.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """Explain an experiment, or predict a trial, as the command line says."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

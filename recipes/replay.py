@@ -20,7 +20,7 @@ import torch
 import tyro
 from pydantic import Field
 
-from torchsoro.command_line import AtLeastZero, Count, options, plain_errors
+from torchsoro.command_line import AtLeastZero, Count, options, run
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.output import archive
@@ -102,13 +102,8 @@ def main(chosen: Options) -> dict[str, float]:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """Show or keep a robot as the command line says.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """Show or keep a robot as the command line says."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

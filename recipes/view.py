@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from torchsoro.command_line import parse_resolution, plain_errors
+from torchsoro.command_line import parse_resolution, run
 
 if TYPE_CHECKING:
     from torchsoro.output.motion import Motion
@@ -148,13 +148,8 @@ def _told(path: Path) -> Path:
 
 
 def cli(arguments: Sequence[str] | None = None) -> None:
-    """View or write a motion as the command line says.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        main(tyro.cli(Options, description=__doc__, args=arguments))
+    """View or write a motion as the command line says."""
+    run(main, Options, description=__doc__, arguments=arguments)
 
 
 if __name__ == "__main__":

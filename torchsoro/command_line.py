@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 import pydantic
@@ -112,6 +112,26 @@ def progress_bar(stage: str) -> Iterator[Callable[[int, int], None]]:
             bar.update(done - bar.n)
 
         yield show
+
+
+def run(
+    main: Callable[[Any], object], options: type, *, description: str | None, arguments: Sequence[str] | None = None
+) -> None:
+    """Read options from the command line and run a program with them; errors are told in a line.
+
+    Args:
+        main: The program.
+        options: Class of its options.
+        description: Text on top of ``--help``.
+        arguments: Instead of the process's own.
+
+    Raises:
+        SystemExit: see :func:`plain_errors`; also after ``--help`` and for an unknown flag.
+    """
+    import tyro  # takes a while to import
+
+    with plain_errors():
+        main(tyro.cli(options, description=description, args=arguments))
 
 
 @contextlib.contextmanager
