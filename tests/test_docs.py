@@ -14,6 +14,17 @@ from pathlib import Path
 import pytest
 
 from torchsoro import cli
+from torchsoro.sim2real.data.schema import (
+    BodyTable,
+    Boundary,
+    Cavity,
+    Clamp,
+    Load,
+    Marker,
+    Material,
+    RecordingTable,
+    SetupFile,
+)
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs/pages").rglob("*.md"))]
@@ -140,6 +151,25 @@ def test_every_command_is_a_recipe_that_knows_its_flags(name, capsys, monkeypatc
             for flag in flags - {"--help"}:
                 field = flag[2:].removeprefix("no-").replace("-", "_")
                 assert re.search(rf"^\s+{field}: ", source, re.MULTILINE), f"{name}: {' '.join(words)}: {flag}"
+
+
+def test_every_field_of_an_experiment_is_described():
+    page = (ROOT / "docs/pages/explain.md").read_text(encoding="utf-8")
+    tables = {"body": BodyTable, "material": Material, "clamp": Clamp, "chamber": Cavity, "plane": Boundary}
+    tables |= {"load": Load, "marker": Marker, "recording": RecordingTable}
+    for name, model in tables.items():
+        text = re.split(r"^(?:`\[|#)", part_of(page, name), maxsplit=1, flags=re.M)[0]
+        for field in model.model_fields:
+            assert f"| `{field}` |" in text, f"[{name}]: {field}"
+    for field in SetupFile.model_fields:
+        assert f"`{field}`" in page or f"[{field}]" in page, field
+
+
+def part_of(page: str, table: str) -> str:
+    """What the page says under the heading of a table."""
+    found = re.search(rf"^`\[+{table}\]+`.*?$(.*)", page, re.M | re.S)
+    assert found, table
+    return found[1]
 
 
 def result(robot: str) -> dict[str, float]:
