@@ -16,9 +16,9 @@ from collections.abc import Sequence
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import CLIMBER
 from torchsoro.design.reading import from_command_line
-from torchsoro.design.robot import climber
 from torchsoro.design.settings import Settings
-from torchsoro.output.delivery import design, report
+
+# What designs is imported when it is needed: --help and a wrong option answer at once.
 
 
 def main(settings: Settings) -> dict[str, float]:
@@ -35,6 +35,9 @@ def main(settings: Settings) -> dict[str, float]:
     """
     if settings.robot != "climber":
         raise ValueError(f"robot = {settings.robot!r}: wanted 'climber'; recipes/walker.py designs a walker")
+    from torchsoro.design.robot import climber
+    from torchsoro.output.delivery import design
+
     return design(climber(settings), "climber")
 
 
@@ -46,7 +49,10 @@ def cli(arguments: Sequence[str] | None = None) -> None:
     """
     with plain_errors():
         settings = from_command_line(CLIMBER, description=__doc__, arguments=arguments)
-        print(report(main(settings), settings))
+        result = main(settings)
+        from torchsoro.output.delivery import report
+
+        print(report(result, settings))
 
 
 if __name__ == "__main__":

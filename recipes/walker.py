@@ -17,9 +17,9 @@ from collections.abc import Sequence
 from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import WALKER
 from torchsoro.design.reading import from_command_line
-from torchsoro.design.robot import walker
 from torchsoro.design.settings import Settings
-from torchsoro.output.delivery import design, report
+
+# What designs is imported when it is needed: --help and a wrong option answer at once.
 
 
 def main(settings: Settings) -> dict[str, float]:
@@ -36,6 +36,9 @@ def main(settings: Settings) -> dict[str, float]:
     """
     if settings.robot != "walker":
         raise ValueError(f"robot = {settings.robot!r}: wanted 'walker'; recipes/climber.py designs a climber")
+    from torchsoro.design.robot import walker
+    from torchsoro.output.delivery import design
+
     return design(walker(settings), "walker")
 
 
@@ -47,7 +50,10 @@ def cli(arguments: Sequence[str] | None = None) -> None:
     """
     with plain_errors():
         settings = from_command_line(WALKER, description=__doc__, arguments=arguments)
-        print(report(main(settings), settings))
+        result = main(settings)
+        from torchsoro.output.delivery import report
+
+        print(report(result, settings))
 
 
 if __name__ == "__main__":

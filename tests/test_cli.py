@@ -39,6 +39,19 @@ def test_help_and_the_package_load_neither_torch_nor_taichi():
     assert f"torchsoro {importlib.metadata.version('torchsoro')}" in ended.stdout
 
 
+@pytest.mark.parametrize("name", ["walker", "climber", "view", "explain"])
+def test_help_of_a_command_loads_neither_torch_nor_taichi(name):
+    code = (
+        "import sys; from torchsoro import cli\n"
+        f"try:\n    cli.main([{name!r}, '--help'])\nexcept SystemExit:\n    pass\n"
+        "assert not {'torch', 'taichi'} & set(sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert ended.returncode == 0, ended.stderr
+    assert f"torchsoro {name} " in ended.stdout
+    assert "python recipes" not in ended.stdout
+
+
 def test_a_command_that_does_not_exist_is_refused_with_those_that_do():
     ended = run("wlaker")
     assert ended.returncode == 2

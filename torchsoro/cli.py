@@ -68,6 +68,8 @@ def load(name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[dotted] = module  # dataclasses look their annotations up there
     spec.loader.exec_module(module)
+    # Its help shows the commands as they are called here.
+    module.__doc__ = re.sub(r"python recipes/(\w+)\.py", r"torchsoro \1", module.__doc__ or "")
     return module
 
 

@@ -10,10 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import tyro
 
-from torchsoro.design.settings import Settings
+from torchsoro.design.settings import Settings, cuda_available
 
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
 GROUPS = {
@@ -47,13 +46,15 @@ def from_command_line(
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default=None)
     first.add_argument("--device", default="auto")
+    first.add_argument("-h", "--help", action="store_true")
     known, _ = first.parse_known_args(arguments)
-    gpu = known.device == "cuda" or (known.device == "auto" and torch.cuda.is_available())
+    # The help does not wait for torch to say whether there is a GPU, and shows the desk preset.
+    gpu = known.device == "cuda" or (known.device == "auto" and not known.help and cuda_available())
     name = known.preset or ("paper" if gpu else "desk")
     # A preset that does not exist is refused by tyro.
     default = presets.get(name, presets["desk"])
     # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
-    text = re.sub(r"\n *(?=(?:python|tensorboard) )", "\n$ ", description or "")
+    text = re.sub(r"\n *(?=(?:python|torchsoro|tensorboard) )", "\n$ ", description or "")
     groups = tyro.cli(_grouped(default), args=arguments, description=text, config=(tyro.conf.OmitArgPrefixes,))
     chosen = {name: value for group in vars(groups).values() for name, value in vars(group).items()}
     return Settings(**chosen)

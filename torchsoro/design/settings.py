@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import torch
 from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
+
+if TYPE_CHECKING:
+    import torch
+
+# torch is imported where it is used: the command line lists the settings without it.
 
 _SOFTEST = 1e3  # Pa; below the softest gels, so that a smaller modulus is one in another unit
 _STEEPEST = 2.0  # rise over run, 63 degrees; a larger slope is one in percent or degrees
@@ -22,6 +26,13 @@ _PARTICLE, _FRAME, _STEP = 1024, 48, 64
 
 _Length = Annotated[float, Field(strict=True, ge=1e-6, le=1e3)]
 _Density = Annotated[float, Field(strict=True, ge=0, le=1)]
+
+
+def cuda_available() -> bool:
+    """Whether torch can use a CUDA device."""
+    import torch
+
+    return torch.cuda.is_available()
 
 
 @options
@@ -191,7 +202,7 @@ class Settings:
         for flags in (("resume", "overwrite"), ("amend", "overwrite")):
             if all(getattr(self, flag) for flag in flags):
                 raise ValueError(f"{' and '.join(flags)}: wanted one of them, to go on with a run or to start again")
-        if self.device == "cuda" and not torch.cuda.is_available():
+        if self.device == "cuda" and not cuda_available():
             raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
 
     def _check_units(self) -> None:
@@ -238,6 +249,8 @@ class Settings:
         time = self.settle + self.duration
         need = nx * ny * nz * (_PARTICLE + _FRAME * time / self.sample_every) + (0 if dt is None else _STEP * time / dt)
         if self.target.type == "cuda":
+            import torch
+
             have = torch.cuda.get_device_properties(self.target).total_memory
         else:
             have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
@@ -258,6 +271,8 @@ class Settings:
     @property
     def target(self) -> torch.device:
         """The device to compute on."""
+        import torch
+
         auto = "cuda" if torch.cuda.is_available() else "cpu"
         return torch.device(auto if self.device == "auto" else self.device)
 
