@@ -62,7 +62,7 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
         np.testing.assert_allclose(by[..., k], difference, rtol=0.02, atol=0.02 * np.abs(difference).max() + 1e-9)
 
 
-def test_a_band_makes_its_own_noise_white():
+def test_noise_model_whitens_noise_of_its_own_covariance():
     rng = np.random.default_rng(2)
     time = np.arange(60) * 0.01
     discretization = np.array([[2e-4, 0.0]])
@@ -238,7 +238,7 @@ def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
     assert (abs(found.point - one.point) < 0.2 * away + 0.01).all()
 
 
-def test_what_is_believed_costs_little_within_its_tolerance(made):
+def test_prior_residual_is_small_within_the_tolerance_and_large_beyond(made):
     twin, ensemble, record = made
     problem = FitProblem(record(None), twin, ensemble=ensemble)
     held = np.array([False])
@@ -355,7 +355,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
     assert answer["error_after"]["a"]["all"] < 0.5 * answer["error_before"]["a"]["all"]
     page = (tmp_path / "out" / "report.html").read_text()
     assert re.search(
-        r'<p class="lead">Missing from the setup is drag [^:]*: [^:]* \d+ kg/m³ \(90 %: \d+ to \d+ kg/m³', page
+        r'<p class="lead">The difference is explained by drag [^:]*: [^:]* \d+ kg/m³ \(90 %: \d+ to \d+ kg/m³', page
     )
     assert page.count("data:image/png") == 5
     folder = tmp_path / "new"
@@ -384,7 +384,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
         read_model(model)
 
 
-def test_what_no_effect_explains_bends_no_clock(made):
+def test_measurement_errors_stay_within_6_deviations_where_no_effect_explains(made):
     """A wind that is none of the effects at hand: what is left is priced, and measurement errors stay believable."""
     twin, ensemble, record = made
     recorded = record("attached_mass", (0.01, 0.06, 0.01, 0.01))

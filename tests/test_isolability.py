@@ -70,7 +70,7 @@ def test_modes_are_what_the_chain_does():
     np.testing.assert_allclose(simulated(np.array([0.0, 0.3, 0.0, 0.0])), 0.3 * answer(1), atol=1e-8)
 
 
-def test_what_nuisances_leave_is_the_generalised_least_squares_misfit():
+def test_projection_off_nuisances_gives_the_generalised_least_squares_chi2():
     left = cleared(columns(), OFFSETS, PRIOR)
     # Marginal covariance of the samples once the offsets have their priors.
     covariance = np.eye(len(OFFSETS)) + OFFSETS @ np.diag(PRIOR**-2) @ OFFSETS.T
@@ -83,7 +83,7 @@ def test_what_nuisances_leave_is_the_generalised_least_squares_misfit():
     assert imitation(left[:, 0], left[:, 1:], np.full(3, True)) == pytest.approx(math.sqrt(most), rel=1e-6)
 
 
-def test_what_has_one_sign_does_not_imitate_its_opposite():
+def test_cosine_with_a_one_sided_effect_of_opposite_sign_is_zero():
     v = columns()[:, 0]
     assert imitation(v, -v[:, None], np.array([False])) == pytest.approx(0.0, abs=1e-6)
     assert imitation(v, -v[:, None], np.array([True])) == pytest.approx(1.0)
@@ -112,7 +112,7 @@ def test_screening_finds_the_node_where_a_force_was_planted(node):
         assert chi2s[k] - chi2s[node] == pytest.approx(expected, rel=0.15)
 
 
-def test_forces_on_a_chain_are_seen_and_alike_as_in_closed_form():
+def test_detectable_forces_and_cosines_on_a_chain_match_closed_form():
     changes = columns()
     none = np.zeros((len(changes), 0))
     responses = [
@@ -141,7 +141,7 @@ def test_a_common_unknown_takes_up_what_its_belief_allows():
     assert float(prior_residual(np.array([found]))[0]) == pytest.approx(math.sqrt(40.0), rel=0.01)
 
 
-def test_what_begins_at_a_strength_is_seen_from_there_on():
+def test_detectable_strength_of_an_effect_with_a_threshold():
     v = columns()[:, 0] / np.linalg.norm(columns()[:, 0])
     changes = np.stack([0 * v, 20 * v], -1)
     found, change = first_seen(np.array([1.0, 3.0]), changes, np.zeros((len(v), 0)), lambda x: x, 40.0)
@@ -192,7 +192,7 @@ def screened(problem):
     return isolability(problem, [*map(effect, names), Twice(), Idle(), Broken()])
 
 
-def test_effects_that_are_the_same_are_alike(screened):
+def test_cosine_of_identical_effects_is_one(screened):
     at = {name: i for i, name in enumerate(screened.effects)}
     density, twice = at["density"], at["twice"]
     assert screened.cosines[density, twice] == pytest.approx(1.0, abs=1e-6)
@@ -216,7 +216,7 @@ def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than
     assert found.cosines[mass, drag] < 0.97
 
 
-def test_what_changes_nothing_or_breaks_down_is_never_seen(screened):
+def test_effect_without_response_or_whose_simulation_breaks_down_is_never_detectable(screened):
     idle, broken = screened.effects.index("idle"), screened.effects.index("broken")
     assert np.isinf(screened.detectable[[idle, broken]]).all()
     assert np.isfinite(np.delete(screened.detectable, [idle, broken])).all()

@@ -36,7 +36,7 @@ def on(planes):
     return SimpleNamespace(experiment=SimpleNamespace(setup=SimpleNamespace(planes=planes)))
 
 
-def test_candidates_are_scored_by_the_best_of_them(still):
+def test_scores_are_in_units_of_the_residual_variance_of_the_best_effect(still):
     problem, null_model = still
     worse = dataclasses.replace(null_model, chi2=3 * null_model.samples, effects=(effect("drag"),), unknowns=1)
     better = dataclasses.replace(worse, chi2=1.5 * null_model.samples, effects=(effect("tether"),), unknowns=6)
@@ -68,21 +68,21 @@ def test_candidates_are_scored_by_the_best_of_them(still):
         (5.0, 1.1, 1.0, 300.0, 0.9, "unknown_physics"),  # it fits, but does not predict
     ],
 )
-def test_what_is_said_of_the_best_effect(still, start, excess, explained, gain, kept, kind):
+def test_verdict_on_one_effect_by_chi2_share_and_heldout_ratio(still, start, excess, explained, gain, kept, kind):
     problem, null_model = still
     fit = dataclasses.replace(null_model, effects=(effect("drag"),), values=(np.ones(1),))
     found = [Candidate(fit=fit, score=400.0, gain=gain, explained=explained, heldout_ratio=kept)]
     assert decide(problem, null_model, found, excess, Thresholds(), start=start).kind == kind
 
 
-def test_where_trials_that_are_left_out_tell_little_but_noise_a_little_better_is_believed(still):
+def test_heldout_ratio_of_0_9_suffices_where_the_heldout_error_is_below_twice_the_noise(still):
     problem, null_model = still
     found = [fitted(null_model, "density", 400.0, 0.96, heldout_ratio=0.9)]
     for faint, chosen in ((1.5, 1), (3.0, 0)):
         assert len(decide(problem, null_model, found, 1.5, Thresholds(), start=9.0, faint=faint).chosen) == chosen
 
 
-def test_a_strained_belief_is_set_free_too(still):
+def test_modulus_beyond_its_tolerance_is_fitted_without_its_prior(still):
     problem, null_model = still
     assert not _unconstrained(problem, library(), null_model)
     ((chosen, begin),) = _unconstrained(problem, library(), dataclasses.replace(null_model, point=np.array([3.5])))
@@ -90,7 +90,7 @@ def test_a_strained_belief_is_set_free_too(still):
     assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
 
 
-def test_what_predicts_far_worse_than_another_is_not_believed(still):
+def test_effect_with_far_larger_heldout_error_than_another_is_not_chosen(still):
     problem, null_model = still
     tether, drag = (
         dataclasses.replace(null_model, effects=(effect(name),), values=(np.ones(6),)) for name in ("tether", "drag")
@@ -108,7 +108,7 @@ def test_what_predicts_far_worse_than_another_is_not_believed(still):
     assert decide(problem, null_model, found, 1.5, Thresholds(), start=9.0).chosen[0].fit.name == "tether"
 
 
-def test_a_threshold_does_not_part_what_predicts_alike(still):
+def test_effects_with_nearly_equal_heldout_ratios_on_both_sides_of_the_limit_are_both_kept(still):
     problem, null_model = still
     found = [
         fitted(null_model, name, 400.0, 0.96, heldout_ratio=kept)
@@ -120,7 +120,7 @@ def test_a_threshold_does_not_part_what_predicts_alike(still):
 
 
 @pytest.mark.parametrize("planes, kind", [((), "explained"), (("a plane",), "cannot_distinguish")])
-def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
+def test_margin_between_effects_is_larger_where_the_body_meets_planes(still, planes, kind):
     _, null_model = still
     found = [
         fitted(null_model, name, score, 0.96)
@@ -132,7 +132,7 @@ def test_where_bodies_slide_effects_are_told_apart_by_more(still, planes, kind):
 
 
 @pytest.mark.parametrize("kept, told", [(0.8, ["friction"]), (0.9, ["friction", "adhesion"])])
-def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
+def test_bad_heldout_prediction_does_not_exclude_an_effect_where_the_body_meets_planes(still, kept, told):
     _, null_model = still
     found = [
         fitted(null_model, name, score, 0.96, heldout_ratio=ratio)
@@ -143,21 +143,21 @@ def test_where_bodies_slide_a_bad_prediction_tells_little(still, kept, told):
     ] == told
 
 
-def test_nothing_is_missing_where_noise_and_numerics_cover_all(still):
+def test_nothing_is_missing_where_chi2_of_the_stated_setup_is_below_0_8_per_sample(still):
     problem, null_model = still
     found = [fitted(null_model, "drag", 400.0, 0.96, heldout_ratio=0.5)]
     for plainly, kind in ((0.75, "nothing_missing"), (0.85, "explained")):
         assert decide(problem, null_model, found, 0.5, Thresholds(), start=0.75, plainly=plainly).kind == kind
 
 
-def test_what_noise_hides_is_one_effect_where_bodies_slide_too(still):
+def test_one_effect_is_chosen_on_planes_where_noise_limits_the_heldout_error(still):
     _, null_model = still
     found = [fitted(null_model, "friction", 400.0, 0.96, heldout_ratio=0.9)]
     assert decide(on(("a plane",)), null_model, found, 1.0, Thresholds(), start=1.1).kind == "explained"
 
 
 @pytest.mark.parametrize("best, other, told", [(0.8, 0.61, 2), (0.8, 0.59, 1), (0.97, 0.965, 1), (0.8, 0.85, 2)])
-def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, told):
+def test_effect_that_leaves_less_than_twice_the_rest_of_the_best_is_not_told_apart(still, best, other, told):
     problem, null_model = still
     found = [
         fitted(null_model, name, score, share)
@@ -167,7 +167,7 @@ def test_what_leaves_as_much_as_the_best_is_not_told_apart(still, best, other, t
 
 
 @pytest.mark.parametrize("slope, ranked", [(0.6, ["soft_side", "modulus"]), (0.1, ["modulus"])])
-def test_the_believed_modulus_may_be_that_of_the_stiff_side(still, slope, ranked):
+def test_soft_side_is_ranked_where_the_stated_modulus_is_that_of_its_stiff_side(still, slope, ranked):
     problem, null_model = still
     unconstrained = dataclasses.replace(
         null_model, effects=(effect("modulus"),), values=(np.array([-0.25]),), chi2=6600.0
@@ -182,7 +182,7 @@ def test_the_believed_modulus_may_be_that_of_the_stiff_side(still, slope, ranked
     assert [c.fit.name for c in found] == ranked
 
 
-def test_of_those_that_lean_on_what_is_not_believed_the_least_is_kept(still):
+def test_effect_that_needs_an_incredible_modulus_yields_to_the_modulus_by_itself(still):
     """Less density is more modulus and more pressure: neither of these does without the other."""
     problem, null_model = still
     without = dataclasses.replace(null_model, chi2=8000.0, ln_factors=np.zeros(2), point=np.zeros(2))

@@ -1,4 +1,4 @@
-"""The twin's own error: what other cells change in what would be recorded."""
+"""The twin's own error, by comparison with a finer twin."""
 
 from __future__ import annotations
 
@@ -18,16 +18,17 @@ from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
-SURE = 1.5  # times the differences that were seen
-GAP = 2e-5  # m
+SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
+GAP = 2e-5  # distance by which planes are moved to see how much the moment of contact matters [m]
+# Of recordings without measurement errors.
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
-OWN = 1 / 3  # of what a simulation of one's own does otherwise, that may be different with an effect
-FLOOR = 0.003  # of the motion, below which no twin is trusted
+OWN = 1 / 3  # share of the difference to a supplied simulation that may change with an effect
+FLOOR = 0.003  # least error of a twin over the size of the motion
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DiscretizationError:
-    """How far the twin is off by itself.
+    """Error of the twin by its discretization.
 
     Attributes:
         deviation: For each trial [M, A] m, once it is corrected, and modulus, pressure and measurement errors fitted.
@@ -51,10 +52,10 @@ def measure(
     *,
     report: Callable[[str], None] = lambda line: None,
 ) -> DiscretizationError:
-    """Simulate what is believed with a finer twin, and see what measurement errors and beliefs cannot take up.
+    """Compare twin and finer twin at the setup as stated, with measurement errors, modulus and pressure fitted.
 
-    A trial that comes with a simulation of one's own has that in place of the finer twin's: asked is then what that
-    simulation left out.
+    A trial that comes with a simulation of its own has that in place of the finer twin's; what is then explained is the
+    difference to that simulation.
 
     Args:
         experiment: What is to be explained, with trials that are only predicted.
@@ -69,13 +70,13 @@ def measure(
     there = FitProblem(experiment, fine.twin, trials=everything, ensemble=fine, **common)
     other = [_as_simulated(motion, t) for motion, t in zip(_believed(there), everything, strict=True)]
     here = FitProblem(experiment, twin, trials=trials, ensemble=ensemble, priors=EXACT, **common)
-    fit = here.only(_told(here, other)).fit([((), None)], rounds=4)[0]
+    fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = np.zeros(len(here.common)) if fit is None else fit.ln_factors
     own = _believed(FitProblem(experiment, twin, trials=everything, ensemble=ensemble, shift=tuple(shift), **common))
     correction = added(everything, own, other)
     here = FitProblem(experiment, twin, trials=trials, ensemble=ensemble, **common)
-    # Of the difference to cells that are so much larger, the finer twin's own error, which falls with their square;
-    # blows do not.
+    # The error falls with the square of the cell size, which gives that of the finer twin from the difference of the
+    # two; impacts on planes do not converge at that order, so that there the whole difference counts.
     ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
     smooth = 1 / (ratio**2 - 1)
     shares = [OWN if t.simulated else 1.0 if s.grounds else smooth for t, s in zip(trials, here.scenarios, strict=True)]
@@ -83,9 +84,9 @@ def measure(
     deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
     found = []
     for i, motion in enumerate(own[: len(trials)]):
-        left = SURE * np.sqrt(sum(d[i] ** 2 for d in deviations))
+        left = SAFETY * np.sqrt(sum(d[i] ** 2 for d in deviations))
         seen = here.observation.observe(motion, i, np.zeros(len(here.observation.deviations)))
-        # Error is shared: no marker is far better than the others.
+        # No marker is taken to be far better than the others.
         shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
         found.append(np.maximum(left, max(shared / 2, FLOOR * moved)))
@@ -100,7 +101,7 @@ def measure(
 
 
 def _touching(here: FitProblem) -> list[list[MarkerMotion]]:
-    """Motions with planes that are a little nearer or farther: where a body touches is not known better."""
+    """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
     if not any(s.grounds for s in here.scenarios):
         return []
     moved = [
@@ -139,30 +140,30 @@ def _apart(here: FitProblem, other: Sequence[MarkerMotion], shares: Sequence[flo
     Returns:
         For each trial [M, A] m.
     """
-    told = _told(here, other)
-    fit = here.only(told).fit([((), None)], rounds=2)[0]
+    recorded = _recordings_of(here, other)
+    fit = here.only(recorded).fit([((), None)], rounds=2)[0]
     if fit is None:
         return [np.zeros(n.shape) for n in here.discretization]
     return [
         share * np.sqrt(((t.recording.place - seen) ** 2).mean(0))
-        for t, seen, share in zip(told, fit.seen, shares, strict=True)
+        for t, seen, share in zip(recorded, fit.seen, shares, strict=True)
         if t.recording is not None
     ]
 
 
-def _told(here: FitProblem, motions: Sequence[MarkerMotion]) -> list[Trial]:
-    """Trials that recorded just these motions."""
-    told = []
+def _recordings_of(here: FitProblem, motions: Sequence[MarkerMotion]) -> list[Trial]:
+    """The trials with recordings of just these motions, free of errors."""
+    recorded = []
     for i, (trial, motion) in enumerate(zip(here.trials, motions, strict=False)):
         assert trial.recording is not None
         place = here.observation.observe(motion.alone(), i, np.zeros(len(here.observation.deviations)))
         recording = dataclasses.replace(trial.recording, place=place)
-        told.append(dataclasses.replace(trial, recording=recording))
-    return told
+        recorded.append(dataclasses.replace(trial, recording=recording))
+    return recorded
 
 
 def _believed(problem: FitProblem) -> list[MarkerMotion]:
-    """What is believed, for each trial.
+    """Motion of the setup as stated, for each trial.
 
     Raises:
         ValueError: if it breaks down.

@@ -1,4 +1,4 @@
-"""Recordings, a twin and its error: simulating with effects, and how far that is from what was recorded."""
+"""The likelihood: simulations with effects, and their whitened residuals against recordings."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 
-EDGE = 0.15  # of a belief's tolerance, over which it ends
-FEWEST = 8  # samples of a trial's beginning
-WITHIN = 0.3  # weight of a belief within its tolerance, in which one value is nearly as good as another
+EDGE = 0.15  # width of the edge of a prior, over its tolerance
+FEWEST = 8  # samples of the first part of a trial, below which it is not used
+WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
-BREAKS = "setup: its simulation breaks down, wanted a body that bears what acts on it"
+BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
 
 Effects = tuple[Hypothesis, ...]
 Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
@@ -34,7 +34,7 @@ Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at 
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerances:
-    """What a setup's numbers are good for: tolerances of ln of the modulus and of the pressure."""
+    """Tolerances of ln of the stated modulus and of the stated pressure."""
 
     modulus: float = 0.1
     pressure: float = 0.05
@@ -42,23 +42,23 @@ class Tolerances:
 
 @dataclass
 class Tally:
-    """What was spent on simulating."""
+    """Number of simulations."""
 
     simulations: int = 0
 
 
 class Likelihood:
-    """Recordings, a twin and its error: what a motion is worth.
+    """Recordings, a twin and its error, and chi-squared of motions.
 
     Args:
         experiment: What to explain.
         twin: Its body.
         trials: To fit, with a recording each; those of the experiment if None.
-        numerics: The twin's own error for each trial [M, A] m; none if None.
+        discretization: Standard deviation of the twin's own error for each trial [M, A] m; none if None.
         shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
         correction: By trial, what a finer twin then adds to motions [S, M, ...].
         own: By effects, the same with them, where it is known.
-        beliefs: See there.
+        tolerances: Of modulus and pressure.
         priors: Of measurement errors.
         noise: [m]; that of the setup, or estimated, if None.
         lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
@@ -172,7 +172,7 @@ class Likelihood:
         return {t.name: self.correction[t.name] for t in trials if t.simulated and t.name in self.correction}
 
     def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
-        """Those of the effects for which there is something in a trial that they change."""
+        """Those of the effects that apply to a trial."""
         return [e for e in effects if any(e.applies(scenario, self.twin) for scenario in self.scenarios)]
 
     def early(self, share: float) -> Self | None:
@@ -267,7 +267,7 @@ class Likelihood:
     def measure(
         self, motions: Sequence[MarkerMotion], errors: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
-        """The best measurement errors for motions: misfit with their priors, errors, residual, slopes."""
+        """The best measurement errors for motions: chi-squared with their priors, errors, residual, slopes."""
         weight = 1 / self.observation.deviations
         best = (math.inf, errors, np.zeros(0), np.zeros((0, 0)))
         for _ in range(6):
@@ -286,9 +286,9 @@ class Likelihood:
         return best
 
     def prior_residual(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals of the beliefs at a point, and their slopes; none where ``held``.
+        """Residuals of modulus and pressure by their priors at a point, and their slopes; zero where ``held``.
 
-        Within its tolerance a number is nearly as good as another, beyond it is soon hard to believe.
+        The prior is nearly flat within the tolerance and falls steeply beyond.
         """
         n = len(self.common)
         out = np.maximum(np.abs(at[:n]) - 1, 0) / EDGE

@@ -1,4 +1,4 @@
-"""Effects that were fitted, best first: what each gains, in what units, and which lean on what is not believed."""
+"""Ranking of fitted effects by a penalised gain in log-likelihood."""
 
 from __future__ import annotations
 
@@ -13,12 +13,14 @@ from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
 from torchsoro.sim2real.inference.fit import Fit
 from torchsoro.sim2real.inference.likelihood import EDGE
 
-FORM = 0.001  # of what an effect takes away, that may be due to its form: nature's is never just the hypothesis'
-BELIEVED = 1 + 3 * EDGE  # of its tolerance, that a believed number may be off
-MISTRUST = 12.0  # of the score, that measurement errors beyond belief cost at most
-FAINT = 4.0  # of the score, below which nothing is worth a fit
-LEANS = 20.0  # of the score, that an effect must do better than a free modulus if it needs that too
-BENT = 3.0  # standard deviations of a measurement error, beyond which it tells against an effect
+# Share of the reduction of chi-squared that the form of the model may be wrong by: differences between effects below it
+# do not count.
+MODEL_FORM = 0.001
+BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
+MISTRUST = 12.0  # score that measurement errors beyond their priors cost at most
+FAINT = 4.0  # score below which an effect is not worth a fit
+LEANS = 20.0  # score by which an effect that needs a modulus beyond its tolerance must exceed the modulus by itself
+BENT = 3.0  # prior standard deviations of a measurement error, above which it costs score
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,13 +29,13 @@ class Candidate:
 
     Attributes:
         fit: The best of it.
-        score: What it gains in ln of the likelihood over nothing, less what its parameters are worth. Residuals of a
-            wrong model are neither white nor of the variance that was thought: the gain counts in units of what the
-            best effect leaves, neighbouring samples that are alike count once, no difference counts that the form of
-            an effect may make, and measurement errors far beyond belief tell against it.
-        gain: The same over nothing with any modulus and pressure, without allowance for its form.
-        explained: Share of the misfit beyond noise and numerics that it takes away.
-        heldout_ratio: Error on trials that were left out over that without an effect; not a number where none was.
+        score: Gain in log-likelihood over the null model with credible modulus and pressure, less a penalty for each
+            parameter. Residuals of a wrong model are neither white nor of the stated variance: the gain is divided by
+            the residual variance of the best effect and by the correlation length of its residuals, and by the model
+            form's share of the reduction; measurement errors far beyond their priors are subtracted.
+        gain: The same over the null model with any modulus and pressure, without the allowance for the model form.
+        explained: Share of chi-squared in excess of the number of samples that it removes.
+        heldout_ratio: Error on trials left out of the fit over that of the null model; not a number without any.
     """
 
     fit: Fit
@@ -44,25 +46,25 @@ class Candidate:
 
 
 def rank(fits: Sequence[Fit], null_model: Fit, believed: float, deviations: np.ndarray) -> list[Candidate]:
-    """Score fits that are better than nothing, best first.
+    """Score fits that are better than the null model, best first.
 
     Args:
         fits: Of effects.
         null_model: The fit without any.
-        believed: Its misfit within beliefs.
-        deviations: That measurement errors are believed to have.
+        believed: Its chi-squared with modulus and pressure within what is credible.
+        deviations: Prior standard deviations of the measurement errors.
     """
     fits = [fit for fit in fits if fit.chi2 < null_model.chi2]
     if not fits:
         return []
     best = min(fits, key=lambda fit: fit.chi2)
-    alike = correlation(best)
+    inflation = correlation(best)
     gained = believed - best.chi2
-    bare = 2 * max(1.0, best.chi2 / best.samples) * alike
-    unit = max(bare, 2 * FORM * gained)
-    worth = 0.5 * math.log(min(best.samples / alike, 1 / FORM))
+    bare = 2 * max(1.0, best.chi2 / best.samples) * inflation
+    unit = max(bare, 2 * MODEL_FORM * gained)
+    worth = 0.5 * math.log(min(best.samples / inflation, 1 / MODEL_FORM))
     unconstrained = [f for f in fits if f.effects and all(isinstance(e, Modulus | PressureGain) for e in f.effects)]
-    # Others lean on a modulus, or a pressure, that is not believed: they must do more than what sets it free.
+    # An effect that needs an incredible modulus or pressure must exceed a fit in which that number is unconstrained.
     fits = [
         f
         for f in fits
@@ -72,7 +74,7 @@ def rank(fits: Sequence[Fit], null_model: Fit, believed: float, deviations: np.n
         Candidate(
             fit=fit,
             score=(believed - fit.chi2) / unit - fit.unknowns * worth - _bent(fit, deviations),
-            # What sets a modulus free gains over one that is believed.
+            # An unconstrained modulus gains over a credible one.
             gain=((believed if fit in unconstrained else null_model.chi2) - fit.chi2) / bare - fit.unknowns * worth,
             explained=min((believed - fit.chi2) / max(believed - fit.samples, 1.0), 1.0),
         )
@@ -82,12 +84,12 @@ def rank(fits: Sequence[Fit], null_model: Fit, believed: float, deviations: np.n
 
 
 def varied(fit: Fit) -> float:
-    """By how much its effects make ln of the modulus higher on a stiff side than on average."""
+    """Excess of ln of the modulus on a stiff side over its mean, by all effects of a fit."""
     return sum(e.varies(v) for e, v in zip(fit.effects, fit.values, strict=True))
 
 
 def _strained(fit: Fit) -> float:
-    """How far beyond belief modulus or pressure are, in tolerances; the belief may be that of a body's stiff side."""
+    """How far modulus or pressure are off, in tolerances; the stated modulus may be that of the body's stiff side."""
     off = np.abs(fit.point[: len(fit.ln_factors)])
     stiffer = varied(fit)
     if fit.ln_factors[0] < 0:
@@ -96,12 +98,12 @@ def _strained(fit: Fit) -> float:
 
 
 def _bent(fit: Fit, deviations: np.ndarray) -> float:
-    """What it costs that measurement errors are far beyond belief: something, as beliefs may be wrong."""
+    """Score that measurement errors beyond their priors cost: bounded, as the priors may be wrong."""
     return min(0.5 * float((np.maximum(np.abs(fit.errors / deviations) - BENT, 0.0) ** 2).sum()), MISTRUST)
 
 
 def correlation(fit: Fit) -> float:
-    """How many neighbouring samples of the whitened residual say the same."""
+    """Correlation length of the whitened residual, in samples, from its lag-one autocorrelation."""
     above = below = 0.0
     for r in fit.whitened:
         above += float(r[1:] @ r[:-1])

@@ -1,4 +1,4 @@
-"""From recordings to fits: look at all effects, begin searches where much is promised, lead the best to their end."""
+"""From recordings to fits: probe all effects, begin searches where much is promised, and complete the best."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torchsoro.sim2real.inference.ranking import BELIEVED, FAINT, correlation, v
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
 
-KEPT = 6  # searches that are led to their end, of those that do best at first
-STARTS = 3  # of each effect, from looks that differ
-FAR = 3.0  # times what noise and numerics explain, above which searches begin with the beginning
-EARLY = (0.12, 0.35)  # of the trials
-PRICED = 1.5  # times what noise and numerics explain, above which what the best effect leaves counts as one of them
-PAIRS = 0.002  # of the budget, that the simulation of all trials may take for pairs of effects to be tried
-CLEAR = 1.5  # times what noise and numerics explain, above which what a finer twin adds depends on the effect
-REFINED = 2  # times that the best are corrected by the finer twin
-PARTLY = 4.0  # times as long as with all lanes filled a simulation takes in a search, that fills some
-MOST = 10  # effects for which searches are begun
-BEHIND = 0.1  # of what the best search has gained, by which others may be behind to be led on
-TWICE = 0.25  # of what the best effect leaves, below which two must leave it to be believed
-TRIED = 4  # rounds of searches before the best are chosen
-ROUNDS = 12  # of a search
+COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
+STARTS = 3  # searches of each effect, from probe points that differ
+FAR = 3.0  # chi-squared per sample of the null model, above which searches begin with the first part of the trials
+EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
+INFLATED = 1.5  # chi-squared per sample of the best effect, above which its residual is added to the discrepancy
+PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
+CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
+REFINED = 2  # rounds in which the best are corrected by the finer twin
+PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
+MOST = 10  # searches that are begun, at most
+BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
+TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
+TRIED = 4  # rounds of a search before the best are chosen
+ROUNDS = 12  # of a search that is completed
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
 
@@ -49,11 +49,11 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    most = int(np.clip(0.3 * budget / (10 * each), KEPT, MOST))
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST))
     carried: list[Task] = []
     if null_model.chi2 > FAR * null_model.samples:
-        # Nothing is linear here, but less is wrong at first, where a wrong frequency is not yet a wrong phase. What a
-        # finer twin adds to the motion that is believed says little about one that is so different.
+        # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
+        # by the finer twin at the setup as stated does not hold for a motion that is so different.
         problem = problem.only(problem.trials, correction=problem.stated)
         carried = _from_the_beginning(problem, effects, most)
         problem, null_model = _fit_null_model(problem, [t for t in carried if not t[0]], report)
@@ -65,21 +65,25 @@ def search(
         probe_points = _probe_points(problem, null_model, effects)
         for effect in effects:
             mine = [chi2 for chi2, e, _ in probe_points if e is effect]
-            report(f"{effect.name}: would leave {min(mine):.0f}" if mine else f"{effect.name}: breaks down")
+            report(
+                f"{effect.name}: chi-squared {min(mine):.0f} by its linear response"
+                if mine
+                else f"{effect.name}: breaks down"
+            )
         tasks = _likely(probe_points, null_model, most)
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
-    if len(tasks) > KEPT:
+    if len(tasks) > COMPLETED:
         tried = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=TRIED, settle=False) if f is not None]
         tried.sort(key=lambda fit: fit.chi2)
         behind = tried[0].chi2 + BEHIND * max(null_model.chi2 - tried[0].chi2, 0.0)
-        led = [f for i, f in enumerate(tried[:KEPT]) if i < 3 or f.chi2 < behind]
-        # A modulus that is not believed may be that of a stiff side.
+        led = [f for i, f in enumerate(tried[:COMPLETED]) if i < 3 or f.chi2 < behind]
+        # A modulus beyond its tolerance may be that of a stiff side.
         led += [f for f in tried if unconstrained and varied(f) > 0 and f not in led]
         tasks = [(f.effects, f.point) for f in led]
     tasks += unconstrained
     best = _best([*problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS), *tried])
-    if best and null_model.chi2 > CLEAR * null_model.samples:
+    if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
     if best and best[0].chi2 > FAR * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
@@ -92,7 +96,7 @@ def _refined(
     problem: FitProblem, null_model: Fit, best: list[Fit], report: Callable[[str], None]
 ) -> tuple[FitProblem, Fit, list[Fit]]:
     """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin."""
-    leading = [null_model, *best[:KEPT]]
+    leading = [null_model, *best[:COMPLETED]]
     for _ in range(REFINED):
         problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
@@ -119,7 +123,7 @@ def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]
 
 
 def _unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit) -> list[Task]:
-    """Where a belief is strained: what sets it free, which every other effect must do better than."""
+    """Starts for an unconstrained modulus or pressure, where the null model needs one beyond its tolerance."""
     found: list[Task] = []
     for i, (common, tolerance) in enumerate(problem.common):
         for effect in effects:
@@ -147,21 +151,22 @@ def _probe_points(
 def inflate_discrepancy(
     problem: FitProblem, null_model: Fit, fits: list[Fit], report: Callable[[str], None]
 ) -> tuple[FitProblem, Fit, list[Fit]]:
-    """Where even the best effect leaves much, that is a part of what may be off, and all is fitted again.
+    """Inflate the discrepancy by the residual of the best effect where that is large, and fit all again.
 
-    Otherwise a clock or a scale would be bent, far beyond belief, to take up what the model lacks.
+    Otherwise measurement errors would be fitted far beyond their priors to take up what the model lacks.
     """
-    fits = fits[:KEPT]
+    fits = fits[:COMPLETED]
     own = problem.discretization
     for _ in range(4):
-        if not fits or fits[0].chi2 < PRICED * fits[0].samples:
+        if not fits or fits[0].chi2 < INFLATED * fits[0].samples:
             break
         left = []
         for trial, seen, discretization in zip(problem.trials, fits[0].seen, own, strict=True):
             assert trial.recording is not None
             off = np.sqrt(np.nanmean((trial.recording.place - seen) ** 2))
             left.append(np.sqrt(discretization**2 + (1.2 * off) ** 2))
-        report(f"what the best leaves is priced: {', '.join(f'{1e3 * float(n.mean()):.2f} mm' for n in left)}")
+        sizes = ", ".join(f"{1e3 * float(n.mean()):.2f} mm" for n in left)
+        report(f"discrepancy inflated by the residual of the best: {sizes}")
         problem = problem.only(problem.trials, discretization=left)
         tasks: list[Task] = [((), null_model.point), *((f.effects, f.point) for f in fits)]
         again, *rest = problem.fit(tasks, rounds=ROUNDS)
@@ -231,7 +236,7 @@ def _fit_null_model(
         if not ends:
             raise ValueError(BREAKS)
         null_model = min(ends, key=lambda fit: fit.chi2)
-        report(f"nothing: misfit {null_model.chi2:.0f} of {null_model.samples} samples")
+        report(f"without an effect: chi-squared {null_model.chi2:.0f} of {null_model.samples} samples")
         left = [
             t.recording.place - seen for t, seen in zip(problem.trials, null_model.seen, strict=True) if t.recording
         ]
@@ -269,7 +274,7 @@ def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_m
 
 
 def within(problem: FitProblem, null_model: Fit) -> float:
-    """The misfit without an effect, with modulus and pressure no further off than one believes."""
+    """Chi-squared without an effect, with modulus and pressure within what is credible."""
     point = np.clip(null_model.point, -BELIEVED, BELIEVED)
     if (point == null_model.point).all():
         return null_model.chi2

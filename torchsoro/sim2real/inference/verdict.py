@@ -1,4 +1,4 @@
-"""From recordings to a verdict: what fits best, whether it predicts trials that were left out, what can be said."""
+"""From recordings to a verdict: which effect fits best, and whether it predicts trials that were left out."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class Thresholds:
     Attributes:
         alarm: Score and gain below which nothing is missing.
         margin: Of the score, within which two effects are not told apart: odds of twenty to one.
-        rough: The same as a share of the score where bodies slide and bounce: there the misfit has many dents, and in
-            which of them a search ends is chance.
-        halves: The same between a modulus and a soft side, which differ in what a whole and a half do otherwise.
+        rough: The same as a share of the score where bodies meet planes: there chi-squared has many local minima, and
+            in which of them a search ends is chance.
+        soft_side_margin: The same between a modulus and a soft side, whose motions differ little.
         covered: Times what noise and numerics explain, as believed, below which nothing is missing: all is within them.
         quiet: The same, without an effect, below which nothing is missing if none is believed.
         some: The same, above which an effect must take away ``part`` of it.
@@ -45,14 +45,14 @@ class Thresholds:
         sure: Such a gain; without anything missing it has never been found.
         worse: Times the error on trials left out of the effect that predicts them best, at which another is.
         near: By how much it may be larger in any case, even than ``lost``, over the error without an effect.
-        left: Of the misfit, above which what the best effect leaves is due to its form, which is never just nature's.
-        equal: Times what the best then leaves, up to which another is not told apart from it.
+        left: Share of chi-squared that the best effect leaves, above which the form of the model explains the rest.
+        equal: Rest that another effect leaves over that of the best, up to which they are then not told apart.
     """
 
     alarm: float = 40.0
     margin: float = 3.0
     rough: float = 0.45
-    halves: float = 10.0
+    soft_side_margin: float = 10.0
     covered: float = 0.8
     quiet: float = 1.7
     some: float = 1.3
@@ -128,7 +128,7 @@ def judge(
     ]
     found, errors, faint = _predicted(problem, null_model, found, heldout)
     for c in found:
-        report(f"{c.fit.name}: misfit {c.fit.chi2:.0f}, score {c.score:.1f}, kept {c.heldout_ratio:.2f}, {tell(c.fit)}")
+        report(f"{c.fit.name}: {_line(c)}")
     t = thresholds or Thresholds()
     verdict = decide(problem, null_model, found, excess, t, start=start, plainly=plainly, faint=faint)
     shown = verdict.chosen[0].fit.name if verdict.chosen else "nothing"
@@ -171,7 +171,7 @@ def _predicted(
     squares = np.zeros(len(fits))
     heldout: dict[str, dict[str, tuple[float, float]]] = {fit.name: {} for fit in fits}
     for where, (still, *others), trials in folds:
-        # Nothing is what is within beliefs.
+        # The null model is the setup with modulus and pressure within what is credible.
         mine = [dataclasses.replace(still, point=np.clip(still.point, -BELIEVED, BELIEVED)), *others]
         told = predict_all(where, mine, trials)
         believed = predict_all(where, mine[:1], trials, believed=True)[0]
@@ -187,11 +187,17 @@ def _predicted(
     return found, heldout, float(squares[0]) / noise
 
 
-def _halves(one: Fit, other: Fit) -> bool:
+def _modulus_and_soft_side(one: Fit, other: Fit) -> bool:
     """Whether one is the modulus, and the other how that varies over the body."""
     plain = [any(isinstance(e, Modulus) for e in f.effects) for f in (one, other)]
     uneven = [varied(f) > 0 for f in (one, other)]
     return (plain[0] and uneven[1]) or (plain[1] and uneven[0])
+
+
+def _line(c: Candidate) -> str:
+    """A candidate for the terminal."""
+    heldout = "" if math.isnan(c.heldout_ratio) else f"held-out error ratio {c.heldout_ratio:.2f}, "
+    return f"chi-squared {c.fit.chi2:.0f}, score {c.score:.1f}, {heldout}{tell(c.fit)}"
 
 
 def decide(
@@ -242,12 +248,12 @@ def decide(
         margin = max(margin, t.rough * best.score)
         # A fit without a trial may end in another dent: that it predicts hardly better than nothing tells little.
         others += [c for c in found if c not in believed and c.gain > t.alarm and c.heldout_ratio > t.lost]
-    formed = t.equal * (1 - best.explained) if 1 - best.explained > t.left else 0.0
+    unexplained = t.equal * (1 - best.explained) if 1 - best.explained > t.left else 0.0
 
-    def alike(c: Candidate) -> bool:
-        less = max(margin, t.halves) if _halves(best.fit, c.fit) else margin
-        return c.score > best.score - less or 1 - c.explained < formed
+    def indistinct(c: Candidate) -> bool:
+        less = max(margin, t.soft_side_margin) if _modulus_and_soft_side(best.fit, c.fit) else margin
+        return c.score > best.score - less or 1 - c.explained < unexplained
 
-    close = (best, *filter(alike, others))
+    close = (best, *filter(indistinct, others))
     kind = "explained" if len(close) == 1 else "cannot_distinguish"
     return Verdict(kind=kind, chosen=close, **common)

@@ -74,7 +74,7 @@ def _effects(page: Document, e: Explanation) -> None:
         for name, p in row["parameters"].items()
     ]
     if rows:
-        page.section("What is missing")
+        page.section("What explains the difference")
         page.table(rows)
 
 

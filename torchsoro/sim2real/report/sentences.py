@@ -33,8 +33,8 @@ def verdict_sentence(e: Explanation) -> str:
         return "Something is missing from the setup that is none of the known effects."
     parts = "; ".join(candidate_words(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
-        return f"One of these is missing from the setup, and the recordings cannot tell which: {parts}."
-    return f"Missing from the setup is {parts}."
+        return f"The difference is explained by one of these, and the recordings cannot tell by which: {parts}."
+    return f"The difference is explained by {parts}."
 
 
 def evidence(e: Explanation) -> list[str]:
