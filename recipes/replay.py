@@ -16,16 +16,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import torch
 import tyro
 from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, options, run
-from torchsoro.design.reading import read_settings
-from torchsoro.design.robot import build
-from torchsoro.output import archive
-from torchsoro.output.delivery import numbers, show
-from torchsoro.storage import check_folder
 
 KEPT = (0, 5, 10, 20, 50, 100, 150, 200, 250, 300)  # iterations whose designs are archived
 
@@ -69,6 +63,15 @@ def main(chosen: Options) -> dict[str, float]:
     Raises:
         ValueError: for a robot that does not exist, or a folder that cannot be written.
     """
+    # Imported when it runs, so that --help is there at once.
+    import torch
+
+    from torchsoro.design.reading import read_settings
+    from torchsoro.design.robot import build
+    from torchsoro.output import archive
+    from torchsoro.output.delivery import numbers, show
+    from torchsoro.storage import check_folder
+
     if chosen.archive is not None:
         if chosen.name in ("", "..") or Path(chosen.name).name != chosen.name:
             raise ValueError(f"name = {chosen.name!r}: wanted a plain name to keep {chosen.archive} under")

@@ -73,7 +73,7 @@ def test_a_kept_run_is_found_by_its_name_and_walks_as_long_as_is_wanted(
         shown.append((robot, gamma, options))
         return result, SimpleNamespace(report="")
 
-    monkeypatch.setattr(replay, "show", show)
+    monkeypatch.setattr("torchsoro.output.delivery.show", show)
     assert play(replay, "mine", tmp_path / "out", cycles=2.5, settle=0.002) == result
     robot, gamma, options = shown[0]
     assert options == {"name": "mine", "void": False}
