@@ -8,8 +8,7 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-# Of the time that an explanation takes, by stage, and batches of simulations in it: medians over sealed cases with one
-# and two trials. Only what is shown depends on them.
+# Guesses of what each stage takes: its share of the time, and batches of simulations in it. Only the bar depends on them.
 STAGES = {
     "comparing cell sizes": (0.10, 12),
     "simulating what each effect would change": (0.10, 2),
