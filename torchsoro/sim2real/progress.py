@@ -8,7 +8,7 @@ from typing import TextIO
 
 from tqdm import tqdm
 
-# Guesses of what each stage takes: its share of the time, and batches of simulations in it. Only the bar depends on them.
+# Guesses of each stage: its share of the time, and batches of simulations in it. Only the bar depends on them.
 STAGES = {
     "comparing cell sizes": (0.10, 12),
     "simulating what each effect would change": (0.10, 2),
