@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import torch
+
+# torch is imported where it is used: tables are read and written without it.
 
 
 @contextlib.contextmanager
@@ -214,6 +215,8 @@ def read_checkpoint(path: Path, parts: Mapping[str, type]) -> dict[str, Any]:
     if broken is not None:
         raise ValueError(f"path: {path} is damaged (checksum of {broken}); choose another folder")
     foreign = f"path: {path} is not a checkpoint of a run"
+    import torch
+
     try:
         payload = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # not quoted: torch advises to read what is not safe to read
@@ -244,6 +247,8 @@ def plain_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any, name: str) -> Any:
+    import torch
+
     if isinstance(value, enum.Enum):
         return _plain(value.value, name)
     if isinstance(value, np.ndarray | np.generic | torch.Tensor):
@@ -275,6 +280,8 @@ def check_storable(value: Any, name: str) -> None:
     Raises:
         ValueError: If something else is among it.
     """
+    import torch
+
     if isinstance(value, Mapping):
         for key, item in value.items():
             check_storable(key, f"a key of {name}")
