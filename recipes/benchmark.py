@@ -24,7 +24,6 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -47,7 +46,7 @@ from torchsoro.benchmark.timing import (
     skipping,
     table,
 )
-from torchsoro.command_line import run
+from torchsoro.command_line import program
 
 PAPER_STEPS = 75_000
 SIZES = {"cpu": (2000, 4096, 8000, 16_384), "cuda": (16_384, 64_000, 216_000, 512_000, 2_000_376)}
@@ -387,10 +386,7 @@ def main(options: Options) -> dict[str, Any]:
     return results
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Measure what the command line asks for."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

@@ -11,11 +11,8 @@ Every number of the settings can be overridden: --help lists them. The loop is `
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from torchsoro.command_line import plain_errors
 from torchsoro.design.presets import CLIMBER
-from torchsoro.design.reading import from_command_line
+from torchsoro.design.reading import design_program
 from torchsoro.design.settings import Settings
 
 # What designs is imported when it is needed: --help and a wrong option answer at once.
@@ -41,19 +38,7 @@ def main(settings: Settings) -> dict[str, float]:
     return design(climber(settings), "climber")
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Design a climber as the command line says, and print what came out of it.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        settings = from_command_line(CLIMBER, description=__doc__, arguments=arguments)
-        result = main(settings)
-        from torchsoro.output.delivery import report
-
-        print(report(result, settings))
-
+cli = design_program(main, CLIMBER, __doc__)
 
 if __name__ == "__main__":
     cli()

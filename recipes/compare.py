@@ -23,7 +23,7 @@ import numpy as np
 import torch
 import tyro
 
-from torchsoro.command_line import CountOrZero, options, progress_bar, run
+from torchsoro.command_line import CountOrZero, options, program, progress_bar
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Outcome, Robot, build
@@ -266,10 +266,7 @@ def line(name: str, found: Mapping[str, Any]) -> str:
     return f"{name:28s} L = {1e3 * found['L']:6.2f} mm, {stride}, fall {1e3 * found['fall']:.2f} mm, {seconds:.1f} s"
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Perform the checks of a robot as the command line says."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

@@ -11,12 +11,11 @@ line. Nothing is resampled, smoothed or filled. Markers of setup.toml must have 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 
 import tyro
 
-from torchsoro.command_line import run
+from torchsoro.command_line import program
 from torchsoro.sim2real.data.recording import AXES, write_table
 from torchsoro.sim2real.data.tracking import LIKELIHOOD, Frame, Tracked, read
 from torchsoro.storage import check_folder
@@ -95,10 +94,7 @@ def main(options: Options) -> None:
     print(f"{options.out}: {recording.time[-1]:g} s")
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Convert what the command line names."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

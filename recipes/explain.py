@@ -11,9 +11,7 @@ explanation.json and model.toml, the setup with what was missing, which predicts
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from torchsoro.command_line import run
+from torchsoro.command_line import program
 from torchsoro.sim2real.options import Options
 
 
@@ -24,10 +22,7 @@ def main(options: Options) -> None:
     run(options)
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Explain an experiment, or predict a trial, as the command line says."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

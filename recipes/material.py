@@ -17,14 +17,13 @@ import csv
 import dataclasses
 import io
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import tyro
 from tqdm import tqdm
 
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import program
 from torchsoro.output.document import Document
 from torchsoro.rheology.budget import Budget, budget, choose, substitutes
 from torchsoro.rheology.horizon import Solidified, solidified
@@ -116,7 +115,7 @@ class Found:
 
 
 def main(options: Options) -> Found:
-    """Make the material and write it with its report.
+    """Make the material, write it with its report, and print what was left out.
 
     Raises:
         ValueError: for a file or an option that will not do; names it.
@@ -175,6 +174,7 @@ def main(options: Options) -> Found:
     write_curve(options.out / "master.csv", curve)
     page.save(options.out / "report.html")
     write_material(options.out / "material.toml", material)
+    print(f"{material.left_out}\nwritten to {options.out}: {', '.join(RESULTS)}")
     return found
 
 
@@ -327,17 +327,7 @@ def write_curve(path: Path, curve: Curve) -> None:
         file.write(text.getvalue().encode())
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Make a material as the command line says, and print what was left out.
-
-    Args:
-        arguments: Instead of the process's own.
-    """
-    with plain_errors():
-        chosen = tyro.cli(Options, description=__doc__, args=arguments)
-        result = main(chosen)
-        print(f"{result.material.left_out}\nwritten to {chosen.out}: {', '.join(RESULTS)}")
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

@@ -12,14 +12,13 @@ Void is left out, which halves the time (``--void`` keeps it). The archived robo
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from pydantic import Field
 
-from torchsoro.command_line import AtLeastZero, Count, options, run
+from torchsoro.command_line import AtLeastZero, Count, options, program
 
 KEPT = (0, 5, 10, 20, 50, 100, 150, 200, 250, 300)  # iterations whose designs are archived
 
@@ -104,10 +103,7 @@ def main(chosen: Options) -> dict[str, float]:
     return found
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """Show or keep a robot as the command line says."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

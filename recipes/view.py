@@ -13,13 +13,12 @@ The motion is that of ``motion.npz`` in the robot's folder, which a finished run
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import tyro
 
-from torchsoro.command_line import parse_resolution, run
+from torchsoro.command_line import parse_resolution, program
 
 if TYPE_CHECKING:
     from torchsoro.output.motion import Motion
@@ -147,10 +146,7 @@ def _told(path: Path) -> Path:
     return path
 
 
-def cli(arguments: Sequence[str] | None = None) -> None:
-    """View or write a motion as the command line says."""
-    run(main, Options, description=__doc__, arguments=arguments)
-
+cli = program(main, Options, __doc__)
 
 if __name__ == "__main__":
     cli()

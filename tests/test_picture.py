@@ -10,29 +10,16 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.figure import Figure
+from moving import DOMAIN, table
 from PIL import Image
 
-from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.domain import Domain
 from torchsoro.output.fabricate import surface
 from torchsoro.output.page import history_panel, last_cycle, motion_of
 from torchsoro.output.picture import deform, movie, shape_image, summary
 from torchsoro.output.scene import Camera
 
-CHAMBER = Chamber(name="air", center=(0.118, 0.068, 0.018), size=(0.018, 0.018, 0.018), wall=0.003)
-DOMAIN = Domain(size=(0.036,) * 3, particles=(12,) * 3, origin=(0.1, 0.05, 0.0), chambers=(CHAMBER,))
 WALLS = ((0, 0.1, 1), (0, 0.136, -1))
-
-
-def table() -> torch.Tensor:
-    """A body on four legs."""
-    gamma = torch.zeros(12, 12, 12)
-    gamma[:, :, 4:] = 1.0
-    for i in (slice(0, 3), slice(9, 12)):
-        for j in (slice(0, 3), slice(9, 12)):
-            gamma[i, j] = 1.0
-    gamma = gamma.flatten()
-    gamma[DOMAIN.gas] = 0.0
-    return gamma
 
 
 def walk(count: int = 5, travel: float = 0.01, axis: int = 0) -> torch.Tensor:

@@ -310,6 +310,7 @@ def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, 
     recipe = recipes["walker"]
     monkeypatch.setattr(loop, "fell", lambda robot, outcome: True)
     monkeypatch.setattr(loop, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field())))
+    monkeypatch.setattr(delivery, "report", lambda result, settings: "")
     monkeypatch.setattr(delivery, "deliver", lambda *_, **__: {})
     recipe.main(tiny(tmp_path / "run", iterations=2))
     start = walker(TINY).field.phi
@@ -320,6 +321,7 @@ def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, 
 def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path, monkeypatch):
     recipe = recipes["walker"]
     delivered = []
+    monkeypatch.setattr(delivery, "report", lambda result, settings: "")
     monkeypatch.setattr(delivery, "deliver", lambda path, robot, gamma, *_, **__: delivered.append(gamma) or {})
     # Every design but the first is within the limit on C.
     settings = tiny(tmp_path / "run", c_max=0.249, gravity_steps=1, gravity_every=2, iterations=2)

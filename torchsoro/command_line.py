@@ -114,24 +114,28 @@ def progress_bar(stage: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
-def run(
-    main: Callable[[Any], object], options: type, *, description: str | None, arguments: Sequence[str] | None = None
-) -> None:
-    """Read options from the command line and run a program with them; errors are told in a line.
+def program(
+    main: Callable[[Any], object], options: type, description: str | None
+) -> Callable[[Sequence[str] | None], None]:
+    """The command line of a recipe: options are read and checked, and errors are told in a line.
 
     Args:
-        main: The program.
-        options: Class of its options.
+        main: What the recipe does with its options.
+        options: Class of the options.
         description: Text on top of ``--help``.
-        arguments: Instead of the process's own.
 
-    Raises:
-        SystemExit: see :func:`plain_errors`; also after ``--help`` and for an unknown flag.
+    Returns:
+        A function of the arguments, which are the process's own if None. It raises ``SystemExit`` as
+        :func:`plain_errors` does, after ``--help``, and for an unknown flag.
     """
-    import tyro  # takes a while to import
 
-    with plain_errors():
-        main(tyro.cli(options, description=description, args=arguments))
+    def cli(arguments: Sequence[str] | None = None) -> None:
+        import tyro  # takes a while to import
+
+        with plain_errors():
+            main(tyro.cli(options, description=description, args=arguments))
+
+    return cli
 
 
 @contextlib.contextmanager

@@ -6,12 +6,13 @@ import argparse
 import dataclasses
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from torchsoro.command_line import plain_errors
 from torchsoro.design.settings import Settings, cuda_available
 
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
@@ -25,6 +26,24 @@ GROUPS = {
     "filter_radius": "optimization",
     "picture_every": "output",
 }
+
+
+def design_program(
+    main: Callable[[Settings], object], presets: Mapping[str, Settings], description: str | None
+) -> Callable[[Sequence[str] | None], None]:
+    """The command line of a design recipe; see :func:`torchsoro.command_line.program`.
+
+    Args:
+        main: What the recipe does with its settings.
+        presets: See :func:`from_command_line`.
+        description: Text on top of ``--help``.
+    """
+
+    def cli(arguments: Sequence[str] | None = None) -> None:
+        with plain_errors():
+            main(from_command_line(presets, description=description, arguments=arguments))
+
+    return cli
 
 
 def from_command_line(

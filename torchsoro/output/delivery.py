@@ -30,7 +30,7 @@ from torchsoro.storage import atomic_write
 
 
 def design(robot: Robot, name: str) -> dict[str, float]:
-    """Run the design loop, with the shape in TensorBoard as it grows, and write what came out of it.
+    """Run the design loop, with the shape in TensorBoard as it grows, write what came out of it, and print the result.
 
     Args:
         robot: What to design; ``robot.settings.out`` is the folder.
@@ -57,6 +57,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
     with atomic_write(s.out / "result.json") as file:
         plain = {name: None if math.isnan(value) else value for name, value in found.items()}
         file.write((json.dumps(plain, indent=2) + "\n").encode())
+    print(report(found, s))
     return found
 
 
