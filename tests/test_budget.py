@@ -54,7 +54,7 @@ def errors(material, full, omega):
     ("elements", "stiffening", "instantaneous", "algorithmic"),
     [(0, 1.00, 0.170, 0.170), (3, 18.0, 0.371, 0.368), (4, 156, 1.01, 0.745), (5, 1104, 2.66, 0.807)],
 )
-def test_stiffness_of_table_s1_as_a_step_feels_it(elements, stiffening, instantaneous, algorithmic):
+def test_algorithmic_stiffness_of_table_s1_matches_design_values(elements, stiffening, instantaneous, algorithmic):
     """The Courant numbers of pressure waves, with g and with g b, of the design notes."""
     rows = paper().elements[: elements + 1]
     total = sum(e.modulus for e in rows)
@@ -69,7 +69,7 @@ def test_stiffness_of_table_s1_as_a_step_feels_it(elements, stiffening, instanta
 
 @pytest.mark.parametrize("formulation", ["updated", "total"])
 @pytest.mark.parametrize("dt", [1e-5, 2.5e-5])
-def test_the_rows_are_the_simulators_own_courant_numbers_and_steps(formulation, dt):
+def test_courant_numbers_and_largest_steps_equal_those_of_simulator(formulation, dt):
     for row in paper(dt, formulation=formulation).elements:
         series = Prony.paper(row.number)
         number = courant(particle(), series, dt=dt, cell=CELL, formulation=formulation).number
@@ -80,7 +80,7 @@ def test_the_rows_are_the_simulators_own_courant_numbers_and_steps(formulation, 
         assert row.cost == pytest.approx(dt / step, rel=3e-4)
 
 
-def test_what_is_lost_without_elements_4_and_5():
+def test_loss_modulus_lost_without_elements_4_and_5_matches_design_values():
     """4, 17 and 26 % of the loss modulus that is kept, at 5, 50 and 100 Hz: the design notes."""
     for hertz, share in ((5, 0.04), (50, 0.17), (100, 0.26)):
         omega = 2 * math.pi * hertz
@@ -88,7 +88,7 @@ def test_what_is_lost_without_elements_4_and_5():
         assert lost / (1 - lost) == pytest.approx(share, abs=0.006)
 
 
-def test_auto_takes_all_elements_and_coarser_cells_longer_steps():
+def test_automatic_step_is_stable_with_all_elements_and_grows_with_cell():
     fine, coarse = paper("auto"), paper("auto", cell=2 * CELL)
     assert fine.stable == coarse.stable == 5 and fine.dt == fine.elements[5].step
     assert 1e-5 < fine.dt < 1.2e-5 < coarse.dt  # the notes: stable at 10 us, not at 12 us
@@ -100,7 +100,7 @@ def test_auto_takes_all_elements_and_coarser_cells_longer_steps():
     moduli=st.lists(st.floats(0.01, 300.0), min_size=7, max_size=7),
     dt=st.floats(1e-6, 5e-5),
 )
-def test_faster_elements_only_make_it_stiffer(gaps, moduli, dt):
+def test_courant_number_grows_and_lost_loss_modulus_falls_with_each_faster_element(gaps, moduli, dt):
     times = 1e-7 * 10 ** np.cumsum(gaps)
     material = Spectrum(equilibrium=1.0, moduli=np.array(moduli[: len(gaps)]), times=times, deformation="shear")
     rows = budget(material, Solid(), cell=CELL, band=BAND, dt=dt).elements
@@ -114,7 +114,7 @@ def test_faster_elements_only_make_it_stiffer(gaps, moduli, dt):
 
 
 # --------------------------------------------------------------------------------------------------------- substitutes
-def test_each_substitute_tells_its_loss_and_its_step():
+def test_substitute_errors_and_stable_steps_match_direct_evaluation():
     found = {m.name: m for m in substitutes(paper(2e-5), match=BAND[1])}
     assert list(found) == ["all elements", "left out", "lumped into element 3", "viscosity", "refitted"]
     omega = torch.logspace(math.log10(BAND[0]), math.log10(BAND[1]), 500, dtype=torch.float64)
@@ -131,7 +131,7 @@ def test_each_substitute_tells_its_loss_and_its_step():
     assert found["left out"].loss_error == pytest.approx(0.207, abs=0.002)
 
 
-def test_lumped_and_viscous_substitutes_of_the_design_notes():
+def test_lumped_element_and_viscosity_match_loss_modulus_at_given_frequency():
     slow = {m.name: m for m in substitutes(paper(2e-5), match=1.0)}
     lumped, viscous = slow["lumped into element 3"], slow["viscosity"]
     assert lumped.moduli[2] * 9.06e-4 == pytest.approx(1.680e-2, rel=1e-3)  # g_3, from 1.27e-2
@@ -143,12 +143,12 @@ def test_lumped_and_viscous_substitutes_of_the_design_notes():
         assert errors(matched[name], Prony.paper(5), at)[1] < 1e-12
 
 
-def test_nothing_stands_for_what_is_stable():
+def test_stable_series_has_no_substitute():
     assert [m.name for m in substitutes(paper(1e-5), match=100.0)] == ["all elements"]
 
 
 @pytest.mark.parametrize(("dt", "formulation"), [(1e-5, "total"), (2e-5, "updated"), (2e-5, "total")])
-def test_refitted_elements_are_stable_and_lose_less_than_lumped_ones(dt, formulation):
+def test_refitted_elements_are_stable_and_more_accurate_than_lumped(dt, formulation):
     found = {m.name: m for m in substitutes(paper(dt, formulation=formulation), match=BAND[1])}
     best, lumped, left = found["refitted"], found["lumped into element 3"], found["left out"]
     number = courant(particle(), best.prony(), dt=dt, cell=CELL, formulation=formulation).number
@@ -157,7 +157,7 @@ def test_refitted_elements_are_stable_and_lose_less_than_lumped_ones(dt, formula
     assert best.good[0] == left.good[0] == 0 and best.good[1] > left.good[1] > BAND[0]
 
 
-def test_five_elements_stand_for_twenty_five():
+def test_five_elements_match_twenty_five_within_1_percent_over_band():
     spent, easy = (budget(LONG, LONG.solid(0.4, 1070.0), cell=CELL, band=BAND, dt=dt) for dt in (3e-5, 1e-5))
     assert spent.stable < easy.stable == 25 and "takes 5 of them" in easy.sentence
     assert [m.name for m in substitutes(easy, match=100.0)] == ["all elements", "refitted"]
@@ -173,13 +173,13 @@ def test_five_elements_stand_for_twenty_five():
         substitutes(spent, match=100.0)[0].prony()
 
 
-def test_a_short_stable_series_is_kept_as_it_is():
+def test_stable_series_of_five_elements_is_unchanged_by_choose():
     kept = choose(paper(1e-5))
     assert torch.equal(kept.prony().times, Prony.paper(5).times) and kept.loss_error == 0
 
 
 # ------------------------------------------------------------------------------------------------- told, and refused
-def test_the_sentence_names_what_is_not_stable():
+def test_elements_4_and_5_are_unstable_at_20_us_and_spring_at_100_us():
     spent = paper(2e-5)
     assert [row["stable"] for row in spent.rows()] == ["yes"] * 4 + ["no"] * 2
     for part in ("elements 4 to 5", "5.77 us to 0.159 us", "2 times as many steps", "21 % of the loss"):
@@ -188,14 +188,14 @@ def test_the_sentence_names_what_is_not_stable():
     assert "even the equilibrium spring is not stable" in paper(1e-4).sentence
 
 
-def test_a_series_without_elements_loses_nothing():
+def test_elastic_solid_has_zero_storage_and_loss_error():
     elastic = budget(Prony.paper(0), Solid(), cell=1.75e-3, band=BAND)
     assert (elastic.elements[0].storage_lost, elastic.elements[0].loss_lost) == (0.0, 0.0)
     only = choose(elastic)
     assert (len(only.moduli), only.storage_error, only.loss_error) == (0, 0.0, 0.0)
 
 
-def test_the_picture_has_every_curve(tmp_path):
+def test_budget_figure_labels_each_substitute_with_its_error(tmp_path):
     spent = paper(2e-5)
     materials = substitutes(spent, match=BAND[1])[1:]
     figure = draw_budget(spent, materials)
@@ -216,12 +216,12 @@ def test_the_picture_has_every_curve(tmp_path):
         ({"formulation": "lagrangian"}, "formulation"),
     ],
 )
-def test_numbers_outside_their_range_are_refused(change, match):
+def test_budget_arguments_outside_their_range_are_refused(change, match):
     with pytest.raises(ValueError, match=match):
         paper(**change)
 
 
-def test_materials_without_a_choice_are_refused():
+def test_batched_prony_melt_and_invalid_element_counts_are_refused():
     batch = Prony(moduli=torch.ones(2, 1), times=torch.ones(2, 1))
     with pytest.raises(ValueError, match="one material"):
         budget(batch, Solid(), cell=CELL, band=BAND)

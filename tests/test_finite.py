@@ -23,12 +23,12 @@ PULL = {"name": "pull", "mode": "uniaxial", "time": [1.0, 2.0], "deformation": [
         ({"deformation": [1.5, 0.0]}, r"pull: deformation\[1\] = 0, wanted a positive stretch"),
     ],
 )
-def test_a_test_refuses(change, message):
+def test_experiment_refuses_invalid_arrays_naming_sample(change, message):
     with pytest.raises(ValueError, match="^" + message):
         Experiment(**{**PULL, **change})
 
 
-def test_a_test_keeps_its_numbers():
+def test_experiment_copies_and_freezes_its_arrays():
     stress = np.array([3.0, 4.0])
     test = Experiment(**{**PULL, "stress": stress})
     stress[0] = 99.0
@@ -41,7 +41,7 @@ def test_a_test_keeps_its_numbers():
 
 
 @pytest.mark.parametrize(("mode", "value"), [("shear", 9.0), ("uniaxial", 9 + 2 / 3 - 3), ("equibiaxial", 15 + 1 / 81)])
-def test_first_invariant(mode, value):
+def test_first_invariant_of_incompressible_solid_matches_closed_form(mode, value):
     test = Experiment(**{**PULL, "mode": mode, "deformation": [1.0, 3.0]})
     assert test.invariant.tolist() == pytest.approx([1.0 if mode == "shear" else 0.0, value])
 
@@ -51,7 +51,7 @@ def test_first_invariant(mode, value):
     first=st.sampled_from([0.0, 0.7]),
     largest=st.floats(0.05, 3),
 )
-def test_the_path_goes_from_rest_through_every_sample_in_steps_that_are_small_enough(ways, first, largest):
+def test_path_starts_at_rest_meets_samples_and_bounds_step_of_deformation(ways, first, largest):
     time = first + np.arange(len(ways))
     test = Experiment(name="", mode="shear", time=time, deformation=ways, stress=np.ones(len(ways)))
     way, steps, at = test.path(largest)
@@ -72,7 +72,7 @@ def write(folder, text, name="data.csv"):
     return path
 
 
-def test_a_table_with_a_head_semicolons_and_strains_in_megapascals(tmp_path):
+def test_tensile_export_with_preamble_and_engineering_strain_is_read_in_si(tmp_path):
     head = "Speed (mm/min);450;;\n;;;\nTime (s);True Strain;Engineering Strain;Engineering Stress (MPa)\n"
     test = read(write(tmp_path, head + "0.5;9;0.25;0.5\n1;9;1;2\n;;;\n\n"), name="silicone")
     assert (test.name, test.mode) == ("silicone", "uniaxial")
@@ -81,7 +81,7 @@ def test_a_table_with_a_head_semicolons_and_strains_in_megapascals(tmp_path):
     assert test.stress.tolist() == [0.5e6, 2e6]
 
 
-def test_columns_are_found_by_their_names_in_any_order(tmp_path):
+def test_columns_are_identified_by_name_in_any_order(tmp_path):
     table = "shear_strain,force_N,shear_stress_kPa,time_s\n0.5,7,3,1\n2,7,4,2\n"
     test = read(write(tmp_path, table, "ramp.csv"))
     assert (test.name, test.mode) == ("ramp", "shear")
@@ -90,7 +90,7 @@ def test_columns_are_found_by_their_names_in_any_order(tmp_path):
     assert test.stress.tolist() == [3e3, 4e3]
 
 
-def test_at_a_rate_time_is_the_way_over_it_to_and_fro(tmp_path):
+def test_time_at_given_rate_is_path_length_over_rate_on_loading_and_unloading(tmp_path):
     table = write(tmp_path, "time_s,stretch,nominal_stress_kPa\n0,1,0\n9,1.5,1\n8,1.2,1\n")
     assert read(table, rate=0.1).time == pytest.approx([0.0, 5.0, 8.0])
     sheared = write(tmp_path, "time_s,shear_strain,shear_stress_kPa\n0,0.5,0\n9,-0.5,1\n")
@@ -115,12 +115,12 @@ def test_at_a_rate_time_is_the_way_over_it_to_and_fro(tmp_path):
         ("time_s,stretch,nominal_stress_kPa\n0,1\n", "line 2: '0,1', wanted numbers"),
     ],
 )
-def test_a_file_is_refused_with_its_line(tmp_path, text, message):
+def test_invalid_file_is_refused_naming_line(tmp_path, text, message):
     with pytest.raises(ValueError, match=r"data\.csv: " + message):
         read(write(tmp_path, text))
 
 
-def test_a_table_without_samples_and_one_whose_times_go_back_are_refused(tmp_path):
+def test_empty_table_and_decreasing_times_are_refused(tmp_path):
     head = "time_s,stretch,nominal_stress_kPa\n"
     with pytest.raises(ValueError, match=r"data: time of shape \(0,\)"):
         read(write(tmp_path, head))

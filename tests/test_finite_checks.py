@@ -22,14 +22,14 @@ def folder(checks, name):
     return path
 
 
-def test_absent_folders_are_skipped_with_the_reason(checks, tmp_path, capsys):
+def test_absent_recording_folders_are_skipped(checks, tmp_path, capsys):
     checks.main(tmp_path)
     said = capsys.readouterr().out
     assert said.count("skipped, there is no folder") == 3
     assert str(tmp_path / "silicone-tensile-tests") in said
 
 
-def test_a_pull_without_its_speed_is_refused(checks, tmp_path):
+def test_strain_rate_from_file_head_and_refusal_without_gauge_length(checks, tmp_path):
     path = tmp_path / "pull.csv"
     path.write_text("Speed (mm/min);450;;\nLength (mm);33;;\n")
     assert checks.pull_rate(path) == pytest.approx(450 / 33 / 60)
@@ -38,7 +38,7 @@ def test_a_pull_without_its_speed_is_refused(checks, tmp_path):
         checks.pull_rate(path)
 
 
-def test_a_test_is_kept_until_it_goes_beyond(checks):
+def test_test_is_truncated_at_first_sample_above_strain_limit(checks):
     numbers = np.array([1.0, 2.0, 3.0, 1.0])
     test = Experiment(name="", mode="shear", time=np.arange(4.0), deformation=numbers, stress=numbers)
     assert checks.until(test, 3.0).stress.tolist() == [1.0, 2.0, 3.0, 1.0]
@@ -46,7 +46,7 @@ def test_a_test_is_kept_until_it_goes_beyond(checks):
 
 
 @recordings
-def test_times_of_the_recordings_are_what_the_recipe_says(checks):
+def test_recorded_times_and_strain_rates_match_file_names(checks):
     base = folder(checks, "viscoelastic-shear-and-tension")
     for rate, tests in checks.tension(base).items():
         for test in tests:  # the way over the rate
@@ -62,7 +62,7 @@ def test_times_of_the_recordings_are_what_the_recipe_says(checks):
 
 
 @recordings
-def test_viscosity_of_some_rates_predicts_another(checks):
+def test_viscous_law_halves_prediction_error_at_held_out_rates(checks):
     base = folder(checks, "viscoelastic-shear-and-tension")
     row = checks.split(checks.tension(base), [0.03], elements=1)
     assert row["tests"] == "8, 2"
@@ -74,7 +74,7 @@ def test_viscosity_of_some_rates_predicts_another(checks):
 
 
 @recordings
-def test_every_silicone_is_read_and_fitted(checks):
+def test_yeoh_error_below_5_percent_for_all_17_silicones(checks):
     rows = checks.silicones(folder(checks, "silicone-tensile-tests"))
     assert len(rows) == 3 * 17
     assert len({row["material"] for row in rows}) == 17

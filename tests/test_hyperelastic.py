@@ -39,7 +39,7 @@ def held(found: Fit, **wanted: float) -> list[bool]:
 
 
 @pytest.mark.parametrize("mode", ["uniaxial", "equibiaxial", "shear"])
-def test_yeohs_law_is_recovered_from_one_curve(mode):
+def test_yeoh_constants_recovered_from_one_stress_stretch_curve(mode):
     exact = experiment(mode, 1.0, back=False)
     found = fit([exact])
     assert found.error < 1e-5
@@ -50,7 +50,7 @@ def test_yeohs_law_is_recovered_from_one_curve(mode):
 
 
 @pytest.mark.parametrize("mode", ["uniaxial", "equibiaxial", "shear"])
-def test_intervals_hold_the_numbers_as_often_as_they_say(mode):
+def test_coverage_of_yeoh_intervals_matches_confidence_level(mode):
     mu, count, exact = TRUE.shear, 40, experiment(mode, 1.0, back=False)
     wanted = {"shear": mu, "a": 0.02, "b": 0.003, "C20": 0.02 * mu / 4, "C30": 0.003 * mu / 6}
     rows = []
@@ -65,7 +65,7 @@ def test_intervals_hold_the_numbers_as_often_as_they_say(mode):
     assert (share > LEVEL - 3 * math.sqrt(LEVEL * (1 - LEVEL) / count)).all(), share
 
 
-def test_intervals_of_maxwell_elements_hold_them_as_often():
+def test_coverage_of_maxwell_element_intervals_matches_confidence_level():
     exact = [experiment("shear", rate, prony=PRONY) for rate in (0.02, 0.1, 1.0)]
     wanted = {"shear": TRUE.shear, "a": 0.02, "b": 0.003, "g1": 0.8, "tau1": 20.0, "g2": 0.5, "tau2": 1.0}
     rows = []
@@ -76,7 +76,7 @@ def test_intervals_of_maxwell_elements_hold_them_as_often():
     assert np.mean(rows) > 0.75, rows  # 90 %, but those of one fit go together
 
 
-def test_correlated_residuals_widen_the_intervals():
+def test_interval_widens_with_serially_correlated_residuals():
     smooth = experiment("uniaxial", 1.0, back=False)
     wave = replace(smooth, stress=smooth.stress * (1 + 0.02 * np.sin(np.linspace(0, 12, len(smooth.time)))))
     found = fit([wave], order=1)
@@ -84,7 +84,7 @@ def test_correlated_residuals_widen_the_intervals():
     assert held(found, shear=TRUE.shear) == [True]
 
 
-def test_maxwell_elements_are_recovered_and_predict_another_rate():
+def test_two_maxwell_elements_recovered_within_10_percent_and_predict_another_rate():
     known = [experiment("shear", rate, prony=PRONY, noise=0.01, seed=k) for k, rate in enumerate((0.02, 1.0))]
     known.append(experiment("uniaxial", 0.1, top=2.0, prony=PRONY, noise=0.01, seed=7))
     fits = ladder(known, most=2)
@@ -103,7 +103,7 @@ def test_maxwell_elements_are_recovered_and_predict_another_rate():
         torch.testing.assert_close(getattr(law, name), getattr(best.law, name).squeeze(), rtol=1e-12, atol=0)
 
 
-def test_specimens_may_differ_by_a_factor():
+def test_stress_factors_of_specimens_recovered_within_1_percent():
     factors = (0.8, 1.25)
     known = [
         experiment("shear", rate, prony=PRONY, factor=factor) for rate, factor in zip((0.02, 1.0), factors, strict=True)
@@ -115,7 +115,7 @@ def test_specimens_may_differ_by_a_factor():
     assert found.error_of(other, specimens=True) < 0.01 < 0.3 < found.error_of(other)
 
 
-def test_what_the_tests_do_not_tell_has_a_wide_interval():
+def test_interval_of_relaxation_time_far_below_sampling_spans_a_decade():
     # An element a thousand times as fast as the test lies below what it sees.
     fast = Prony(moduli=torch.tensor([0.5]).double(), times=torch.tensor([1e-4]).double())
     found = fit([experiment("shear", 1.0, prony=fast, noise=0.01)], elements=1)
@@ -123,7 +123,7 @@ def test_what_the_tests_do_not_tell_has_a_wide_interval():
     assert interval.high > 10 * interval.low
 
 
-def test_a_stable_fit_is_a_solid_also_where_the_data_soften():
+def test_stable_fit_to_softening_data_is_accepted_by_solid():
     softer = experiment("shear", 1.0, top=3.0, back=False)
     softer = replace(softer, stress=2e4 * np.tanh(softer.deformation))
     for order in (0, 1, 2):
@@ -146,13 +146,13 @@ def test_a_stable_fit_is_a_solid_also_where_the_data_soften():
         ({"poisson_ratio": 0.5}, r"order, elements, poisson_ratio = 2, 0, 0\.5"),
     ],
 )
-def test_a_fit_refuses(change, message):
+def test_fit_refuses_arguments_outside_their_range(change, message):
     test = experiment("shear", 1.0)
     with pytest.raises(ValueError, match="^" + message):
         fit([test], **change)
 
 
-def test_no_tests_and_a_test_without_stress_are_refused():
+def test_fit_refuses_empty_list_and_zero_stress():
     test = experiment("shear", 1.0)
     with pytest.raises(ValueError, match="experiments: 0, wanted at least one"):
         fit([])

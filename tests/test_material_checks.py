@@ -28,7 +28,7 @@ def sweeps(shift: Shift) -> list[Sweep]:
     return curves
 
 
-def test_a_master_curve_comes_apart_into_its_sweeps_and_its_shifts_are_found_again(checks):
+def test_master_curve_separates_into_sweeps_and_shift_factors_are_recovered(checks):
     shift = Shift(
         temperatures=np.array([0.0, 10.0, 20.0, 30.0]), log_a=np.array([2.23, 1.05, 0.0, -0.92]), reference=20.0
     )
@@ -46,7 +46,7 @@ def test_a_master_curve_comes_apart_into_its_sweeps_and_its_shifts_are_found_aga
     assert row["apart, theirs"] > 3 * row["apart, ours"]
 
 
-def test_table_s1_is_found_again_in_a_noisy_master_curve(checks):
+def test_table_s1_moduli_recovered_at_2_percent_noise(checks):
     (row,) = checks.resin(noises=(0.02,), seeds=2)
     assert (row["with five elements"], row["moduli"], row["or said"]) == (2, 12, 12)
     assert checks.wide(1.0, Interval(low=0.9, high=1.1))
@@ -54,14 +54,14 @@ def test_table_s1_is_found_again_in_a_noisy_master_curve(checks):
     assert checks.wide(1.0, Interval(low=0.99, high=1.01, unknown="for a reason"))
 
 
-def test_folders_that_are_not_there_are_skipped_and_named(checks, tmp_path, capsys):
+def test_absent_recording_folders_are_skipped(checks, tmp_path, capsys):
     for check, folder in checks.FOLDERS.items():
         checks.main(tmp_path, check)
         assert f"{check}: skipped, there is no {tmp_path / folder}" in capsys.readouterr().out
 
 
 @pytest.mark.filterwarnings("ignore")  # those of pandas are meant for pyvisco
-def test_pyvisco_fits_worse_with_as_many_terms(checks):
+def test_error_norm_not_above_pyvisco_for_same_number_of_terms(checks):
     pytest.importorskip("pyvisco", reason="what is compared with; an extra")
     omega = np.geomspace(1e-3, 1e6, 91)
     storage, loss = SOLID.storage_loss(omega) * (1 + 0.02 * np.random.default_rng(1).standard_normal((2, 91)))
@@ -74,7 +74,7 @@ def test_pyvisco_fits_worse_with_as_many_terms(checks):
 
 
 @recordings
-def test_the_recordings_meet_what_is_asked_for_or_the_table_says_not(checks, capsys):
+def test_instrument_shift_factors_reported_as_not_superposing_raw_adhesive_sweeps(checks, capsys):
     checks.adhesive(Path(RECORDINGS) / "dma-nrel-polymer")
     said = capsys.readouterr().out
     assert "does not superpose them" in said
@@ -83,7 +83,7 @@ def test_the_recordings_meet_what_is_asked_for_or_the_table_says_not(checks, cap
 
 
 @recordings
-def test_the_rubber_dma_predicts_the_peaks_of_the_shaker(checks):
+def test_resonance_of_rubber_discs_predicted_from_dma_within_13_percent(checks):
     rows = checks.shaker(Path(RECORDINGS) / "dma-shaker-rubber" / "material_a", across=())
     for row in rows:
         if row["material"].startswith(("fitted", "for the simulator")):

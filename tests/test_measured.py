@@ -24,7 +24,7 @@ def write(folder, text, name="data.csv", encoding="utf-8"):
 # ------------------------------------------------------------------------------------------------------- the curves
 
 
-def test_a_curve_keeps_its_numbers():
+def test_curve_copies_and_freezes_its_arrays():
     omega = np.array([1.0, 2.0])
     sweep = Sweep(**{**SWEEP, "omega": omega, "temperature": math.nan})
     omega[0] = 99.0
@@ -49,7 +49,7 @@ def test_a_curve_keeps_its_numbers():
         ({"temperature": -300.0}, "temperature = -300.0: wanted deg C above -273.15"),
     ],
 )
-def test_a_curve_refuses(change, message):
+def test_curve_refuses_invalid_arrays_naming_attribute_and_index(change, message):
     with pytest.raises(ValueError, match=message):
         Sweep(**{**SWEEP, **change})
 
@@ -69,7 +69,9 @@ HEADERS = [("E'", "E''"), ("E_stor", "E_loss"), ("E storage", "E loss"), ("E'", 
     units=st.sampled_from(["row", "brackets", "suffix"]),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_what_is_written_is_read(tmp_path_factory, delimiter, header, modulus, frequency, kelvin, units, seed):
+def test_table_read_in_si_units_for_any_delimiter_header_and_unit(
+    tmp_path_factory, delimiter, header, modulus, frequency, kelvin, units, seed
+):
     rng = np.random.default_rng(seed)
     name, spelled = frequency
     if spelled is None:
@@ -102,7 +104,7 @@ def test_what_is_written_is_read(tmp_path_factory, delimiter, header, modulus, f
         np.testing.assert_allclose(curve.loss, wanted[t][1] * MODULI[modulus], rtol=1e-9)
 
 
-def test_times_make_relaxation_and_creep_tests(tmp_path):
+def test_time_columns_give_relaxation_and_creep_in_si_units(tmp_path):
     (relaxation,) = read(write(tmp_path, "t,E_relax\nms,MPa\n1,3\n10,2\n"))
     assert isinstance(relaxation, Relaxation)
     assert relaxation.time.tolist() == [1e-3, 1e-2]
@@ -115,7 +117,7 @@ def test_times_make_relaxation_and_creep_tests(tmp_path):
     assert (creep.temperature, creep.deformation) == (25.0, "shear")
 
 
-def test_an_instruments_file(tmp_path):
+def test_rheometer_export_with_metadata_tabs_and_latin_1_is_read(tmp_path):
     # Metadata first, tabs in the header only, a degree sign in one byte, a column twice, a comment, blank lines.
     text = "T=-10;chem=PI;\nFreq\tG'\tG\"\tTemp\tPhase\tTemp\nrad/s\tPa\tPa\t\xb0C\t\xb0\t\xb0C\n"
     path = write(
@@ -130,13 +132,13 @@ def test_an_instruments_file(tmp_path):
     assert sweep.temperature == pytest.approx(-9.998)
 
 
-def test_a_decimal_comma(tmp_path):
+def test_decimal_comma_is_read_in_semicolon_table(tmp_path):
     (sweep,) = read(write(tmp_path, "f / Hz;E' / MPa;E'' / MPa\n0,5;1,25;0,5\n1,5;2;1\n", encoding="utf-16"))
     assert sweep.omega == pytest.approx([math.pi, 3 * math.pi])
     assert sweep.storage.tolist() == [1.25e6, 2e6]
 
 
-def test_a_table_without_a_header(tmp_path):
+def test_table_without_header_is_read_by_column_numbers(tmp_path):
     path = write(tmp_path, "nothing to see\n1 10 2\n2 11 3\n", name="data.txt")
     units = {"frequency": "rad/s", "storage": "Pa", "loss": "Pa"}
     columns = {"frequency": 0, "storage": 1, "loss": 2}
@@ -144,7 +146,7 @@ def test_a_table_without_a_header(tmp_path):
     assert (sweep.omega.tolist(), sweep.loss.tolist()) == ([1.0, 2.0], [2.0, 3.0])
 
 
-def test_what_tells_curves_apart(tmp_path):
+def test_label_and_nominal_temperature_split_rows_into_curves(tmp_path):
     # A label splits two runs of one temperature, the nominal temperature splits what the measured one blurs.
     head = "run,T_nominal_C,T_measured_C,f_Hz,E'_Pa,E''_Pa\n"
     rows = ["a,0,0.7,1,5,1", "a,0,-0.6,2,6,1", "b,0,0.1,1,7,1", "b,0,0.1,2,8,1", "a,1,1.1,1,9,1", "a,1,0.8,2,9,1"]
@@ -185,12 +187,12 @@ GOOD = "f,E',E'',T\nHz,MPa,MPa,C\n1,5,1,20\n2,6,1,20\n"
         (("", ""), {"sheet": "one"}, "sheet = 'one': .* is text"),
     ],
 )
-def test_a_table_that_is_refused(tmp_path, change, options, message):
+def test_invalid_table_is_refused_naming_line_and_column(tmp_path, change, options, message):
     with pytest.raises(ValueError, match=message):
         read(write(tmp_path, GOOD.replace(*change)), **options)
 
 
-def test_declared_units_and_columns_go_before_what_the_file_says(tmp_path):
+def test_declared_units_and_columns_override_header(tmp_path):
     path = write(
         tmp_path, GOOD.replace("f,", "f,Gp,").replace("Hz,", "Hz,-,").replace("1,5", "1,7,5").replace("2,6", "2,8,6")
     )
@@ -200,7 +202,7 @@ def test_declared_units_and_columns_go_before_what_the_file_says(tmp_path):
     assert (sweep.omega.tolist(), sweep.storage.tolist()) == ([1.0, 2.0], [7e3, 8e3])
 
 
-def test_a_workbook_without_its_reader_says_how_to_go_on(tmp_path, monkeypatch):
+def test_workbook_without_calamine_and_missing_file_raise(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "python_calamine", None)
     with pytest.raises(ModuleNotFoundError, match=r'extra excel \(pip install "torchsoro\[excel\]"\).*as CSV'):
         read(write(tmp_path, "x", name="data.xls"))
@@ -237,7 +239,7 @@ def test_a_workbook_without_its_reader_says_how_to_go_on(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_recordings_are_read(file, options, kind, points, ends):
+def test_published_recordings_give_expected_curves_points_and_range(file, options, kind, points, ends):
     curves = read(Path(RECORDINGS) / file, **options)
     assert {type(c) for c in curves} == {kind}
     assert [len(getattr(c, kind.axis)) for c in curves] == points
@@ -245,7 +247,7 @@ def test_recordings_are_read(file, options, kind, points, ends):
 
 
 @recordings
-def test_the_workbook_of_the_instrument_is_the_csv():
+def test_instrument_workbook_equals_published_csv():
     pytest.importorskip("python_calamine", reason="reads workbooks")
     folder = Path(RECORDINGS) / "dma-nrel-polymer"
     for a, b in zip(read(folder / "freq_Eplexor_raw.xls"), read(folder / "freq_user_raw.csv"), strict=True):
@@ -254,7 +256,7 @@ def test_the_workbook_of_the_instrument_is_the_csv():
 
 
 @recordings
-def test_the_instruments_files_and_the_table_made_of_them_agree():
+def test_single_sweep_files_equal_combined_table():
     folder = Path(RECORDINGS) / "rheology-polyisoprene-tts"
     units = {"frequency": "rad/s", "storage": "Pa", "loss": "Pa", "temperature": "C"}  # some files do not say
     single = [read(path, units=units)[0] for path in sorted((folder / "original_osc").glob("PI600k*"))]

@@ -47,7 +47,7 @@ def even(count, dt):
 
 
 @pytest.mark.parametrize("elements", [0, 1, 5])
-def test_a_particle_in_the_kernels_has_the_same_stress(elements):
+def test_stress_history_equals_updated_kernel_of_one_particle(elements):
     torchsoro.init("cpu")
     steps, dt, prony = 80, 1e-3, Prony.paper(elements)
     waves = torch.sin(torch.linspace(0.05, 4, steps).double()[:, None] * vector(1.0, 2.3, 5.1))
@@ -69,7 +69,7 @@ def test_a_particle_in_the_kernels_has_the_same_stress(elements):
     assert float((found - tau).abs().max()) < 1e-12 * float(tau.abs().max())
 
 
-def test_a_point_of_the_total_lagrangian_form_has_the_same_history():
+def test_stress_history_equals_total_lagrangian_kernel():
     # A cube of a single cell, flung apart; it keeps Z = H - b S.
     _, body = block((2, 2, 2))
     body = replace(body, velocity=(body.position - body.position.mean(0)) @ (400 * noise(3, 3)))
@@ -92,7 +92,7 @@ def test_a_point_of_the_total_lagrangian_form_has_the_same_history():
         torch.testing.assert_close(Z, six, rtol=0, atol=1e-12 * float(six.abs().max()))
 
 
-def test_steps_are_those_of_the_simulators_prony_series():
+def test_discrete_decay_and_gain_equal_prony_discrete():
     prony, dt = Prony.paper(5), torch.logspace(-8, 1, 10, dtype=torch.float64)
     decay, gain = Law.of(SOLID, prony).discrete(dt)
     for k, step in enumerate(dt.tolist()):
@@ -109,7 +109,7 @@ def path(count=60):
 
 
 @pytest.mark.parametrize("poisson_ratio", [0.0, 0.4, 0.499])
-def test_free_sides_are_free_and_the_rest_is_the_stress_of_that_path(poisson_ratio):
+def test_lateral_stress_vanishes_and_axial_stress_matches_full_path(poisson_ratio):
     # The middle path is compressed; each has steps of its own.
     law = Law.of(replace(SOLID, poisson_ratio=poisson_ratio), Prony.paper(3))
     stretch = path()
@@ -124,7 +124,7 @@ def test_free_sides_are_free_and_the_rest_is_the_stress_of_that_path(poisson_rat
         assert float((P[..., 1, 1] - (P[..., 2, 2] if axes[1] == 2 else P[..., 0, 0])).abs().max()) < 1e-12 * scale
 
 
-def test_incompressible_limit_has_the_closed_forms_of_yeohs_solid():
+def test_nearly_incompressible_stress_matches_closed_forms_of_yeoh():
     law = Law.of(replace(SOLID, poisson_ratio=0.5 - 1e-9))
     stretch = torch.linspace(0.5, 5, 46, dtype=torch.float64)
     dt, mu = even(46, 1.0), float(law.shear)
@@ -140,7 +140,7 @@ def test_incompressible_limit_has_the_closed_forms_of_yeohs_solid():
 
 
 @given(ratio=st.floats(1e-3, 1e3), count=st.integers(1, 20))
-def test_small_shear_at_a_constant_rate_has_the_stress_of_a_maxwell_element_at_any_step(ratio, count):
+def test_shear_stress_at_constant_rate_matches_maxwell_element_for_any_step(ratio, count):
     # Linear viscoelasticity: mu (rate t + g tau rate (1 - exp(-t/tau))); neo-Hookean to the square of the strain.
     law = Law.of(Solid(), Prony(moduli=vector(2.0), times=vector(1.0)))
     time = ratio * torch.arange(1, count + 1, dtype=torch.float64)
@@ -149,7 +149,7 @@ def test_small_shear_at_a_constant_rate_has_the_stress_of_a_maxwell_element_at_a
     torch.testing.assert_close(simple_shear(rate * time, even(count, ratio), law), wanted, rtol=1e-9, atol=0)
 
 
-def test_relaxation_after_a_jump_is_that_of_the_series():
+def test_stress_relaxation_after_step_strain_matches_prony_series():
     # Simo's model factors: stress over that of the law alone is 1 + sum g b exp(-t/tau), at any strain.
     prony, dt, count = Prony.paper(2), 1e-3, 40
     with_, without = Law.of(SOLID, prony), Law.of(SOLID)
@@ -176,7 +176,7 @@ def at(numbers):
 
 
 @pytest.mark.parametrize("test", ["shear", "uniaxial", "equibiaxial"])
-def test_derivatives_by_every_number_of_the_law(test):
+def test_complex_step_and_autograd_derivatives_match_for_every_constant(test):
     stretch = path(12)
     dt = even(12, 0.05)
     run = {
@@ -212,6 +212,6 @@ def test_derivatives_by_every_number_of_the_law(test):
         ),
     ],
 )
-def test_bad_paths_are_refused(call, message):
+def test_non_positive_stretch_step_or_volume_ratio_is_refused(call, message):
     with pytest.raises(ValueError, match="^" + message):
         call(Law.of(SOLID))

@@ -56,7 +56,7 @@ def master_curve(name, skip, unit, **meaning):
 
 
 # ------------------------------------------------------------------------------------------------------- closed forms
-def test_moduli_of_one_maxwell_element():
+def test_storage_loss_and_relaxation_modulus_of_one_maxwell_element_match_closed_forms():
     one = Spectrum(equilibrium=2.0, moduli=np.array([3.0]), times=np.array([0.5]), deformation="shear")
     storage, loss = one.storage_loss(np.array([2.0, 4.0]))
     np.testing.assert_allclose(storage, [2 + 3 / 2, 2 + 3 * 4 / 5])
@@ -64,7 +64,7 @@ def test_moduli_of_one_maxwell_element():
     np.testing.assert_allclose(one.relaxation(np.array([0.0, 0.5])), [5, 2 + 3 / math.e])
 
 
-def test_the_simulators_elements_have_the_moduli_of_the_spectrum():
+def test_prony_series_has_storage_and_loss_modulus_of_spectrum_within_1e_12():
     prony = TABLE_S1.prony()
     assert torch.equal(prony.times, Prony.paper(5).times)  # the slowest first, as in Table S1
     ours = np.stack(TABLE_S1.storage_loss(MASTER))
@@ -72,7 +72,7 @@ def test_the_simulators_elements_have_the_moduli_of_the_spectrum():
     np.testing.assert_allclose(theirs, ours, rtol=1e-12)
 
 
-def test_youngs_modulus_from_tension_and_from_shear():
+def test_solid_modulus_from_tension_is_youngs_and_from_shear_is_shear_modulus():
     assert TABLE_S1.solid(0.4, 1070.0) == Solid()
     assert replace(TABLE_S1, deformation="shear").solid(0.4, 1070.0).shear == pytest.approx(0.44e6)
 
@@ -91,7 +91,7 @@ def test_error_norm_is_the_sum_of_eq_17c():
     weights=st.lists(st.floats(-1.5, 1.5), min_size=5, max_size=5),
     kind=st.sampled_from(["sweep", "relaxation"]),
 )
-def test_a_curve_without_noise_gives_its_spectrum_back(gaps, weights, kind):
+def test_moduli_and_times_recovered_within_1_percent_from_noiseless_sweep_and_relaxation(gaps, weights, kind):
     times = 1e-3 * 10 ** np.cumsum(gaps)
     truth = Spectrum(
         equilibrium=1e5, moduli=1e5 * 10 ** np.array(weights[: len(gaps)]), times=times, deformation="shear"
@@ -109,7 +109,7 @@ def test_a_curve_without_noise_gives_its_spectrum_back(gaps, weights, kind):
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.05])
-def test_table_s1_comes_back_from_a_noisy_master_curve(noise):
+def test_table_s1_moduli_within_5_percent_and_intervals_cover_truth_at_1_and_5_percent_noise(noise):
     truth = np.array([TABLE_S1.equilibrium, *TABLE_S1.moduli])
     off, half, held = [], [], []
     for seed in range(20):
@@ -129,7 +129,7 @@ def test_table_s1_comes_back_from_a_noisy_master_curve(noise):
     assert half.max() < 3 * noise  # and they say something
 
 
-def test_the_times_of_table_s1_given_narrow_the_intervals():
+def test_given_relaxation_times_narrow_intervals_of_moduli():
     data = sweep(TABLE_S1, MASTER, 0.03, 1)
     free, given = fit(data, elements=5), fit(data, times=TABLE_S1.times, regularization=0)
     widths = [np.array([i.high - i.low for i in f.intervals]) for f in (free, given)]
@@ -143,7 +143,7 @@ def test_the_times_of_table_s1_given_narrow_the_intervals():
     weights=st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
     fluidity=st.sampled_from([0.0, 1e-8]),
 )
-def test_complex_modulus_and_compliance_are_each_others_inverse(gaps, weights, fluidity):
+def test_complex_modulus_times_complex_compliance_is_one_after_interconversion(gaps, weights, fluidity):
     times, compliances = 1e-4 * 10 ** np.cumsum(gaps), 1e-6 * 10 ** np.array(weights[: len(gaps)])
     found = interconverted(1e-7, fluidity, compliances, times)
     omega = np.geomspace(1e-6, 1e6, 40)
@@ -157,7 +157,7 @@ def test_complex_modulus_and_compliance_are_each_others_inverse(gaps, weights, f
     np.testing.assert_allclose(both.creep(time), creep, rtol=1e-6)
 
 
-def test_a_creep_test_gives_the_relaxation_spectrum():
+def test_relaxation_spectrum_recovered_from_creep_compliance():
     retarded, compliances = np.array([0.05, 3.0, 100.0]), np.array([1e-6, 3e-6, 5e-6])
     truth = interconverted(1e-6, 0.0, compliances, retarded).values
     time = np.geomspace(1e-3, 1e3, 80)
@@ -178,9 +178,9 @@ def test_a_creep_test_gives_the_relaxation_spectrum():
 
 # -------------------------------------------------------------------------------------------- what cannot be known
 @pytest.mark.parametrize("seed", range(3))
-def test_terms_faster_than_the_data_cannot_be_known(seed):
+def test_modulus_of_relaxation_time_below_data_window_is_unbounded(seed):
     found = fit(sweep(TABLE_S1, np.geomspace(1e-2, 1e4, 90), 0.02, seed))  # the two fastest lie beyond
-    assert found.intervals[0].unknown.startswith("stands for all that is faster")
+    assert found.intervals[0].unknown.startswith("stands for all relaxation faster")
     assert found.intervals[0].high == math.inf
     known = [(v, i) for v, i in zip(found.moduli, found.intervals, strict=True) if not i.unknown]
     assert len(known) >= 2
@@ -188,7 +188,7 @@ def test_terms_faster_than_the_data_cannot_be_known(seed):
         assert interval.low <= truth <= interval.high or abs(value / truth - 1) < 0.05
 
 
-def test_intervals_of_a_melt_cover_its_moduli_beside_an_element_faster_than_the_data():
+def test_intervals_cover_moduli_of_melt_with_one_relaxation_time_below_data_window():
     truth = Spectrum(
         equilibrium=0.0,
         moduli=np.array([5e6, 2e5, 1e5, 5e4]),
@@ -205,7 +205,7 @@ def test_intervals_of_a_melt_cover_its_moduli_beside_an_element_faster_than_the_
     assert sum(inside) >= 21  # of 24 at 95 %
 
 
-def test_serially_correlated_residuals_leave_intervals_at_held_relaxation_times():
+def test_intervals_hold_at_fixed_relaxation_times_for_serially_correlated_residuals():
     # A smooth error, as where isotherms do not quite meet: one term less fits nearly as well.
     times, omega = np.geomspace(1e-5, 1e2, 40), np.geomspace(1e-3, 1e3, 60)
     truth = Spectrum(equilibrium=0.0, moduli=1e4 * times**-0.3, times=times, deformation="shear")
@@ -218,15 +218,15 @@ def test_serially_correlated_residuals_leave_intervals_at_held_relaxation_times(
     assert all(0 < i.low and i.high < 5 * i.low for i in known if i.condition)
 
 
-def test_a_term_that_is_not_there_has_an_interval_from_zero():
+def test_interval_of_superfluous_term_starts_at_zero():
     times = np.sort([*TABLE_S1.times, 40.0])
     found = fit(sweep(TABLE_S1, MASTER, 0.02, 3), times=times, regularization=0)
     extra = found.intervals[-1]
-    assert extra.low == 0 and extra.unknown == "the data agree with zero"
+    assert extra.low == 0 and extra.unknown == "the data are consistent with zero"
     assert 0 < extra.high < 0.05 * TABLE_S1.equilibrium
 
 
-def test_a_melt_has_no_elements_relative_to_its_equilibrium_modulus():
+def test_prony_series_of_melt_requires_given_equilibrium_modulus():
     melt = Spectrum(equilibrium=0.0, moduli=np.array([3e5, 1e5]), times=np.array([0.1, 10.0]), deformation="shear")
     data = sweep(melt, np.geomspace(1e-3, 1e3, 60), 0.03)
     liquid, asked = fit(data, equilibrium=False), fit(data)
@@ -240,9 +240,9 @@ def test_a_melt_has_no_elements_relative_to_its_equilibrium_modulus():
 
 
 @pytest.mark.parametrize(
-    ("window", "why"), [((1e-3, 1e4), "the data agree with zero"), (None, "it is still falling there")]
+    ("window", "why"), [((1e-3, 1e4), "the data are consistent with zero"), (None, "it is still falling there")]
 )
-def test_a_modulus_that_is_still_falling_is_no_equilibrium_modulus(window, why):
+def test_equilibrium_modulus_of_critical_gel_is_undetermined(window, why):
     times = np.geomspace(1e-4, 1e6, 60)  # a critical gel: a power law far beyond the data
     gel = Spectrum(equilibrium=0.0, moduli=1e4 * times**-0.5, times=times, deformation="shear")
     found = fit(sweep(gel, np.geomspace(1e-2, 1e3, 80), 0.01), window=window)
@@ -251,7 +251,7 @@ def test_a_modulus_that_is_still_falling_is_no_equilibrium_modulus(window, why):
         found.solid(0.4, 1000.0)
 
 
-def test_correlated_residuals_widen_the_intervals():
+def test_interval_of_equilibrium_modulus_widens_with_serially_correlated_residuals():
     white = sweep(TABLE_S1, MASTER, 0.02)
     wave = 1 + 0.028 * np.sin(4 * np.log(MASTER))  # as large, but smooth: as where isotherms do not quite meet
     storage, loss = (m * wave for m in TABLE_S1.storage_loss(MASTER))
@@ -263,7 +263,7 @@ def test_correlated_residuals_widen_the_intervals():
 
 
 # ----------------------------------------------------------------------------------------------- number and roughness
-def test_the_evidence_chooses_and_is_told():
+def test_least_bic_selects_five_terms_of_table_s1_at_2_percent_noise():
     found = fit(sweep(TABLE_S1, MASTER, 0.02))
     best = min(found.evidence, key=lambda c: c.bic)
     assert best.elements == len(found.times) == 5
@@ -272,7 +272,7 @@ def test_the_evidence_chooses_and_is_told():
     assert error_norm(found, sweep(TABLE_S1, MASTER, 0.02)) == pytest.approx(found.error)
 
 
-def test_regularisation_tames_more_terms_than_the_data_can_tell():
+def test_regularization_reduces_error_of_moduli_of_60_terms_below_30_percent():
     times = np.geomspace(1e-7, 1e2, 60)
     truth = Spectrum(equilibrium=1e5, moduli=1e4 * times**-0.25, times=times, deformation="shear")
     data = sweep(truth, np.geomspace(1e-2, 1e7, 120), 0.03)
@@ -295,12 +295,12 @@ def test_regularisation_tames_more_terms_than_the_data_can_tell():
         ({"elements": 4, "times": "log"}, "wanted more points"),
     ],
 )
-def test_what_cannot_be_fitted_is_refused(change, match):
+def test_fit_arguments_outside_their_range_are_refused(change, match):
     with pytest.raises(ValueError, match=match):
         fit(sweep(TABLE_S1, np.array([1.0, 10.0])), **change)
 
 
-def test_other_refusals():
+def test_zero_loss_creep_equilibrium_single_point_and_invalid_spectra_are_refused():
     zero = replace(sweep(TABLE_S1, MASTER), loss=np.zeros(len(MASTER)))
     with pytest.raises(ValueError, match=r"loss modulus 0 Pa at 0\.01 rad/s"):
         fit(zero)
@@ -326,7 +326,7 @@ def test_other_refusals():
 
 
 # ---------------------------------------------------------------------------------------------------- measured curves
-def test_the_master_curve_that_pyvisco_publishes():
+def test_error_norm_on_published_master_curve_below_pyvisco_with_half_its_terms():
     data = master_curve(
         "dma-nrel-polymer/freq_user_master.csv", 2, 1e6, temperature=-5.0, deformation="tension"
     )  # MPa over Hz
@@ -340,7 +340,7 @@ def test_the_master_curve_that_pyvisco_publishes():
     assert 11 < best.floor < best.error < 1.2 * best.floor  # storage and loss contradict each other by that much
 
 
-def test_a_melts_master_curve_without_equilibrium_term():
+def test_plateau_modulus_of_polyisoprene_melt_is_0_3_to_0_5_mpa():
     name = "rheology-polyisoprene-tts/master_curves_reference/PI_634.5k_T-35.tts"
     data = master_curve(name, 1, 1.0, temperature=-35.0, deformation="shear")
     found = fit(data, equilibrium=False)

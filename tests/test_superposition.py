@@ -53,7 +53,7 @@ def spread(values):
 
 
 @pytest.mark.parametrize("reference", [20.0, 17.0])
-def test_shifts_are_found_and_their_errors_are_true(reference):
+def test_horizontal_shift_factors_match_wlf_within_standard_errors(reference):
     truth = LAW.at(reference).log_a(TEMPERATURES)
     off, steps, quality = [], [], []
     for seed in range(10):
@@ -71,7 +71,7 @@ def test_shifts_are_found_and_their_errors_are_true(reference):
     assert shift.noise == pytest.approx((0.004, 0.008), rel=0.3)
 
 
-def test_errors_grow_from_the_reference_outwards_and_with_the_noise():
+def test_shift_factor_errors_grow_with_distance_from_reference_and_with_noise():
     shift = superpose(sweeps(), reference=6.0)
     at = int(np.argmin(shift.log_a_error))
     assert shift.temperatures[at] == 6.0
@@ -82,7 +82,7 @@ def test_errors_grow_from_the_reference_outwards_and_with_the_noise():
     assert np.abs(quiet.log_a - LAW.at(6.0).log_a(TEMPERATURES)).max() < 0.02
 
 
-def test_vertical_shifts_are_found_with_their_errors():
+def test_vertical_shift_factors_recovered_within_standard_errors():
     truth = np.log10((TEMPERATURES + 273.15) / 293.15)  # an ideal rubber, upside down: b_T = T / Tr
     off_a, off_b = [], []
     for seed in range(6):
@@ -94,7 +94,7 @@ def test_vertical_shifts_are_found_with_their_errors():
     assert 0.6 < spread(off_b) < 1.5
 
 
-def test_relaxation_tests_are_superposed_too():
+def test_shift_factors_recovered_from_relaxation_moduli():
     rng = np.random.default_rng(0)
     time, some = np.geomspace(0.01, 10, 500), TEMPERATURES[1::2]  # more points than the search takes
     curves = [
@@ -114,7 +114,7 @@ def test_relaxation_tests_are_superposed_too():
     assert spread(np.log10(whole.modulus / relaxation(whole.time))) < 0.006
 
 
-def test_a_compliance_is_divided_by_its_vertical_shift():
+def test_vertical_shift_factor_divides_creep_compliance():
     rng = np.random.default_rng(0)
     time, some = np.geomspace(0.01, 10, 20), TEMPERATURES[1::2]
     truth = np.linspace(-0.02, 0.02, len(some))
@@ -134,7 +134,7 @@ def test_a_compliance_is_divided_by_its_vertical_shift():
     assert spread(np.log10(whole.compliance * relaxation(whole.time)) - truth[2]) < 0.01
 
 
-def test_the_master_curve_is_the_curve_that_the_sweeps_were_cut_from():
+def test_master_curve_matches_moduli_from_which_sweeps_were_sampled():
     curves = sweeps(storage=0.0, loss=0.0)
     exact = Shift(temperatures=TEMPERATURES, log_a=LAW.log_a(TEMPERATURES), reference=20.0)
     whole = master(curves[::-1], exact)
@@ -145,7 +145,7 @@ def test_the_master_curve_is_the_curve_that_the_sweeps_were_cut_from():
     assert whole.omega[-1] / whole.omega[0] > 1e8
 
 
-def test_units_and_reference_do_not_change_the_steps():
+def test_differences_of_log_a_independent_of_units_and_reference_temperature():
     curves = sweeps()
     plain = superpose(curves, reference=20.0)
     scaled = [replace(c, omega=c.omega * 60, storage=c.storage / 7, loss=c.loss / 7) for c in curves[::-1]]
@@ -158,7 +158,7 @@ def test_units_and_reference_do_not_change_the_steps():
 # ----------------------------------------------------------------------------------------- curves that do not superpose
 
 
-def test_a_gap_is_bridged_with_a_larger_and_true_error():
+def test_shift_across_frequency_gap_lies_within_its_larger_standard_error():
     few, off = TEMPERATURES[[0, 1, 2, 3, 7, 8]], []  # 28 K and 3 decades from 6 to 34 deg C, more than a sweep has
     for seed in range(6):
         shift = superpose(sweeps(seed, temperatures=few), reference=34.0)
@@ -171,7 +171,7 @@ def test_a_gap_is_bridged_with_a_larger_and_true_error():
     assert 0.4 < spread(off) < 1.6
 
 
-def test_curves_of_incomparable_height_are_told_by_their_quality():
+def test_overlap_quality_above_2_for_sweeps_with_random_height_errors():
     rng = np.random.default_rng(1)
     bad = []
     for curve in sweeps():
@@ -184,7 +184,7 @@ def test_curves_of_incomparable_height_are_told_by_their_quality():
     assert np.median(shift.log_a_error) > 2 * np.median(good.log_a_error)
 
 
-def test_one_modulus_alone_or_no_misfit():
+def test_shift_factors_from_one_modulus_or_zero_discrepancy_match_wlf():
     curves = sweeps()
     for options in ({"moduli": "storage"}, {"moduli": "loss"}, {"misfit": 0.0}):
         shift = superpose(curves, reference=20.0, **options)
@@ -194,7 +194,7 @@ def test_one_modulus_alone_or_no_misfit():
             assert set(shift.misfit) == {0.0}
 
 
-def test_an_outlier_moves_little():
+def test_shift_factors_robust_to_one_outlier_of_30_percent():
     clean, curves = superpose(sweeps(), reference=20.0), sweeps()
     curves[4] = replace(curves[4], storage=curves[4].storage * np.where(np.arange(10) == 6, 1.3, 1.0))
     assert np.abs(superpose(curves, reference=20.0).log_a - clean.log_a).max() < 1.5 * clean.log_a_error.max()
@@ -204,7 +204,7 @@ def test_an_outlier_moves_little():
 
 
 @given(C1=st.floats(3, 30), C2=st.floats(30, 300), reference=st.floats(-10, 40), other=st.floats(-10, 40))
-def test_wlf_is_found_again_and_moved_to_another_reference(C1, C2, reference, other):
+def test_wlf_constants_recovered_and_converted_to_another_reference_temperature(C1, C2, reference, other):
     law = Wlf(C1=C1, C2=C2, reference=reference)
     temperatures = np.linspace(max(-12.0, reference - 0.9 * C2), 60, 9)
     found = wlf(Shift(temperatures=temperatures, log_a=law.log_a(temperatures), reference=reference))
@@ -216,7 +216,7 @@ def test_wlf_is_found_again_and_moved_to_another_reference(C1, C2, reference, ot
     assert (moved.at(reference).C1, moved.at(reference).C2) == pytest.approx((C1, C2))
 
 
-def test_the_errors_of_wlf_are_true():
+def test_wlf_standard_errors_match_scatter_of_estimates():
     # Steps with errors of their own: those of the shifts accumulate, and so correlate, away from the reference.
     rng = np.random.default_rng(0)
     sigma = np.full(len(TEMPERATURES) - 1, 0.03)
@@ -233,7 +233,7 @@ def test_the_errors_of_wlf_are_true():
     assert 0.7 < spread(off) < 1.2
 
 
-def test_wlf_of_superposed_sweeps():
+def test_wlf_constants_from_superposed_sweeps_within_standard_errors():
     shift = superpose(sweeps(3), reference=20.0)
     found = wlf(shift)
     assert found.C1 == pytest.approx(9.0, abs=4 * found.C1_error)
@@ -242,7 +242,7 @@ def test_wlf_of_superposed_sweeps():
     assert arrhenius(shift).quality > 5  # the law is not of this kind
 
 
-def test_arrhenius_is_found_again():
+def test_activation_energy_recovered_from_arrhenius_shift_factors():
     law, temperatures = Arrhenius(activation_energy=8e4, reference=25.0), np.array([0.0, 20, 25, 50])
     assert float(law.log_a(0.0)) == pytest.approx(8e4 / (8.314462618 * np.log(10)) * (1 / 273.15 - 1 / 298.15))
     found = arrhenius(Shift(temperatures=temperatures, log_a=law.log_a(temperatures), reference=25.0))
@@ -270,17 +270,17 @@ def curve(temperature, **change):
         ([curve(0.0, omega=[1e5, 1e6, 1e7]), curve(10.0)], {}, "curves at 0 and 10 deg C: the colder would have to"),
     ],
 )  # fmt: skip
-def test_superpose_refuses(curves, options, message):
+def test_superpose_refuses_invalid_curves_and_options(curves, options, message):
     with pytest.raises(ValueError, match=message):
         superpose(curves, **{"reference": 5.0, **options})
 
 
-def test_laws_and_shifts_refuse():
+def test_wlf_arrhenius_and_shift_refuse_invalid_numbers():
     with pytest.raises(ValueError, match="wanted above -70 deg C, Tr - C2"):
         LAW.log_a(-70.0)
     with pytest.raises(ValueError, match="reference = -71: wanted above -70"):
         LAW.at(-71)
-    with pytest.raises(ValueError, match="wanted over 2, apart from the reference"):
+    with pytest.raises(ValueError, match="wanted more than 2 besides the reference"):
         wlf(Shift(temperatures=np.array([0.0, 10, 20]), log_a=np.array([2.0, 1, 0]), reference=20.0))
     with pytest.raises(ValueError, match="wanted falling with temperature"):
         wlf(Shift(temperatures=np.arange(4.0), log_a=np.arange(4.0), reference=0.0))
@@ -292,7 +292,7 @@ def test_laws_and_shifts_refuse():
         master([curve(0.0)], Shift(temperatures=np.array([5.0]), log_a=np.zeros(1), reference=5.0))
 
 
-def test_a_list_of_shift_factors(tmp_path):
+def test_read_shift_converts_units_sorts_and_finds_reference(tmp_path):
     path = tmp_path / "shift.csv"
     path.write_text("T,log_aT\nC, -\n20,-2\n0,2\n10,1\n")
     shift = read_shift(path)
@@ -308,7 +308,7 @@ def test_a_list_of_shift_factors(tmp_path):
 
 @recordings
 @pytest.mark.parametrize(("file", "molar_mass"), [("PI_226k_sweeps.csv", 225.9), ("PI_635k_sweeps.csv", 634.5)])
-def test_polyisoprene_has_the_shifts_of_its_authors(file, molar_mass):
+def test_polyisoprene_shift_factors_within_0_1_decades_of_published_law(file, molar_mass):
     # Header of their master curves: log10 a_T = -C1 (T - Tr + c) / (C2 + T + c), T in deg C, c = 14.65 / molar mass;
     # b_T = rho Tr / (rho T), rho = 0.928 - 0.61e-3 T.
     curves = read(Path(RECORDINGS) / "rheology-polyisoprene-tts" / file)
@@ -325,7 +325,7 @@ def test_polyisoprene_has_the_shifts_of_its_authors(file, molar_mass):
 
 
 @recordings
-def test_polystyrene_has_the_shifts_of_plazek():
+def test_polystyrene_creep_shift_factors_within_0_1_decades_rms_of_plazek():
     curves = read(Path(RECORDINGS) / "creep-polystyrene-plazek" / "plazek_long.csv", deformation="shear")
     shift = superpose(curves, reference=100.0)
     off = shift.log_a - Wlf(C1=10.7, C2=29.9, reference=100.0).log_a(shift.temperatures)
@@ -337,7 +337,7 @@ def test_polystyrene_has_the_shifts_of_plazek():
 
 
 @recordings
-def test_an_adhesive_has_its_published_shifts_where_they_are_known(checks):
+def test_adhesive_shift_factors_within_0_15_decades_rms_of_published_where_determined(checks):
     folder = Path(RECORDINGS) / "dma-nrel-polymer"
     (whole,) = read(folder / "freq_user_master.csv")
     published = read_shift(folder / "freq_user_master__shift_factors.csv")
@@ -351,7 +351,7 @@ def test_an_adhesive_has_its_published_shifts_where_they_are_known(checks):
 
 
 @recordings
-def test_the_storage_modulus_alone_gives_the_instruments_shifts_and_its_wlf(checks):
+def test_wlf_constants_from_storage_modulus_alone_match_instrument_within_2_standard_errors(checks):
     pytest.importorskip("python_calamine", reason="reads workbooks")
     book = Path(RECORDINGS) / "dma-nrel-polymer" / "freq_Eplexor_master.xls"
     published = read_shift(book, columns={"temperature": "Temp.", "log_a": "Shift"}, units={"temperature": "C"})
@@ -367,7 +367,7 @@ def test_the_storage_modulus_alone_gives_the_instruments_shifts_and_its_wlf(chec
 
 
 @recordings
-def test_where_published_shifts_are_off_the_curves_do_not_lie_on_each_other():
+def test_storage_modulus_mismatch_below_30_percent_of_that_with_published_raw_shifts():
     # The list that goes with the raw sweeps differs by more than it should; this is why.
     folder = Path(RECORDINGS) / "dma-nrel-polymer"
     curves = read(folder / "freq_user_raw.csv")

@@ -1,13 +1,15 @@
-"""How likely it is that shifted curves are pieces of one: a Gaussian process for each modulus.
+"""Likelihood of time-temperature shift factors: a Gaussian process of the master curve of each modulus.
 
 With x = log10 of frequency and y = log10 of a modulus, curve k is
 
     y_k(x) = f(x + log10 a_k) - log10 b_k + d_k(x) + noise
 
-where f, the master curve, is smooth (Matern 5/2, 2 decades high, of unknown length), d_k is by how much curve k is no
-piece of it (unknown height, one decade long), and the noise is white. The three unknown numbers of a modulus and the
-shifts are those under which the data are most likely, so that smoothness is not tuned by hand. Rasmussen and Williams,
-Gaussian Processes for Machine Learning, 2006, Eqs. 2.30 and 5.9.
+where a_k and b_k are the horizontal and vertical shift factors, f is the master curve (Matern 5/2 kernel, standard
+deviation 2 decades, length scale estimated), d_k is the discrepancy of curve k from the master curve (squared
+exponential kernel, length scale 1 decade, standard deviation, called misfit, estimated), and the noise is white
+(standard deviation estimated). Shifts and the three hyperparameters of each modulus maximise the likelihood; no
+smoothing parameter is set by hand. Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, Eqs. 2.30 and
+5.9.
 """
 
 from __future__ import annotations
@@ -21,31 +23,31 @@ from scipy.optimize import minimize
 
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 
-HEIGHT = 2.0  # of the master curve, standard deviation [decades]
-MISFIT_LENGTH = 1.0  # over which a curve's departure from the master curve stays the same [decades of frequency]
-FLOOR = 3e-4  # noise that no rheometer is below [decades]
-START = np.log([3e-3, 5.0, 0.01])  # noise [decades], length [decades of frequency], misfit [decades]
+HEIGHT = 2.0  # prior standard deviation of the master curve [decades of modulus]
+MISFIT_LENGTH = 1.0  # length scale of the discrepancy from the master curve [decades of frequency]
+FLOOR = 3e-4  # lower bound of the noise standard deviation: resolution of a rheometer [decades]
+START = np.log([3e-3, 5.0, 0.01])  # initial noise [decades], length scale [decades of frequency], misfit [decades]
 BOUNDS = [(np.log(1e-5), np.log(0.3)), (0.0, np.log(100.0)), (np.log(1e-6), np.log(0.3))]
-OUTLIER = 2.5  # standard deviations off its own curve, from where a point counts less
-GAP = 0.5  # that neighbouring curves may leave between them [decades]
-MOST = 40  # points of a curve; more are averaged
-SAME = 1.0  # of temperatures closer than this the shift may grow with temperature [K]
-GRID = 0.05  # of the first guess of a step [decades]
+OUTLIER = 2.5  # leave-one-out residual in standard deviations above which the weight of a point is reduced
+GAP = 0.5  # largest gap in frequency between neighbouring shifted curves [decades]
+MOST = 40  # largest number of points of a curve; curves with more are averaged in bins
+SAME = 1.0  # temperature difference below which log10 a_T is not required to fall with temperature [K]
+GRID = 0.05  # spacing of the grid of initial horizontal steps [decades]
 VERTICAL = 0.3  # largest vertical step [decades]
-ROUNDS = 12  # of steps and hyperparameters in turn, at most
+ROUNDS = 12  # largest number of alternations between shifts and hyperparameters
 _NONE = np.log(1e-7)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Channel:
-    """One modulus of all curves.
+    """Values of one modulus (storage, loss, relaxation) or of the compliance on all curves.
 
     Attributes:
         x: log10 of frequency, as measured [n].
-        y: log10 of the modulus, less the mean [n].
-        curve: Number of the curve of each point [n].
-        weight: Noise variance of each point, relative to the common one [n].
-        hyper: Natural logarithms of noise, length and misfit [3].
+        y: log10 of the modulus minus its mean over all points [n].
+        curve: Index of the curve of each point [n].
+        weight: Noise variance of each point over the common noise variance [n].
+        hyper: Natural logarithms of noise, length scale and misfit [3].
     """
 
     x: np.ndarray
@@ -55,27 +57,27 @@ class Channel:
     hyper: np.ndarray = field(default_factory=START.copy)
 
     def part(self, *curves: int) -> Channel:
-        """The points of some curves."""
+        """Points of the given curves."""
         keep = np.isin(self.curve, curves)
         return replace(self, x=self.x[keep], y=self.y[keep], curve=self.curve[keep], weight=self.weight[keep])
 
     def departure(self) -> np.ndarray:
-        """Correlation of the departures from the master curve [n, n]."""
+        """Correlation matrix of the discrepancy from the master curve [n, n]."""
         near = np.exp(-0.5 * ((self.x[:, None] - self.x) / MISFIT_LENGTH) ** 2)
         return np.where(self.curve[:, None] == self.curve, near, 0.0)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class State:
-    """The process of one modulus at given shifts: n points of covariance K and height y.
+    """Gaussian process of one modulus at given shifts: n points with covariance K and values y.
 
     Attributes:
-        value: Negative logarithm of the likelihood, less a constant.
+        value: Negative log likelihood up to a constant.
         inverse: K^-1 [n, n].
-        pull: K^-1 y [n], the derivative of ``value`` by y.
-        by_x: Derivative of ``value`` by the shifted frequency of each point [n].
-        slope: Slope of the master curve at each point [n].
-        parts: dK by the logarithms of noise, length and misfit [3, n, n].
+        pull: K^-1 y [n], the derivative of ``value`` with respect to y.
+        by_x: Derivative of ``value`` with respect to log10 of the shifted frequency of each point [n].
+        slope: Posterior mean slope d log10 modulus / d log10 frequency of the master curve at each point [n].
+        parts: Derivatives of K with respect to the logarithms of noise, length scale and misfit [3, n, n].
     """
 
     value: float
@@ -86,20 +88,24 @@ class State:
     parts: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     def by_hyper(self, by_covariance: np.ndarray | None = None) -> np.ndarray:
-        """Derivative by the hyperparameters [3] of what has this derivative by K; of ``value`` if None."""
+        """Derivative with respect to the hyperparameters [3] by the chain rule.
+
+        Args:
+            by_covariance: Derivative of a scalar with respect to K [n, n]; that of ``value`` if None.
+        """
         if by_covariance is None:
             by_covariance = 0.5 * (self.inverse - np.outer(self.pull, self.pull))
         return np.array([(by_covariance * part).sum() for part in self.parts])
 
 
 def process(channel: Channel, x: np.ndarray, y: np.ndarray, hyper: np.ndarray, departure: np.ndarray) -> State:
-    """The process of one modulus.
+    """Evaluate the Gaussian process of one modulus and its derivatives.
 
     Args:
-        channel: The points.
-        x: Their frequencies after the shift, log10 [n].
-        y: Their moduli after the shift, log10 [n].
-        hyper: Logarithms of noise, length and misfit [3].
+        channel: Points.
+        x: log10 of the shifted frequencies [n].
+        y: log10 of the shifted moduli [n].
+        hyper: Natural logarithms of noise, length scale and misfit [3].
         departure: ``channel.departure()``.
     """
     noise, length, misfit = np.exp(hyper)
@@ -108,12 +114,12 @@ def process(channel: Channel, x: np.ndarray, y: np.ndarray, hyper: np.ndarray, d
     decay = HEIGHT**2 * np.exp(-r)
     bend = 5 / 3 * (1 + r) * decay * h
     covariance = (1 + r + r * r / 3) * decay + misfit**2 * departure
-    covariance += 10 * HEIGHT**2  # the height of the whole is free
+    covariance += 10 * HEIGHT**2  # wide prior of the mean level
     covariance[np.diag_indices(len(x))] += (noise**2 + FLOOR**2) * channel.weight
     factor = cho_factor(covariance, lower=True)
     inverse = cho_solve(factor, np.eye(len(x)))
     pull = inverse @ y
-    rise = -bend / length  # of K by x of its row
+    rise = -bend / length  # derivative of K with respect to x of its row
     return State(
         value=float(0.5 * y @ pull + np.log(np.diag(factor[0])).sum()),
         inverse=inverse,
@@ -130,11 +136,15 @@ def abscissa(curve: Sweep | Relaxation | Creep) -> np.ndarray:
 
 
 def channels_of(curves: Sequence[Sweep | Relaxation | Creep], moduli: str) -> list[Channel]:
-    """The moduli of all curves, as decades; zeros of a loss modulus are left out, many points averaged."""
+    """log10 of each modulus of all curves, binned by :func:`_thin`; points of zero loss modulus are omitted.
+
+    Raises:
+        ValueError: for an unknown ``moduli``, or fewer than three positive values on a curve.
+    """
     if moduli not in ("both", "storage", "loss"):
         raise ValueError(f'moduli = {moduli!r}: wanted "both", "storage" or "loss"')
     if moduli != "both" and not isinstance(curves[0], Sweep):
-        raise ValueError(f'moduli = {moduli!r}: wanted "both", as {type(curves[0]).__name__} has but one')
+        raise ValueError(f'moduli = {moduli!r}: wanted "both", since {type(curves[0]).__name__} has a single one')
     channels = []
     for name in curves[0].ordinates if moduli == "both" else (moduli,):
         x, y, number = [], [], []
@@ -160,7 +170,7 @@ def channels_of(curves: Sequence[Sweep | Relaxation | Creep], moduli: str) -> li
 
 
 def _thin(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Means over equal parts of the range of x, if there are more points than need be."""
+    """Means over ``MOST`` bins of equal width in x, for curves of more than ``MOST`` points."""
     if len(x) <= MOST:
         return x, y
     part = np.minimum((x - x.min()) / np.ptp(x) * MOST, MOST - 1).astype(int)
@@ -171,21 +181,32 @@ def _thin(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def window(channels: list[Channel], temperatures: np.ndarray, i: int) -> tuple[float, float]:
-    """How far curve i may be shifted relative to the next: not apart, nor against temperature."""
+    """Bounds of the horizontal step from curve i to curve i + 1 [decades].
+
+    The gap between the shifted curves is at most ``GAP``; log10 a_T does not increase with temperature where the
+    temperatures differ by at least ``SAME``.
+
+    Raises:
+        ValueError: if no step satisfies both.
+    """
     cold, hot = (np.concatenate([c.x[c.curve == k] for c in channels]) for k in (i, i + 1))
     low, high = hot.min() - cold.max() - GAP, hot.max() - cold.min() + GAP
     if temperatures[i + 1] - temperatures[i] >= SAME:
         low = max(low, 0.0)
     if low >= high:
         raise ValueError(
-            f"curves at {temperatures[i]:.4g} and {temperatures[i + 1]:.4g} deg C: the colder would have to be shifted "
-            f"by {high:.3g} decades or less to meet the hotter; wanted a shift factor that falls with temperature"
+            f"curves at {temperatures[i]:.4g} and {temperatures[i + 1]:.4g} deg C: overlap needs log10 a_T of the "
+            f"colder minus that of the hotter <= {high:.3g} decades; wanted a shift factor that falls with temperature"
         )
     return float(low), float(high)
 
 
 def roughness(channel: Channel) -> Channel:
-    """Estimate noise and length from the curves' own roughness, each by itself, and give outliers less weight."""
+    """Estimate noise and length scale from each curve separately, and increase the noise variance of outliers.
+
+    Weights are iterated: a leave-one-out residual above ``OUTLIER`` standard deviations multiplies the variance of its
+    point by the squared ratio.
+    """
     curves = [channel.part(k) for k in np.unique(channel.curve)]
     none = [np.zeros((len(c.x), len(c.x))) for c in curves]
 
@@ -214,7 +235,13 @@ def roughness(channel: Channel) -> Channel:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solution:
-    """Steps as in :class:`Alignment` [count], their covariance, and noise, length and misfit of each channel [c, 3]."""
+    """Result of :meth:`Alignment.solve`.
+
+    Attributes:
+        steps: Horizontal, then vertical steps between neighbouring curves [count] decades.
+        covariance: Covariance of the steps [count, count].
+        hypers: Noise, length scale and misfit of each channel [c, 3].
+    """
 
     steps: np.ndarray
     covariance: np.ndarray
@@ -223,20 +250,20 @@ class Solution:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Alignment:
-    """The search for the most likely steps from each curve to the next hotter one.
+    """Maximum-likelihood steps of the shift factors from each curve to the next hotter one.
 
-    The unknowns are the horizontal steps [m] between m + 1 curves, the vertical ones [m] if sought, and the channels'
-    hyperparameters. Steps make the bounds simple: neighbours have to stay near each other, others need not. Steps and
-    hyperparameters are improved in turn, the former by the likelihood, the latter by the restricted likelihood, which
-    knows that the steps are fitted (Patterson and Thompson, Biometrika 58 (1971) 545); without it the misfit, which
-    shifts can mimic, would come out too small, and so would the errors.
+    The unknowns are the horizontal steps [m] between m + 1 curves, the vertical steps [m] if ``vertical``, and the
+    hyperparameters of each channel. Steps of neighbours are used instead of shifts since their bounds are independent.
+    Steps maximise the likelihood and hyperparameters the restricted likelihood, in alternation. The latter accounts for
+    the fitted steps (Patterson and Thompson, Biometrika 58 (1971) 545); the plain likelihood underestimates the misfit,
+    which shifts can absorb, and with it the standard errors.
 
     Attributes:
         channels: As from :func:`roughness`.
         windows: Bounds of each horizontal step [decades].
-        vertical: Seek vertical steps.
-        misfit: Given misfit [decades], or None to estimate it.
-        sign: 1 for moduli, -1 for compliances, which a vertical shift divides.
+        vertical: Whether vertical steps are estimated.
+        misfit: Standard deviation of the discrepancy [decades]; estimated if None.
+        sign: 1 for moduli, which b_T multiplies; -1 for compliances, which b_T divides.
     """
 
     channels: list[Channel]
@@ -247,18 +274,18 @@ class Alignment:
 
     @property
     def sums(self) -> np.ndarray:
-        """What makes shifts of steps, the coldest curve's being 0 [m + 1, m]."""
+        """Matrix from steps to shifts relative to the coldest curve [m + 1, m]."""
         m = len(self.windows)
         return -np.tril(np.ones((m + 1, m)), -1)
 
     @property
     def bounds(self) -> np.ndarray:
-        """Bounds of all steps [count, 2]."""
+        """Lower and upper bounds of all steps [count, 2] decades."""
         vertical = [(-VERTICAL, VERTICAL)] * (len(self.windows) if self.vertical else 0)
         return np.array([*self.windows, *vertical])
 
     def solve(self, progress: Callable[[float], object]) -> Solution:
-        """Search from the guesses that neighbouring curves give by themselves."""
+        """Estimate steps, covariance and hyperparameters, starting from the best step of each pair of neighbours."""
         m = len(self.windows)
         hypers = np.array([channel.hyper for channel in self.channels])
         bounds = BOUNDS
@@ -300,20 +327,20 @@ class Alignment:
         return Solution(steps=steps, hypers=np.exp(hypers), covariance=np.linalg.inv(information))
 
     def _shifted(self, steps: np.ndarray, channel: Channel) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies and moduli of a channel after the shift."""
+        """log10 of the shifted frequencies and moduli of a channel."""
         m, k = len(self.windows), channel.curve
         y = channel.y + self.sign * (self.sums @ steps[m:])[k] if self.vertical else channel.y
         return channel.x + (self.sums @ steps[:m])[k], y
 
     def _states(self, steps: np.ndarray, hypers: np.ndarray, departures: list[np.ndarray]) -> list[State]:
-        """The process of each channel."""
+        """Gaussian process of each channel."""
         each = zip(self.channels, hypers, departures, strict=True)
         return [process(c, *self._shifted(steps, c), hyper, departure) for c, hyper, departure in each]
 
     def _objective(
         self, steps: np.ndarray, hypers: np.ndarray, departures: list[np.ndarray]
     ) -> tuple[float, np.ndarray]:
-        """Negative logarithm of the likelihood, and its gradient by the steps."""
+        """Negative log likelihood, and its gradient with respect to the steps."""
         states = self._states(steps, hypers, departures)
         count = len(self.windows) + 1
         each = list(zip(self.channels, states, strict=True))
@@ -323,7 +350,7 @@ class Alignment:
         return sum(state.value for state in states), gradient
 
     def _effects(self, steps: np.ndarray, hypers: np.ndarray, departures: list[np.ndarray]) -> list[np.ndarray]:
-        """What a change of each step does to the moduli of each channel [n, count]; nothing at a bound."""
+        """Derivative of the moduli of each channel with respect to the steps [n, count]; zero for steps at a bound."""
         free = np.abs(steps[:, None] - self.bounds).min(1) > 1e-6
         effects = []
         for channel, state in zip(self.channels, self._states(steps, hypers, departures), strict=True):
@@ -333,14 +360,14 @@ class Alignment:
         return effects
 
     def _information(self, states: list[State], effects: list[np.ndarray]) -> np.ndarray:
-        """Inverse covariance of the steps: of a step of which the data say nothing that of its window."""
+        """Inverse covariance of the steps; an undetermined step has the variance of a uniform one over its bounds."""
         window = np.diag(12 / np.ptp(self.bounds, axis=1) ** 2)
         return window + sum(effect.T @ state.inverse @ effect for state, effect in zip(states, effects, strict=True))
 
     def _restricted(
         self, hypers: np.ndarray, steps: np.ndarray, effects: list[np.ndarray], departures: list[np.ndarray]
     ) -> tuple[float, np.ndarray]:
-        """Negative logarithm of the restricted likelihood, and its gradient by the hyperparameters."""
+        """Negative log restricted likelihood, and its gradient with respect to the hyperparameters."""
         states = self._states(steps, hypers.reshape(-1, 3), departures)
         information = self._information(states, effects)
         covariance = np.linalg.inv(information)
@@ -352,7 +379,7 @@ class Alignment:
         return float(value), np.concatenate(gradient)
 
     def _guess(self, i: int) -> float:
-        """The likeliest step from curve i to the next, of a grid and from these two alone."""
+        """Most likely horizontal step from curve i to curve i + 1 on a grid, from these two curves alone."""
         low, high = self.windows[i]
         grid = np.linspace(low, high, max(2, round((high - low) / GRID)))
         total = np.zeros(len(grid))

@@ -1,8 +1,8 @@
-"""From a material to the simulator: which Maxwell elements a time step bears, what the others cost, what is lost.
+"""Selection of Maxwell elements for a time step: stability, cost, and error of storage and loss modulus.
 
-Elements are numbered from the slowest, as in Table S1 of the paper. A fast element is stiff, and the stable step falls
-with stiffness; but with the exact-exponential update an element much faster than the step is felt with
-g b 2 / (1 + a), not with g (see :meth:`torchsoro.simulation.material.Prony.step_moduli`).
+Elements are numbered from the slowest, as in Table S1 of the paper. A fast element reduces the stable step. With the
+exact-exponential update, the effective modulus of an element at the highest resolved frequency is
+g 2 b / (1 + a) instead of g (see :meth:`torchsoro.simulation.material.Prony.step_moduli`).
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from torchsoro.rheology.stability import Formulation, courant_number, felt_share
 from torchsoro.simulation.material import Prony, Solid
 from torchsoro.simulation.stability import STABLE_COURANT
 
-MOST = 5  # elements that the simulator takes
-_POINTS = 40  # to a decade of the band, on which losses are looked for
+MOST = 5  # largest number of elements in the simulator
+_POINTS = 40  # frequencies per decade at which errors over the band are evaluated
 
 
 @dataclass(frozen=True, kw_only=True)
 class Element:
-    """One Maxwell element beside those that are slower; number 0 is the equilibrium spring alone.
+    """Series of Maxwell elements up to and including one; number 0 is the equilibrium spring alone.
 
     Attributes:
-        number: Counted from the slowest, as in Table S1.
-        time: Relaxation time [s].
-        modulus: Over the equilibrium modulus.
-        felt: What an oscillation that changes sign at every step feels of it, g b 2 / (1 + a).
+        number: Number of the fastest element of the series, counted from the slowest, as in Table S1.
+        time: Relaxation time of that element [s].
+        modulus: Its modulus over the equilibrium modulus.
+        felt: Its effective modulus for an oscillation that changes sign at every step, g 2 b / (1 + a).
         courant: Courant number of the step with this element and all slower ones.
-        stable: Whether that is within ``torchsoro.simulation.material.STABLE_COURANT``.
-        step: Largest stable step [s] with this element and all slower ones.
-        cost: Number of steps at that step over the number at the step asked for; 1 or less if it is stable.
-        storage_lost: Largest share of the storage modulus that the band loses without this and all faster ones.
-        loss_lost: The same of the loss modulus.
+        stable: Whether ``courant`` is at most ``torchsoro.simulation.stability.STABLE_COURANT``.
+        step: Largest stable step with this element and all slower ones [s].
+        cost: Number of steps at ``step`` over that at the given step; 1 or less if stable.
+        storage_lost: Largest relative loss of storage modulus over the band without this and all faster elements.
+        loss_lost: Largest relative loss of loss modulus, likewise.
     """
 
     number: int
@@ -58,19 +58,19 @@ class Element:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Material:
-    """Maxwell elements for the simulator, in place of a longer or stiffer series.
+    """Reduced Prony series for the simulator, which replaces a longer or stiffer one.
 
     Attributes:
-        name: How it came about.
-        moduli: Over the equilibrium modulus [M], the slowest element first.
+        name: Method of reduction.
+        moduli: Moduli over the equilibrium modulus [M], the slowest element first.
         times: Relaxation times [M] s.
-        viscosity: Shear viscosity beside the elements [Pa s], for ``Body.viscosity``.
+        viscosity: Additional shear viscosity [Pa s], for ``Body.viscosity``.
         step: Largest stable step [s].
         storage_error: Largest relative difference of the storage modulus from the full series over the band.
         loss_error: The same of the loss modulus.
-        good: Lowest and highest angular frequency [rad/s] between which, around the middle of the band, both are within
-            10 %; 0 and inf where no end is found within a factor of 1e6 of the band.
-        sentence: All this in words.
+        good: Lowest and highest angular frequency [rad/s] of the interval around the centre of the band in which both
+            moduli are within 10 %; 0 and inf where no end lies within a factor of 1e6 of the band.
+        sentence: Summary of these numbers.
     """
 
     name: str
@@ -84,7 +84,7 @@ class Material:
     sentence: str
 
     def prony(self) -> Prony:
-        """For the simulator; the viscosity is not in it.
+        """Prony series for the simulator, without the viscosity.
 
         Raises:
             ValueError: for more than five elements.
@@ -92,7 +92,7 @@ class Material:
         return Prony(moduli=torch.from_numpy(self.moduli.copy()), times=torch.from_numpy(self.times.copy()))
 
     def row(self) -> dict[str, float | str]:
-        """For a table."""
+        """Row of a table: name, stable step, errors and valid frequencies."""
         return {
             "material": self.name,
             "elements": len(self.moduli),
@@ -107,16 +107,16 @@ class Material:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Budget:
-    """What a step bears.
+    """Stability and error of each Maxwell element at a given time step.
 
     Attributes:
-        dt: Step [s].
-        cell: Grid cell [m].
-        formulation: Form of the simulator.
-        band: Lowest and highest angular frequency [rad/s] that the robot sees.
-        solid: The solid.
+        dt: Time step [s].
+        cell: Edge of a grid cell [m].
+        formulation: Formulation of the simulator.
+        band: Lowest and highest angular frequency of the robot's motion [rad/s].
+        solid: Equilibrium solid.
         elements: The equilibrium spring, then the elements from the slowest.
-        sentence: What is stable, what the rest costs, what leaving it out loses.
+        sentence: Unstable elements, their cost, and the error without them, in words.
     """
 
     dt: float
@@ -129,12 +129,12 @@ class Budget:
 
     @property
     def stable(self) -> int:
-        """Number of stable elements, counted from the slowest."""
+        """Number of elements, counted from the slowest, that are stable at the step."""
         return sum(e.stable for e in self.elements[1:])
 
     @property
     def moduli(self) -> np.ndarray:
-        """Of all elements over the equilibrium modulus [M], the slowest first."""
+        """Moduli of all elements over the equilibrium modulus [M], the slowest first."""
         return np.array([e.modulus for e in self.elements[1:]])
 
     @property
@@ -170,17 +170,17 @@ def budget(
     dt: float | Literal["auto"] = "auto",
     formulation: Formulation = "updated",
 ) -> Budget:
-    """Tell for every Maxwell element whether a step is stable with it, what it costs, and what is lost without it.
+    """Evaluate stability, cost and modulus error of each Maxwell element at a time step.
 
-    Only the solid is looked at; chambers may ask for a smaller step (see ``torchsoro.simulation.material.courant``).
+    Only the solid is considered; chambers may need a smaller step (see ``torchsoro.simulation.stability.courant``).
 
     Args:
-        material: Any number of elements.
-        solid: The equilibrium solid, as from ``Spectrum.solid``.
-        cell: Grid cell [m].
-        band: Lowest and highest angular frequency [rad/s] that the robot sees.
-        dt: Step [s]; "auto" for the largest with all elements.
-        formulation: Form of the simulator.
+        material: Prony series of any number of elements.
+        solid: Equilibrium solid, as from ``Spectrum.solid``.
+        cell: Edge of a grid cell [m].
+        band: Lowest and highest angular frequency of the robot's motion [rad/s].
+        dt: Time step [s]; "auto" for the largest stable one with all elements.
+        formulation: Formulation of the simulator.
 
     Raises:
         ValueError: for a spectrum without equilibrium modulus, a batch of materials, or numbers outside their range.
@@ -227,22 +227,21 @@ def budget(
 
 
 def substitutes(budget: Budget, *, match: float) -> list[Material]:
-    """What may stand for the elements that a step does not bear, with what each loses.
+    """Reduced series that replace the elements unstable at the step, with the error of each.
 
     - "all elements": the full series at its own, smaller step.
     - "left out": the stable elements alone, as in the paper.
-    - "lumped": the slowest stable element, or with none the equilibrium spring's neighbour, made stiffer so that the
-      loss modulus at ``match`` is that of the full series.
-    - "viscosity": a plain viscosity with that loss modulus.
-    - "refitted": as many elements as the series has, but at most five, by :func:`choose`.
+    - "lumped": the stable elements, the modulus of the fastest of them increased so that the loss modulus at ``match``
+      equals that of the full series; omitted if no element is stable.
+    - "viscosity": the stable elements and a Newtonian viscosity that restores the loss modulus at ``match``.
+    - "refitted": as many elements as the series has, at most five, by :func:`choose`.
 
     Args:
         budget: As from :func:`budget`.
-        match: Angular frequency [rad/s] at which the loss modulus is matched.
+        match: Angular frequency at which the loss modulus is matched [rad/s].
 
     Returns:
-        The materials; of a series that is stable as it is, that alone, and if it is of more than five elements, the
-        refitted one.
+        The materials. For a stable series only "all elements", and "refitted" if it has more than five elements.
 
     Raises:
         ValueError: if ``match`` is not positive.
@@ -266,14 +265,14 @@ def substitutes(budget: Budget, *, match: float) -> list[Material]:
 
 
 def choose(budget: Budget, *, elements: int = MOST) -> Material:
-    """Few elements for the simulator, stable at the budget's step, with the least relative error over its band.
+    """Refit few elements, stable at the step of the budget, with the least relative error over its band.
 
-    The equilibrium modulus is kept. Relaxation times and moduli are fitted to the full series over the band (Eq. 17c);
-    where that is not stable, to be just as stiff as the step bears.
+    The equilibrium modulus is kept. Relaxation times and moduli are fitted to storage and loss modulus of the full
+    series over the band (Eq. 17c); if the result is unstable, with the stiffness constrained to the stability limit.
 
     Args:
         budget: As from :func:`budget`.
-        elements: Number of elements at most, 1 to 5.
+        elements: Largest number of elements, 1 to 5.
 
     Raises:
         ValueError: if ``elements`` is not 1 to 5, or the step is not stable with the equilibrium spring alone.
@@ -288,7 +287,7 @@ def choose(budget: Budget, *, elements: int = MOST) -> Material:
     omega = _omega(budget.band)
     storage, loss = moduli_over(budget.moduli, budget.times, omega)
     sweep = Sweep(omega=omega, storage=storage, loss=loss, temperature=math.nan, deformation="shear")
-    # A hundred times faster or slower than the band, an element is a dashpot or a spring.
+    # An element a hundred times faster or slower than the band is equivalent to a dashpot or a spring.
     shortest = max(budget.times.min(), 1e-2 / budget.band[1])
     longest = max(min(budget.times.max(), 1e2 / budget.band[0]), 10 * shortest)
     problem = relative_residuals(sweep, 1.0, (shortest, longest))
@@ -303,7 +302,7 @@ def _refitted(budget: Budget, problem: Problem, elements: int) -> Material:
 
 
 def _as_stiff_as_can_be(budget: Budget, problem: Problem) -> Problem:
-    """One more residual, of such weight that the step feels just the stiffness that it bears."""
+    """The problem with one more residual of large weight, which sets the effective stiffness to the stability limit."""
     low, high = 0.0, 1e12
     at = {"dt": budget.dt, "cell": budget.cell, "formulation": budget.formulation}
     while high - low > 1e-6 * high:
@@ -315,7 +314,7 @@ def _as_stiff_as_can_be(budget: Budget, problem: Problem) -> Problem:
     def columns(times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         value, slope = problem.columns(times)
         felt = felt_share(times, budget.dt)
-        change = felt - np.cosh(np.minimum(budget.dt / (2 * times), 300)) ** -2  # by ln(tau)
+        change = felt - np.cosh(np.minimum(budget.dt / (2 * times), 300)) ** -2  # derivative by ln(tau)
         return np.vstack([value, weight * felt]), np.vstack([slope, weight * change])
 
     return replace(problem, columns=columns, target=np.append(problem.target, weight * low * (1 - 1e-4)))
@@ -341,7 +340,7 @@ def _omega(band: tuple[float, float]) -> np.ndarray:
 
 
 def _over(moduli: np.ndarray, full: np.ndarray) -> np.ndarray:
-    """Moduli over those of the full series; 1 where both are zero, as the loss modulus without elements."""
+    """Ratio to the moduli of the full series; 1 where both are zero, as for the loss modulus without elements."""
     return np.divide(moduli, full, out=np.where(moduli > 0, np.inf, 1.0), where=full > 0)
 
 

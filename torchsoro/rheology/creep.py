@@ -1,4 +1,4 @@
-"""From creep to relaxation: the same linear viscoelastic solid or liquid in its two spectra, exactly."""
+"""Exact interconversion of the retardation and relaxation spectra of a linear viscoelastic solid or liquid."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from torchsoro.rheology.leastsquares import Found, Problem
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Relaxing:
-    """A relaxation spectrum: equilibrium modulus and moduli [1 + M] Pa, relaxation times [M] s, the shortest first."""
+    """Relaxation spectrum: equilibrium modulus and moduli [1 + M] Pa, relaxation times [M] s, ascending."""
 
     values: np.ndarray
     times: np.ndarray
 
 
 def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarray, times: np.ndarray) -> Relaxing:
-    """The relaxation spectrum of J(t) = J_0 + t / eta + sum_k J_k (1 - exp(-t / lambda_k)).
+    """Relaxation spectrum of the creep compliance J(t) = J_0 + t / eta + sum_k J_k (1 - exp(-t / lambda_k)).
 
-    In the Laplace domain s J(s) and s E(s) are each other's inverse (Ferry, Viscoelastic Properties of Polymers, 3rd
-    ed., ch. 3). So relaxation rates are where s J(s) is zero, one above each retardation rate (and above zero, with
-    flow), and the moduli are the residues there.
+    In the Laplace domain s J(s) s E(s) = 1 (Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 3). The relaxation
+    rates are the zeros of s J(s), one above each retardation rate (with flow, also one above rate zero), and the moduli
+    are the residues there.
 
     Args:
         instantaneous: J_0 [1/Pa], positive.
@@ -35,7 +35,8 @@ def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarra
         rates, weights = np.append(rates, 0.0), np.append(weights, fluidity / instantaneous)
     rates, same = np.unique(rates, return_inverse=True)
     weights = np.bincount(same, weights)
-    # Zeros of 1 - sum_j w_j / (rho - r_j), one in each gap; their distances from the lower end, lest digits cancel.
+    # Zeros of 1 - sum_j w_j / (rho - r_j), one in each gap; solved for the distance from the lower end of the gap to
+    # avoid cancellation.
     gaps = np.append(np.diff(rates), weights.sum())
     low, high = np.log(gaps) - 80.0, np.log(gaps)
     behind = rates[:, None] - rates
@@ -51,16 +52,16 @@ def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarra
 
 
 def compliance(equilibrium: float, moduli: np.ndarray, times: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Creep compliance [n] 1/Pa at times [n] s after a step of stress, of a relaxation spectrum.
+    """Creep compliance [n] 1/Pa of a relaxation spectrum at times [n] s after a step of unit stress.
 
-    The viscous strains follow v_i' = (e - v_i) / tau_i under the strain e = (1 + sum_i E_i v_i) / (E_inf + sum_i E_i).
-    Scaled by sqrt(E_i tau_i) that system is symmetric, and its modes decay, or one of a liquid flows.
+    The viscous strains obey v_i' = (e - v_i) / tau_i, the total strain is e = (1 + sum_i E_i v_i) / (E_inf + sum_i
+    E_i). Scaled by sqrt(E_i tau_i) the system is symmetric; its eigenmodes decay, except one of rate zero in a liquid.
 
     Args:
-        equilibrium: E_inf [Pa].
-        moduli: E_i [M] Pa.
-        times: tau_i [M] s.
-        time: [n] s.
+        equilibrium: Equilibrium modulus E_inf [Pa].
+        moduli: Moduli E_i [M] Pa.
+        times: Relaxation times tau_i [M] s.
+        time: Times since the step [n] s.
     """
     used = moduli > 0
     stiff, tau = moduli[used], times[used]
@@ -74,18 +75,20 @@ def compliance(equilibrium: float, moduli: np.ndarray, times: np.ndarray, time: 
 
 
 def relaxing(problem: Problem, found: Found, *, optimised: bool) -> tuple[Relaxing, np.ndarray]:
-    """The relaxation spectrum of a fitted retardation spectrum, and how well it is known.
+    """Relaxation spectrum of a fitted retardation spectrum, with standard errors.
 
-    Without instantaneous compliance that of the fastest term stands for it. Terms with zero compliance fall out.
+    If the fitted instantaneous compliance is zero, the compliance of the fastest term replaces it. Terms of zero
+    compliance are omitted.
 
     Args:
-        problem: Creep: columns of the instantaneous compliance, of the flow unless there is an equilibrium, of terms.
-        found: Compliances and retardation times.
-        optimised: Whether those times were fitted.
+        problem: Creep problem: columns of the instantaneous compliance, of the flow without an equilibrium modulus, and
+            of the terms.
+        found: Fitted compliances and retardation times.
+        optimised: Whether the retardation times were fitted.
 
     Returns:
-        The spectrum, and the standard errors of the logarithms of its values [1 + M] for residuals of variance one
-        (Laplace's approximation; 0 for an equilibrium modulus that is not there).
+        The spectrum, and the standard errors of the logarithms of its values [1 + M] for residuals of unit variance
+        (Laplace approximation; 0 for a zero equilibrium modulus).
     """
     constant, times, first = found.values[: problem.first], found.times, problem.first
     used = np.flatnonzero(found.values[first:] > 0)
@@ -98,7 +101,7 @@ def relaxing(problem: Problem, found: Found, *, optimised: bool) -> tuple[Relaxi
     columns = [matrix[:, there] * values[: len(there)], matrix[:, first + used] * values[len(there) :]]
     if optimised:
         columns.append(slope[:, used] * found.values[first + used])
-    jacobian = np.column_stack(columns)  # by the logarithms of compliances and times
+    jacobian = np.column_stack(columns)  # with respect to the logarithms of compliances and times
 
     def spectrum(logs: np.ndarray) -> Relaxing:
         spread = np.exp(logs[: len(values)]) * values

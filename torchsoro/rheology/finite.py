@@ -1,4 +1,4 @@
-"""Finite-strain tests of soft solids: tension, equibiaxial tension and simple shear, and how their files are read."""
+"""Finite-strain tests of soft solids: uniaxial and equibiaxial tension, simple shear, and their file reader."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 Mode = Literal["uniaxial", "equibiaxial", "shear"]
 
-# What columns are called, in lower case, and the unit of each in SI. The first name that a file has is taken.
+# Column names in lower case, factor to SI units, and mode of the test. The first name found in a file is used.
 _COLUMNS: dict[str, tuple[tuple[str, float, Mode | None], ...]] = {
     "time": (("time_s", 1.0, None), ("time (s)", 1.0, None)),
     "deformation": (
@@ -26,23 +26,24 @@ _COLUMNS: dict[str, tuple[tuple[str, float, Mode | None], ...]] = {
         ("engineering stress (mpa)", 1e6, "uniaxial"),
     ),
 }
-_STRAINS = {"engineering strain"}  # a stretch less one
+_STRAINS = {"engineering strain"}  # stretch minus one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment:
-    """What was done to a specimen at rest, and the stress that it took.
+    """Deformation history of a specimen and its nominal stress.
 
     Attributes:
-        name: For people.
-        mode: "uniaxial" or "equibiaxial" tension or compression with free sides, or simple "shear".
-        time: [n] s, from 0 on, increasing; the specimen is at rest at time 0 and moves evenly to the first sample.
+        name: Label in tables and messages.
+        mode: "uniaxial" or "equibiaxial" tension or compression with stress-free sides, or simple "shear".
+        time: Times [n] s, non-negative, increasing; the specimen is undeformed and relaxed at time 0 and deforms at a
+            constant rate up to the first sample.
         deformation: Stretch, or amount of shear [n].
-        stress: Nominal stress [n] Pa: force over the area at rest.
+        stress: Nominal stress [n] Pa: force over undeformed area.
 
     Raises:
-        ValueError: for fewer than two samples, lengths that differ, numbers that are not finite, times that do not
-            increase, or a stretch that is not positive; names the experiment and the sample.
+        ValueError: for fewer than two samples, different lengths, numbers that are not finite, times that do not
+            increase, or a stretch that is not positive; the message names experiment and sample.
     """
 
     name: str
@@ -75,7 +76,7 @@ class Experiment:
 
     @property
     def rest(self) -> float:
-        """The deformation at rest."""
+        """Deformation of the undeformed specimen: 0 in shear, stretch 1 otherwise."""
         return 0.0 if self.mode == "shear" else 1.0
 
     @property
@@ -91,18 +92,19 @@ class Experiment:
         return math.sqrt(float((self.stress**2).mean()))
 
     def part(self, keep: np.ndarray) -> Experiment:
-        """Some of its samples, bool or indices [n]; the path between them is taken as even."""
+        """Experiment with a subset of the samples, given as bool [n] or indices; linear in between."""
         arrays = {name: getattr(self, name)[keep] for name in ("time", "deformation", "stress")}
         return Experiment(name=self.name, mode=self.mode, **arrays)
 
     def path(self, largest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The way from rest through all samples in even steps, of which none changes the deformation by more.
+        """Piecewise linear deformation history from rest through all samples, in steps of bounded increment.
 
         Args:
-            largest: Change of the deformation in a step, at most.
+            largest: Largest increment of the deformation in a step.
 
         Returns:
-            Deformation at the end of each step [S], length of each step [S] s, and the steps that end at samples [n].
+            Deformation at the end of each step [S], duration of each step [S] s, and indices of the steps that end at
+            the samples [n].
         """
         time, deformation = self.time, self.deformation
         if time[0] > 0:
@@ -119,21 +121,21 @@ class Experiment:
 
 
 def read(path: str | Path, *, name: str | None = None, rate: float | None = None) -> Experiment:
-    """Read a tensile or shear test from a table of numbers, separated by commas or semicolons.
+    """Read a tensile or shear test from a table separated by commas or semicolons.
 
-    The columns are found by their names, in the first line that has one for the time, the deformation and the stress;
-    lines above it are skipped. Known names are ``time_s`` or ``Time (s)``; ``stretch``, ``shear_strain`` or
-    ``Engineering Strain``; ``nominal_stress_kPa``, ``shear_stress_kPa`` or ``Engineering Stress (MPa)``.
+    Columns are identified by name in the first line that names time, deformation and stress; lines above it are
+    skipped. Names are ``time_s`` or ``Time (s)``; ``stretch``, ``shear_strain`` or ``Engineering Strain``;
+    ``nominal_stress_kPa``, ``shear_stress_kPa`` or ``Engineering Stress (MPa)``.
 
     Args:
-        path: The file.
-        name: For people; the file's name if None.
-        rate: Of the deformation [1/s], if the file's own times are not to be used: in a test at one speed they then
-            follow from the way.
+        path: File.
+        name: Label of the experiment; the name of the file if None.
+        rate: Constant rate of deformation [1/s]. If given, times are the accumulated deformation over the rate, and the
+            times of the file are ignored.
 
     Raises:
-        ValueError: if a column is missing or a cell is no number, with the file and line; for a rate that is not
-            positive; or as of `Experiment`.
+        ValueError: for a missing column or a cell that is not a number, naming file and line; for a rate that is not
+            positive; or as for `Experiment`.
         OSError: if the file cannot be read.
     """
     path = Path(path)
@@ -155,7 +157,7 @@ def read(path: str | Path, *, name: str | None = None, rate: float | None = None
 
 
 def _header(path: Path, lines: Sequence[str]) -> tuple[int, str, list[str], list[tuple[str, float, Mode | None]]]:
-    """The line that names the columns (from 1), what separates them, their names, and those to be read."""
+    """Number of the header line (from 1), separator, all column names, and the three columns to be read."""
     for number, line in enumerate(lines, start=1):
         separator = ";" if ";" in line else ","
         header = [cell.strip().lower() for cell in line.split(separator)]
@@ -170,7 +172,7 @@ def _header(path: Path, lines: Sequence[str]) -> tuple[int, str, list[str], list
 def _numbers(
     path: Path, lines: Sequence[str], header: int, separator: str, columns: Sequence[tuple[int, float]]
 ) -> np.ndarray:
-    """The columns [n, 3] in SI below line number ``header``."""
+    """Time, deformation and stress [n, 3] in SI units, from the lines below line ``header``."""
     rows = []
     for number, line in enumerate(lines[header:], start=header + 1):
         cells = line.split(separator)

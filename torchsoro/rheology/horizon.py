@@ -1,4 +1,4 @@
-"""A solid for the simulator where a spectrum has no equilibrium modulus: slow elements count as permanent."""
+"""Equilibrium modulus for the simulator from a spectrum without one: terms slower than a horizon become permanent."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 from torchsoro.rheology.spectrum import Spectrum, fit
 from torchsoro.rheology.terminal import Flow, terminal_flow
 
-SEEN = 0.3  # share of the longest time of the data up to which a relaxation time is told from a permanent modulus
+SEEN = 0.3  # longest relaxation time distinguishable from the equilibrium modulus, over the longest time of the data
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Solidified:
-    """A spectrum with an equilibrium modulus that the simulator can take.
+    """Relaxation spectrum with a positive equilibrium modulus.
 
     Attributes:
-        spectrum: The spectrum; fitted, but for an equilibrium modulus that holds the slow elements.
-        remark: What was taken for permanent and what that neglects, in words; empty if nothing was.
+        spectrum: Fitted spectrum, in which the equilibrium modulus includes the terms slower than the horizon.
+        remark: Modulus treated as permanent and the neglected loss modulus, in words; empty if none.
         flow: Terminal flow of the curve, None if there is none.
     """
 

@@ -1,4 +1,4 @@
-"""Non-negative moduli and relaxation times of Maxwell terms by least squares of relative residuals."""
+"""Fit of a Prony series with non-negative moduli by least squares of relative residuals, with profile likelihoods."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-_PATIENCE = 4  # more terms without better evidence before the search ends
-_FINE = 12  # relaxation times to a decade that stand for all of them
+_PATIENCE = 4  # terms added without a lower BIC before the search ends
+_FINE = 12  # relaxation times per decade of a grid that approximates a continuous spectrum
 
 
 @dataclass(frozen=True, kw_only=True)
 class Problem:
-    """Relative residuals, linear in the moduli: columns(tau) @ moduli + constant * equilibrium - target.
+    """Relative residuals of a Prony series: columns(tau) @ moduli + constant * equilibrium - target.
 
     Attributes:
-        columns: Takes relaxation times [M] s; gives the columns [n, M] 1/Pa and their derivatives by ln(tau).
-        constant: Column of the equilibrium modulus [n] 1/Pa, or columns [n, c], before those of the terms; or None.
-        target: What the columns are to add up to [n]: ones, less the share of a modulus that is held.
+        columns: Maps relaxation times [M] s to columns [n, M] 1/Pa and their derivatives with respect to ln(tau).
+        constant: Column [n] 1/Pa of the equilibrium modulus, or several columns [n, c], placed before those of the
+            terms; None without.
+        target: Target values [n]: ones minus the relative contribution of a fixed equilibrium modulus.
         window: Shortest and longest relaxation time [s].
-        curves: Number of curves, of equal length, that the residuals consist of.
+        curves: Number of concatenated curves of equal length in the residuals.
     """
 
     columns: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -34,30 +35,30 @@ class Problem:
 
     @property
     def first(self) -> int:
-        """Number of columns before those of the terms."""
+        """Number of columns that precede those of the terms."""
         return 0 if self.constant is None else self.constant[0].size
 
     def matrix(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """All columns [n, first + M], and the derivatives of the terms' by ln(tau) [n, M]."""
+        """Design matrix [n, first + M], and derivatives of the columns of the terms by ln(tau) [n, M]."""
         value, slope = self.columns(times)
         return (value if self.constant is None else np.column_stack([self.constant, value])), slope
 
     def grid(self, count: int) -> np.ndarray:
-        """Equal spaces in log time over the window [count] s; the middle for one."""
+        """Relaxation times, logarithmically spaced over the window [count] s; its geometric mean for one."""
         low, high = np.log(self.window)
         return np.exp(np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2]))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Found:
-    """Least squares for some number of terms.
+    """Least-squares fit with a given number of terms.
 
     Attributes:
-        times: Relaxation times [M] s, the shortest first.
-        values: Equilibrium modulus, if it is fitted, and moduli [first + M] Pa.
+        times: Relaxation times [M] s, ascending.
+        values: Equilibrium modulus, if fitted, then moduli [first + M] Pa.
         error: Sum of the squared residuals.
         parameters: Effective number of parameters.
-        weight: Of the penalty.
+        weight: Weight of the second-difference penalty.
         bic: Bayesian information criterion, n ln(error / n) + parameters ln(n).
     """
 
@@ -72,12 +73,12 @@ class Found:
 def _found(problem: Problem, times: np.ndarray, values: np.ndarray, parameters: float, weight: float = 0.0) -> Found:
     error = float(((problem.matrix(times)[0] @ values - problem.target) ** 2).sum())
     n = len(problem.target)
-    bic = n * math.log(max(error, 1e-20 * n) / n) + parameters * math.log(n)  # data without noise: keeps it finite
+    bic = n * math.log(max(error, 1e-20 * n) / n) + parameters * math.log(n)  # lower bound for noiseless data
     return Found(times=times, values=values, error=error, parameters=parameters, weight=weight, bic=bic)
 
 
 def solve(matrix: np.ndarray, target: np.ndarray, hold: tuple[int, float] | None = None) -> np.ndarray:
-    """Non-negative least squares; ``hold`` is the column and value of an unknown that is kept."""
+    """Non-negative least squares; ``hold`` is the column and value of an unknown that is fixed."""
     if hold is not None:
         column, value = hold
         rest = solve(np.delete(matrix, column, axis=1), target - value * matrix[:, column])
@@ -88,9 +89,10 @@ def solve(matrix: np.ndarray, target: np.ndarray, hold: tuple[int, float] | None
 
 
 def free(problem: Problem, elements: int | None) -> list[Found]:
-    """Optimised relaxation times, for 1, 2, ... up to ``elements`` terms, or until the evidence falls.
+    """Fits with optimised relaxation times for 1, 2, ... ``elements`` terms; if None, until the BIC stops falling.
 
-    One term more starts where a new one lowers the error fastest, and from equal spaces; the better is kept.
+    Each number of terms is started from the previous fit with one more relaxation time at the steepest descent of the
+    error, and from logarithmically spaced times; the fit of the smaller error is retained.
     """
     fine = problem.grid(_fine(problem))
     columns = problem.columns(fine)[0]
@@ -118,9 +120,9 @@ def _optimised(
     limits: tuple[np.ndarray, np.ndarray] | None = None,
     tolerance: float = 1e-9,
 ) -> Found:
-    """Optimise relaxation times, the moduli being projected out (Golub and Pereyra 1973, Kaufman 1975).
+    """Optimise relaxation times by variable projection of the moduli (Golub and Pereyra 1973, Kaufman 1975).
 
-    ``limits`` are of ln(tau) [M]; the problem's window if None.
+    ``limits`` are lower and upper bounds of ln(tau) [M]; the problem's window if None.
     """
     low, high = limits or np.log(problem.window)
     last: dict[bytes, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
@@ -149,14 +151,14 @@ def _optimised(
     inside = np.clip(np.log(start), low + 1e-6 * (high - low), high - 1e-6 * (high - low))
     search: dict[str, Any] = {"bounds": (low, high), "ftol": tolerance, "xtol": tolerance, "gtol": 1e-12}
     best = least_squares(residual, inside, jac=jacobian, max_nfev=200, **search)  # pyright: ignore[reportArgumentType]
-    order = np.argsort(best.x) if hold is None else np.arange(len(start))  # a column that is held keeps its place
+    order = np.argsort(best.x) if hold is None else np.arange(len(start))  # the fixed column is an index: no sorting
     values = state(best.x)[2]
     values = np.concatenate([values[: problem.first], values[problem.first :][order]])
     return _found(problem, np.exp(best.x[order]), values, 2 * len(start) + problem.first)
 
 
 def fixed(problem: Problem, times: np.ndarray, weights: tuple[float, ...]) -> list[Found]:
-    """Moduli at given relaxation times [M] s, with each weight of the penalty (0 alone for less than three times)."""
+    """Moduli at given relaxation times [M] s for each penalty weight (the first weight only for M < 3)."""
     matrix = problem.matrix(times)[0]
     found = []
     for weight in weights if len(times) > 2 else weights[:1]:
@@ -171,7 +173,7 @@ def fixed(problem: Problem, times: np.ndarray, weights: tuple[float, ...]) -> li
 
 
 def roughness(problem: Problem, times: np.ndarray) -> np.ndarray:
-    """Second differences of the moduli, each times the norm of its column [max(M - 2, 0), first + M]."""
+    """Second-difference matrix of the moduli, columns scaled by their norms [max(M - 2, 0), first + M]."""
     count = len(times)
     rows = np.diff(np.eye(count), 2, axis=0) if count > 2 else np.zeros((0, count))
     rows = rows * np.linalg.norm(problem.columns(times)[0], axis=0)
@@ -183,16 +185,16 @@ def _fine(problem: Problem) -> int:
 
 
 def floor(problem: Problem) -> Found:
-    """The best of all non-negative spectra within the window, on a fine grid of relaxation times.
+    """Least error over all non-negative spectra within the window, on a fine grid of relaxation times.
 
-    The problem is convex, so that no number of terms has a smaller error, but for the grid.
+    The problem is convex: up to the grid spacing this is the lower bound for any number of terms.
     """
     times = problem.grid(_fine(problem))
     return fixed(problem, times, (0.0,))[0]
 
 
 def inflation(problem: Problem, found: Found) -> float:
-    """How many times a variance grows with the residuals' serial correlation r: (1 + r) / (1 - r), 1 if r is noise."""
+    """Variance inflation (1 + r) / (1 - r) for a lag-one correlation r of the residuals; 1 if r is insignificant."""
     rest = problem.matrix(found.times)[0] @ found.values - problem.target
     curves = rest.reshape(problem.curves, -1)
     total = float((curves**2).sum())
@@ -201,12 +203,12 @@ def inflation(problem: Problem, found: Found) -> float:
 
 
 def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) -> Iterator[tuple[float, float]]:
-    """Where the least error, at each value of one unknown, has risen by ``rise``: both ends, for every unknown.
+    """Profile-likelihood interval of every unknown: both values at which the minimised error has risen by ``rise``.
 
-    All other moduli are fitted anew, and the relaxation times where they are ``optimised``, each within its own part of
-    the window: up to the geometric mean with its neighbour. Without these limits the terms exchange places: the one
-    whose modulus is held moves to where the data see nothing, the rest take over its part, and the ends found are those
-    of the term beyond the data. An end that is not reached is 0 or inf.
+    At each value of the unknown all other moduli are refitted, and, if ``optimised``, the relaxation times, each
+    bounded by the geometric means with its neighbours. Without these bounds terms can exchange roles: the term of fixed
+    modulus moves outside the data window, its neighbours replace it, and the interval is that of an unobserved term. A
+    bound that is not reached is 0 or inf.
     """
     matrix = problem.matrix(found.times)[0]
     below = found.weight * roughness(problem, found.times)
@@ -219,11 +221,11 @@ def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) ->
     low, high = np.log(problem.window)
     limits = np.append(low, middles), np.append(middles, high)
     for column, value in enumerate(found.values):
-        # With all else kept, the error rises by ``rise`` within this distance, so the end lies beyond it.
+        # With all other unknowns fixed the error rises by ``rise`` at this distance, a lower bound of the half width.
         near = math.sqrt(rise) / max(float(np.linalg.norm(rows[:, column])), 1e-300)
         ends = []
         for step in (-near, near):
-            times = found.times  # followed along the way
+            times = found.times  # warm start of the next evaluation
 
             def excess(at: float, column: int = column) -> float:
                 nonlocal times
@@ -239,7 +241,7 @@ def profiles(problem: Problem, found: Found, rise: float, *, optimised: bool) ->
 
 
 def _end(excess: Callable[[float], float], value: float, step: float) -> float:
-    """Where ``excess``, about linear with -1 at ``value``, becomes zero: steps that double, then false position."""
+    """Root of ``excess``, about linear and -1 at ``value``: bracketing by doubled steps, then false position."""
     inner, below, outer = value, -1.0, value + step
     while True:
         outer = max(outer, 0.0)

@@ -1,4 +1,4 @@
-"""Measured curves of a viscoelastic material: frequency sweeps, relaxation and creep tests, and how they are read."""
+"""Measured curves of a viscoelastic material: frequency sweeps, stress relaxation and creep, and their file reader."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scipy.ndimage import median_filter
 from torchsoro.rheology.readers import Table, load
 
 Deformation = Literal["tension", "shear"]
-OUTLIER = 2.5  # decades from the median of the five values around it, beyond which a value is no measurement
+OUTLIER = 2.5  # largest distance of a value from the running median of five [decades]
 
 
 class _Curve:
-    """What the three kinds of curve share: their checks, and arrays that nobody can change behind their back."""
+    """Base of the three kinds of curve: validation of values, and read-only arrays."""
 
     axis: ClassVar[str]
     ordinates: ClassVar[tuple[str, ...]]
@@ -50,7 +50,7 @@ class Sweep(_Curve):
         omega: Angular frequency [n] rad/s, increasing.
         storage: E' or G' [n] Pa, positive.
         loss: E'' or G'' [n] Pa, not negative.
-        temperature: deg C, nan if unknown; of a master curve its reference.
+        temperature: Temperature [deg C], nan if unknown; the reference temperature of a master curve.
         deformation: "tension" for E, "shear" for G.
 
     Raises:
@@ -69,12 +69,12 @@ class Sweep(_Curve):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Relaxation(_Curve):
-    """The modulus over the time after a step of strain, at one temperature.
+    """Stress relaxation: relaxation modulus over the time after a step of strain, at one temperature.
 
     Attributes:
-        time: Since the step [n] s, increasing.
-        modulus: E(t) or G(t) [n] Pa, positive.
-        temperature: deg C, nan if unknown.
+        time: Time since the step [n] s, increasing.
+        modulus: Relaxation modulus E(t) or G(t) [n] Pa, positive.
+        temperature: Temperature [deg C], nan if unknown.
         deformation: "tension" for E, "shear" for G.
 
     Raises:
@@ -91,12 +91,12 @@ class Relaxation(_Curve):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Creep(_Curve):
-    """The compliance over the time after a step of stress, at one temperature.
+    """Creep: compliance over the time after a step of stress, at one temperature.
 
     Attributes:
-        time: Since the step [n] s, increasing.
-        compliance: D(t) or J(t) [n] 1/Pa, positive.
-        temperature: deg C, nan if unknown.
+        time: Time since the step [n] s, increasing.
+        compliance: Creep compliance D(t) or J(t) [n] 1/Pa, positive.
+        temperature: Temperature [deg C], nan if unknown.
         deformation: "tension" for D, "shear" for J.
 
     Raises:
@@ -121,32 +121,33 @@ def read(
     scatter: float = 0.5,
     sheet: str | None = None,
 ) -> list[Sweep] | list[Relaxation] | list[Creep]:
-    """Read a table of measurements, split into isothermal curves, the coldest first.
+    """Read a table of measurements and split it into isothermal curves, ordered by temperature.
 
-    The table is text (comma, semicolon, tab or blanks between the columns) or a sheet of .xls or .xlsx. Lines before
-    the header row are skipped; a row of units may follow it. Frequency with storage and loss makes sweeps, time with a
-    modulus relaxation tests, time with a compliance creep tests. The header names columns in one of the customary ways
-    (``f``, ``omega``, ``E'``, ``E_stor``, ``G_loss_Pa``, ``T``, ``Set``, ``E_relax``, ...) and units stand in it
-    (``E' (MPa)``, ``G_storage_pa``) or in the row of units. What is missing or ambiguous is an error that says how to
-    declare it. With both a nominal and a measured temperature, the former splits and the latter is averaged.
+    The table is text (columns separated by comma, semicolon, tab or blanks) or a sheet of a workbook (.xls, .xlsx).
+    Lines before the header row are skipped; a row of units may follow it. Columns of frequency, storage and loss
+    modulus give sweeps; time and modulus give stress relaxation; time and compliance give creep. Columns are identified
+    by common names (``f``, ``omega``, ``E'``, ``E_stor``, ``G_loss_Pa``, ``T``, ``Set``, ``E_relax``, ...), units by the
+    header (``E' (MPa)``, ``G_storage_pa``) or the row of units. Missing or ambiguous columns and units raise an error
+    that names the argument to declare them. If nominal and measured temperatures are present, rows are grouped by the
+    nominal one, and the temperature of a curve is the mean of the measured ones.
 
     Args:
         path: File.
-        columns: Which column holds a quantity, where the header does not say: its name or its number from 0. The
+        columns: Column of a quantity, by name or by number from 0, where the header does not identify it. The
             quantities are "frequency", "storage", "loss", "time", "modulus", "compliance", "temperature", "nominal"
-            (the temperature that was set) and "set" (whatever tells one curve from the next).
-        units: Unit of a quantity, which goes before what the file says, such as ``{"frequency": "rad/s"}``.
-        deformation: "tension" or "shear", where the header has neither E nor G, or against it.
-        temperature: deg C, where the file has no column of it.
-        scatter: Without a set or nominal temperature, rows belong to one curve if their temperatures, sorted, are at
-            most this far apart [K].
-        sheet: Sheet of a workbook; the first that holds such a table if None.
+            (set temperature) and "set" (label of the curve).
+        units: Unit of a quantity, such as ``{"frequency": "rad/s"}``; overrides the file.
+        deformation: "tension" or "shear", where the header has neither E nor G; overrides the header.
+        temperature: Temperature [deg C], for a file without a temperature column.
+        scatter: Largest difference between consecutive sorted temperatures within a curve [K], for a file without label
+            or nominal temperature.
+        sheet: Sheet of a workbook; the first with such a table if None.
 
     Returns:
-        Curves in SI units and deg C.
+        Curves in SI units, temperatures in deg C.
 
     Raises:
-        ValueError: naming the file, the line and the column, what was seen and what was wanted.
+        ValueError: naming file, line and column, the value seen and the value wanted.
         FileNotFoundError: if there is no such file.
         ModuleNotFoundError: for a workbook, without the package that reads it.
     """
@@ -187,7 +188,7 @@ def read(
 
 
 def _kind(table: Table) -> type[Sweep] | type[Relaxation] | type[Creep]:
-    """The kind of curve that a table's columns make."""
+    """Kind of curve given by the columns of a table."""
     kinds = {Sweep: ("frequency", "storage", "loss"), Relaxation: ("time", "modulus"), Creep: ("time", "compliance")}
     for kind, wanted in kinds.items():
         if set(wanted) <= set(table.columns):
@@ -201,7 +202,7 @@ def _kind(table: Table) -> type[Sweep] | type[Relaxation] | type[Creep]:
 
 
 def _deformation(table: Table, quantity: str) -> Deformation:
-    """Tension or shear, from the letter or word in the header of a modulus."""
+    """Deformation, from the symbol (E or G) or word in the header of a modulus."""
     name = table.stem(quantity)
     words = name.lower()
     tension, shear = "tens" in words or "young" in words, "shear" in words
@@ -213,7 +214,7 @@ def _deformation(table: Table, quantity: str) -> Deformation:
 
 
 def _check_unit_of_frequency(table: Table) -> None:
-    """Refuse an angular frequency in Hz: the name and the unit contradict each other by a factor of 2 pi."""
+    """Refuse an angular frequency in Hz, an ambiguity of a factor of 2 pi."""
     if table.units["frequency"].endswith("hz") and re.fullmatch(r"w|ω|(?i:omega|ang.*)", table.stem("frequency")):
         raise ValueError(
             f"{table.where('frequency')}: an angular frequency in Hz; wanted rad/s, or a frequency in Hz. Declare "
@@ -222,7 +223,7 @@ def _check_unit_of_frequency(table: Table) -> None:
 
 
 def _check_outliers(table: Table, quantity: str, values: np.ndarray, rows: np.ndarray) -> None:
-    """Refuse a value that is decades from those beside it in its curve, naming its line and column."""
+    """Refuse a value more than ``OUTLIER`` decades from the running median of its curve, naming line and column."""
     rows = rows[values[rows] > 0]  # a loss modulus may be zero
     if len(rows) < 5:
         return
@@ -238,11 +239,11 @@ def _check_outliers(table: Table, quantity: str, values: np.ndarray, rows: np.nd
         )
 
 
-DRIFT = 2.0  # more than this between the rows of one curve is another temperature, not scatter [K]
+DRIFT = 2.0  # largest range of the measured temperature within one isothermal curve [K]
 
 
 def _isothermal(table: Table, measured: np.ndarray | None, scatter: float) -> list[np.ndarray]:
-    """Row numbers of each curve: the rows of one label and nominal temperature, or else of one temperature."""
+    """Row numbers of each curve: rows of equal label and nominal temperature, or else of equal temperature."""
     groups = [np.arange(len(table.lines))]
     if "set" in table.columns:
         labels = np.array(table.texts("set"))
@@ -254,7 +255,7 @@ def _isothermal(table: Table, measured: np.ndarray | None, scatter: float) -> li
         return groups
     parts = []
     for group in groups:
-        # Labels go before a scatter of the measured temperature, but one label may hold all temperatures of a run.
+        # A label defines a curve even if the measured temperature scatters, unless it spans several temperatures.
         whole = len(groups) > 1 and np.ptp(measured[group]) <= DRIFT
         parts += [group] if whole else _clusters(group, measured, scatter)
     for part in parts:
@@ -268,7 +269,7 @@ def _isothermal(table: Table, measured: np.ndarray | None, scatter: float) -> li
 
 
 def _clusters(rows: np.ndarray, values: np.ndarray, gap: float) -> list[np.ndarray]:
-    """Rows whose sorted values are at most a gap apart, in the rows' order."""
+    """Groups of rows whose consecutive sorted values differ by at most ``gap``, each in row order."""
     order = rows[np.argsort(values[rows], kind="stable")]
     ends = np.flatnonzero(np.diff(values[order]) > gap) + 1
     return [np.sort(part) for part in np.split(order, ends)]

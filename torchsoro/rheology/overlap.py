@@ -1,4 +1,4 @@
-"""How well neighbouring curves lie on each other after a shift."""
+"""Residual mismatch between neighbouring isothermal curves after time-temperature shifting."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Overlap:
-    """How well two neighbouring curves lie on each other after the shift.
+    """Mismatch of two neighbouring curves after the shift.
 
     Attributes:
-        cold: Temperature of the one [deg C].
-        hot: Temperature of the other [deg C].
-        step: log10 a_T of the colder less that of the hotter [decades].
-        step_error: Its standard error [decades].
-        common: Range of frequency or time that both cover; negative for a gap [decades].
-        mismatch: Root-mean-square distance of their moduli over that range [decades]; nan without one.
-        quality: The mismatch over what the noise alone would make: about 1 if they superpose, well above 1 if they do
-            not; nan without a common range.
+        cold: Temperature of the colder curve [deg C].
+        hot: Temperature of the hotter curve [deg C].
+        step: log10 a_T of the colder minus that of the hotter curve [decades].
+        step_error: Standard error of ``step`` [decades].
+        common: Range of frequency or time covered by both curves; negative for a gap [decades].
+        mismatch: Root-mean-square difference of log10 of their moduli over that range [decades]; nan for a gap.
+        quality: Ratio of the root-mean-square difference to that expected from the noise: about 1 if the curves
+            superpose, well above 1 if they do not; nan for a gap.
     """
 
     cold: float
@@ -37,12 +37,12 @@ def distance(
 ) -> tuple[float, float, float]:
     """Common range, mismatch and quality of curves i and i + 1, as of :class:`Overlap`.
 
-    Each is held against the straight lines between the points of the other.
+    The points of each curve are compared with the linear interpolation between the points of the other.
 
     Args:
-        moduli: Of each modulus the shifted log10 of frequency, that of the modulus, and the number of the curve [n].
-        noise: Of each modulus [decades].
-        i: Number of the first curve.
+        moduli: For each modulus: log10 of the shifted frequency, log10 of the shifted modulus, index of the curve [n].
+        noise: Noise standard deviation of each modulus [decades].
+        i: Index of the first curve.
     """
     squares, ratios, common = [], [], -np.inf
     for (x, y, curve), sigma in zip(moduli, noise, strict=True):

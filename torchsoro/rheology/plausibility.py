@@ -1,7 +1,7 @@
-"""Whether measured curves can be those of a linear viscoelastic material, found before anything long is computed.
+"""Consistency of measured curves with linear viscoelasticity, checked before superposition and fit.
 
-Storage and loss modulus of a linear material belong together (Kramers and Kronig): one non-negative spectrum gives
-both. How closely the best of all spectra fits an isothermal curve is a convex problem of milliseconds.
+Storage and loss modulus of a linear material satisfy the Kramers-Kronig relations: one non-negative relaxation spectrum
+gives both. The least residual of any spectrum on an isothermal curve is a convex problem solved in milliseconds.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from torchsoro.rheology.leastsquares import floor
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 from torchsoro.rheology.residuals import relative_residuals
 
-BEYOND = 100.0  # factor beyond the data to which relaxation times are tried
-LEAST = 5  # points of all curves: fewer determine neither an element nor the noise
-POINTS = 200  # of a curve that are looked at, at most
-SWAPPED = 0.5  # share of the residual below which storage and loss fit the other way round
+BEYOND = 100.0  # factor by which relaxation times may exceed the data window
+LEAST = 5  # smallest number of points of all curves; fewer determine neither an element nor the noise
+POINTS = 200  # largest number of points of a curve that are evaluated
+SWAPPED = 0.5  # ratio of residuals with and without exchanged moduli below which they are reported as exchanged
 POOR = 0.15  # root mean square of relative residuals from which on a fit is reported as poor
-HOPELESS = 0.5  # from which on it is refused
-AXIS = (1e-30, 1e30)  # of frequency [rad/s] or time [s]; master curves span some 30 decades
-MODULUS = (1e-9, 1.3e12)  # [Pa]; the upper end is diamond's Young's modulus
+HOPELESS = 0.5  # root mean square of relative residuals from which on a curve is refused
+AXIS = (1e-30, 1e30)  # valid range of frequency [rad/s] or time [s]; master curves span some 30 decades
+MODULUS = (1e-9, 1.3e12)  # valid range [Pa]; the upper end is diamond's Young's modulus
 
 
 def residual(curve: Sweep | Relaxation | Creep) -> float:
@@ -37,16 +37,16 @@ def residual(curve: Sweep | Relaxation | Creep) -> float:
 
 
 def check_curves(where: str, curves: Sequence[Sweep] | Sequence[Relaxation] | Sequence[Creep]) -> None:
-    """Refuse curves that no linear viscoelastic material has.
+    """Refuse curves that are inconsistent with a linear viscoelastic material.
 
     Args:
-        where: Of what messages are about, such as the file.
+        where: Origin of the curves for messages, such as the file.
         curves: Isothermal curves.
 
     Raises:
-        ValueError: for fewer than five points; frequencies, times or moduli that no experiment has; storage and loss
-            modulus that fit only when swapped; and curves that the best spectrum misses by more than half of their
-            values (root mean square).
+        ValueError: for fewer than five points; frequencies, times or moduli outside ``AXIS`` and ``MODULUS``; storage
+            and loss modulus that are consistent only when exchanged; relative residuals of the best spectrum above
+            ``HOPELESS`` (root mean square).
     """
     count = sum(len(getattr(curve, curve.axis)) for curve in curves)
     if count < LEAST:
@@ -93,7 +93,7 @@ def poor(error: float, values: int) -> str:
 
 
 def _thinned(curve: Sweep | Relaxation | Creep) -> Sweep | Relaxation | Creep:
-    """At most ``POINTS`` points, evenly chosen."""
+    """Curve reduced to at most ``POINTS`` points at equal index spacing."""
     names = (curve.axis, *curve.ordinates)
     count = len(getattr(curve, curve.axis))
     keep = np.unique(np.linspace(0, count - 1, min(count, POINTS)).round().astype(int))

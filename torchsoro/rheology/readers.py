@@ -1,4 +1,4 @@
-"""Tables of measurements as people have them: text or a workbook, with their columns and units made out."""
+"""Tables of measurements from text files and workbooks, with identification of columns and units."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import numpy as np
 
 MODULUS = {"pa": 1.0, "kpa": 1e3, "mpa": 1e6, "gpa": 1e9, "n/m2": 1.0, "n/mm2": 1e6, "dyn/cm2": 0.1}
 COMPLIANCE = {"1/pa": 1.0, "1/kpa": 1e-3, "1/mpa": 1e-6, "1/gpa": 1e-9, "m2/n": 1.0, "mm2/n": 1e-6, "cm2/dyn": 10.0}
-LARGEST = 10_000_000  # bytes of a file; a sweep has some thousand rows
-TEMPERATURE = {"c": 0.0, "k": -273.15}  # what is added
+LARGEST = 10_000_000  # largest file [bytes]; a sweep has about a thousand rows
+TEMPERATURE = {"c": 0.0, "k": -273.15}  # offset to deg C
 UNITS: dict[str, dict[str, float]] = {
     "frequency": {"hz": 2 * math.pi, "khz": 2e3 * math.pi, "rad/s": 1.0},
     "storage": MODULUS,
@@ -47,18 +47,18 @@ NAMES = {
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Rows of a file and what their columns hold.
+    """Rows of a file with the identified columns and their units.
 
     Attributes:
         path: File.
-        header: Line of the header row, from 1.
+        header: Line number of the header row, from 1.
         names: Header of each column.
-        columns: Number of the column of each quantity, from 0.
-        rivals: Header of a second column of a quantity, for the quantities that have one.
-        units: Unit of each quantity, as spelled in ``UNITS``; the empty text where it is unknown.
-        lines: Line of each row of data, from 1.
+        columns: Column index of each quantity, from 0.
+        rivals: Header of a second column that matches the same quantity, where there is one.
+        units: Unit of each quantity, as spelled in ``UNITS``; empty where unknown.
+        lines: Line number of each row of data, from 1.
         rows: Cells of each row of data.
-        decimal: The decimal sign may be a comma.
+        decimal: Whether a comma is read as a decimal sign.
     """
 
     path: Path
@@ -72,7 +72,7 @@ class Table:
     decimal: bool
 
     def where(self, quantity: str) -> str:
-        """File, header line and column of a quantity, to begin a message with."""
+        """File, header line and column of a quantity, the start of an error message."""
         return f"{self.path}, line {self.header}, column {self.names[self.columns[quantity]]!r} ({quantity})"
 
     def stem(self, quantity: str) -> str:
@@ -81,10 +81,10 @@ class Table:
         return next((stem for stem, unit in _readings(name) if unit in UNITS[quantity]), name)
 
     def texts(self, quantity: str) -> list[str]:
-        """Cells of a quantity's column.
+        """Cells of the column of a quantity.
 
         Raises:
-            ValueError: if another column may be meant, or a row is too short.
+            ValueError: if two columns match the quantity, or a row is too short.
         """
         if quantity in self.rivals:
             rival = self.rivals[quantity]
@@ -105,8 +105,8 @@ class Table:
         """A quantity in SI units, temperatures in deg C; angular frequency for "frequency".
 
         Raises:
-            ValueError: naming the line, for what is not a finite number, or not positive though it has to be; or naming
-                the column, if its unit is unknown.
+            ValueError: naming the line, for a value that is not finite, or not positive if ``positive``; naming the
+                column, for an unknown unit.
         """
         known = UNITS[quantity]
         unit = self.units[quantity]
@@ -179,7 +179,7 @@ def load(path: Path, columns: Mapping[str, str | int], units: Mapping[str, str],
 
 
 def _splits(path: Path, sheet: str | None) -> Iterator[tuple[list[list[str]], bool]]:
-    """Ways to split a file into rows of cells, and whether the decimal sign may be a comma."""
+    """Candidate splits of a file into rows of cells, each with whether a comma may be the decimal sign."""
     if path.suffix.lower() in (".xls", ".xlsx", ".xlsm", ".ods"):
         for rows in _workbook(path, sheet):
             yield rows, False
@@ -200,7 +200,7 @@ def _splits(path: Path, sheet: str | None) -> Iterator[tuple[list[list[str]], bo
             rows = [next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), []) for line in lines]
         except csv.Error as error:
             raise ValueError(f"{path}: {error}; wanted a table of text") from error
-        # Some instruments write a header with tabs over rows with blanks.
+        # Some instruments separate the header by tabs and the rows by blanks.
         for i, line in enumerate(lines):
             words = line.split()
             if len(rows[i]) == 1 and words and _number(words[0], False) is not None:
@@ -252,7 +252,7 @@ def _table(
     units: Mapping[str, str],
     decimal: bool,
 ) -> Table:
-    """The table under a header row."""
+    """Table of the rows below the header row."""
     width = max(map(len, rows))
     names = rows[header] if header >= 0 else [f"column {i}" for i in range(width)]
     columns, rivals, spelled = _columns(path, names, declared)
@@ -287,7 +287,7 @@ def _table(
 def _columns(
     path: Path, names: Sequence[str], declared: Mapping[str, str | int]
 ) -> tuple[dict[str, int], dict[str, str], dict[str, str]]:
-    """Column of each quantity, the header of a second one, and the unit in the header."""
+    """Column index of each quantity, header of a second matching column, and unit from the header."""
     columns: dict[str, int] = {}
     rivals: dict[str, str] = {}
     units: dict[str, str] = {}
@@ -304,7 +304,7 @@ def _columns(
         quantity, unit = found
         if quantity not in columns:
             columns[quantity], units[quantity] = index, unit
-        elif names[columns[quantity]] != name:  # of columns with the same name the first counts
+        elif names[columns[quantity]] != name:  # of columns with equal names the first is used
             rivals[quantity] = name
     if "nominal" in columns and "temperature" not in columns:
         columns["temperature"], units["temperature"] = columns["nominal"], units["nominal"]
@@ -312,7 +312,7 @@ def _columns(
 
 
 def _quantity(name: str) -> tuple[str, str] | None:
-    """Quantity and unit that a header names, the unit empty if it does not say."""
+    """Quantity and unit named by a column header, the unit empty if absent; None for an unknown name."""
     for stem, unit in _readings(name):
         for quantity, pattern in NAMES.items():
             if re.fullmatch(pattern, stem) and (not unit or unit in UNITS[quantity]):
@@ -321,7 +321,7 @@ def _quantity(name: str) -> tuple[str, str] | None:
 
 
 def _readings(name: str) -> Iterator[tuple[str, str]]:
-    """Ways to take a header apart into a name and a unit: ``E' (MPa)``, ``f / Hz``, ``G_loss_Pa``, ``T``."""
+    """Candidate splits of a column header into name and unit: ``E' (MPa)``, ``f / Hz``, ``G_loss_Pa``, ``T``."""
     name = re.sub(r"[\s_]+", "_", name.strip())
     if match := re.fullmatch(r"(.+?)_?[(\[](.*)[)\]]", name):
         yield match[1], _spell(match[2])
@@ -334,7 +334,7 @@ def _readings(name: str) -> Iterator[tuple[str, str]]:
 
 
 def _spell(unit: str) -> str:
-    """A unit as ``UNITS`` spells it; an unknown one in lower case."""
+    """Unit in the spelling of ``UNITS``; unknown units in lower case."""
     unit = unit.strip().strip("[]()").lower().replace("_", " ").replace("²", "2").replace("^", "").replace("**", "")
     unit = re.sub(r"^(°|deg(rees)?)?\s*(c|k)(elsius|elvin)?$", r"\3", unit)
     unit = re.sub(r"^(\S+)\s*[-⁻][1¹]$", r"1/\1", re.sub(r"\s*\bper\s+|\s*/\s*", "/", unit))
@@ -343,7 +343,7 @@ def _spell(unit: str) -> str:
 
 
 def _number(text: str, decimal: bool) -> float | None:
-    """The number that a cell holds, or None."""
+    """Number in a cell, or None."""
     try:
         return float(text.replace(",", ".") if decimal else text)
     except ValueError:

@@ -1,4 +1,4 @@
-"""How far a spectrum is from a measured curve, relative to the curve."""
+"""Relative residuals between a relaxation or retardation spectrum and a measured curve."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 def relative_residuals(
     data: Sweep | Relaxation | Creep, equilibrium: bool | float, window: tuple[float, float] | None = None
 ) -> Problem:
-    """The least-squares problem of Eq. 17c for a sweep, and the like for a relaxation and for creep.
+    """Least-squares problem of Eq. 17c for a sweep, and its analogue for stress relaxation and creep.
 
-    Creep has compliances 1 - exp(-t / lambda) for terms, after the instantaneous one and, without equilibrium, the flow
-    t / eta.
+    For creep the terms are J_k (1 - exp(-t / lambda_k)), preceded by the instantaneous compliance and, without an
+    equilibrium modulus, the viscous flow t / eta.
 
     Args:
-        data: What was measured.
-        equilibrium: Whether there is a permanent modulus, or its value [Pa], which is then held.
-        window: Shortest and longest time [s] of a term; the data's if None.
+        data: Measured curve.
+        equilibrium: Whether an equilibrium modulus is fitted, or its fixed value [Pa].
+        window: Shortest and longest time constant of a term [s]; the range of the data if None.
 
     Raises:
         ValueError: for less than two points, a loss modulus of zero, or an equilibrium modulus that cannot be held.

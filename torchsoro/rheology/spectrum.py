@@ -1,11 +1,11 @@
-"""Discrete relaxation spectra: moduli and relaxation times fitted to measurements, and how well the data know each.
+"""Discrete relaxation spectra (Prony series) fitted to measurements, with confidence intervals of the moduli.
 
 A generalised Maxwell solid has the storage and loss modulus
 
     E'(w) = E_inf + sum_i E_i (w tau_i)^2 / (1 + (w tau_i)^2),    E''(w) = sum_i E_i w tau_i / (1 + (w tau_i)^2)
 
-(Eqs. 17a, 17b) and relaxes as E(t) = E_inf + sum_i E_i exp(-t / tau_i), with no modulus negative. The same holds for a
-shear modulus G.
+(Eqs. 17a, 17b) and the relaxation modulus E(t) = E_inf + sum_i E_i exp(-t / tau_i), with non-negative moduli. The same
+holds for a shear modulus G.
 """
 
 from __future__ import annotations
@@ -26,25 +26,26 @@ from torchsoro.rheology.residuals import relative_residuals
 from torchsoro.simulation.material import Prony, Solid
 
 LEVEL = 0.95  # confidence of the intervals
-PENALTIES = (0.0, 1e-2, 1e-1, 1.0, 10.0)  # tried where regularization = "auto"
-# Free times may lie these factors beyond the data, lest terms within take over the part of those without. To a sweep a
-# faster term is a dashpot, in time it is nothing; a much slower one would be a spring, like the equilibrium modulus.
+PENALTIES = (0.0, 1e-2, 1e-1, 1.0, 10.0)  # candidate weights for regularization = "auto"
+# Optimised relaxation times may lie outside the data window by these factors, so that unobserved relaxation does not
+# bias terms inside it. Below the window a term acts as a dashpot in a sweep and vanishes in the time domain; far above
+# it a term is indistinguishable from the equilibrium modulus.
 _FASTER = {Sweep: 30.0, Relaxation: 3.0, Creep: 3.0}
 _SLOWER = 3.0
-_PERMANENT = 0.5  # least share of the lowest measured modulus that counts as an equilibrium modulus
-_HELD = "with the relaxation times held: one element less fits as well within the correlated residuals"
+_PERMANENT = 0.5  # smallest ratio of a determined equilibrium modulus to the modulus at the slow end of the data
+_HELD = "with the relaxation times held: one element fewer fits equally well within the correlated residuals"
 _EDGE = 1.05  # a relaxation time within this factor of an end of the window lies on it
 
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """What the data say about one modulus.
+    """Confidence interval of one modulus, at ``LEVEL``.
 
     Attributes:
-        low: Lower end [Pa].
-        high: Upper end [Pa], inf if there is none.
-        unknown: Why the modulus cannot be known, in words; empty if it can.
-        condition: What the interval takes for known that was fitted, in words; empty for nothing.
+        low: Lower bound [Pa].
+        high: Upper bound [Pa], inf if there is none.
+        unknown: Reason why the data do not determine the modulus; empty if they do.
+        condition: Fitted quantities on which the interval is conditional; empty if there are none.
     """
 
     low: float
@@ -55,14 +56,14 @@ class Interval:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """One number of terms that was tried.
+    """One fit of the model selection.
 
     Attributes:
         elements: Number of terms.
-        regularization: Weight of the penalty.
+        regularization: Weight of the second-difference penalty.
         error: Sum of the squared relative residuals; e of Eq. 17c for a sweep.
         parameters: Effective number of parameters.
-        bic: n ln(error / n) + parameters ln(n) over the n measured values; the smallest is chosen.
+        bic: n ln(error / n) + parameters ln(n) over the n measured values; the smallest is selected.
     """
 
     elements: int
@@ -74,25 +75,25 @@ class Candidate:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Spectrum:
-    """Equilibrium modulus and Maxwell terms, absolute, from the fastest to the slowest.
+    """Relaxation spectrum: equilibrium modulus and Maxwell terms in absolute units, relaxation times ascending.
 
     Attributes:
-        equilibrium: E_inf or G_inf [Pa]; after a fit it stands for everything that is slower than the data see.
-        moduli: E_i or G_i [M] Pa.
+        equilibrium: E_inf or G_inf [Pa]; after a fit it includes all relaxation slower than the data window.
+        moduli: Moduli E_i or G_i [M] Pa.
         times: Relaxation times tau_i [M] s, not decreasing.
-        deformation: What the moduli resist.
-        temperature: [deg C], nan if unknown.
-        window: Shortest and longest relaxation time [s] that the data see; None if not fitted.
-        equilibrium_interval: Of ``equilibrium``; None if not fitted or held.
-        intervals: Of every modulus; empty if not fitted.
-        evidence: Every number of terms that was tried; empty if not fitted.
+        deformation: "tension" for Young's moduli, "shear" for shear moduli.
+        temperature: Temperature [deg C], nan if unknown.
+        window: Shortest and longest relaxation time covered by the data [s]; None if not fitted.
+        equilibrium_interval: Interval of ``equilibrium``; None if not fitted or given.
+        intervals: Interval of each modulus; empty if not fitted.
+        evidence: All fits of the model selection; empty if not fitted.
         error: Sum of the squared relative residuals (e of Eq. 17c), nan if not fitted.
-        floor: The same for the best spectrum of any number of terms within the window. If it is far above the scatter
-            of the data, then storage and loss do not belong to one linear viscoelastic material.
-        inflation: How many times the residuals' serial correlation widens a variance; 1 if they are independent.
+        floor: Least ``error`` of any non-negative spectrum within the window. If it is far above the scatter of the
+            data, storage and loss modulus are inconsistent with one linear viscoelastic material.
+        inflation: Variance inflation by serial correlation of the residuals; 1 if they are independent.
 
     Raises:
-        ValueError: for shapes that differ, negative or infinite numbers, times that decrease or an unknown deformation.
+        ValueError: for different shapes, negative or infinite numbers, decreasing times or an unknown deformation.
     """
 
     equilibrium: float
@@ -139,13 +140,13 @@ class Spectrum:
         return compliance(self.equilibrium, self.moduli, self.times, time)
 
     def prony(self, *, equilibrium: float | None = None) -> Prony:
-        """Maxwell elements for the simulator, relative to the equilibrium modulus, the slowest first as in Table S1.
+        """Prony series for the simulator: moduli over the equilibrium modulus, relaxation times descending.
 
         Args:
-            equilibrium: Equilibrium modulus [Pa] from elsewhere, in place of the fitted one.
+            equilibrium: Equilibrium modulus from another test [Pa], which replaces the fitted one.
 
         Raises:
-            ValueError: if the equilibrium modulus is zero or not determined by the data, or for more than five terms.
+            ValueError: if the equilibrium modulus is zero or undetermined, or for more than five terms.
         """
         relative = self.relative(equilibrium=equilibrium)
         if len(relative) > 5:
@@ -156,18 +157,17 @@ class Spectrum:
         return Prony(moduli=torch.from_numpy(relative[::-1].copy()), times=torch.from_numpy(self.times[::-1].copy()))
 
     def relative(self, *, equilibrium: float | None = None) -> np.ndarray:
-        """Moduli over the equilibrium modulus [M], of any number of terms; arguments and errors as :meth:`prony`."""
+        """Moduli over the equilibrium modulus [M] for any number of terms; arguments and errors as :meth:`prony`."""
         return self.moduli / self._permanent(equilibrium)
 
     def solid(self, poisson_ratio: float, density: float, *, equilibrium: float | None = None) -> Solid:
-        """The simulator's solid, with a Young's modulus of E_inf or 2 (1 + nu) G_inf.
+        """Solid for the simulator, with Young's modulus E_inf or 2 (1 + nu) G_inf.
 
-        The relative moduli of tension are used for shear as they are, as the paper does: exact for a constant Poisson
-        ratio.
+        Relative moduli measured in tension are used for shear, as in the paper: exact for a constant Poisson ratio.
 
         Args:
-            poisson_ratio: nu, 0 to below 0.5.
-            density: [kg/m3].
+            poisson_ratio: Poisson ratio nu, 0 to below 0.5.
+            density: Density [kg/m3].
             equilibrium: As in :meth:`prony`.
 
         Raises:
@@ -193,7 +193,7 @@ class Spectrum:
         )
 
     def rows(self) -> list[dict[str, float | str]]:
-        """One row for the equilibrium modulus and each term: time [s], modulus, interval [Pa], and a remark on it."""
+        """One row for the equilibrium modulus and each term: time [s], modulus and interval [Pa], remark."""
         known = (self.equilibrium_interval, *(self.intervals or (None,) * len(self.moduli)))
         values = zip((math.inf, *self.times), (self.equilibrium, *self.moduli), known, strict=True)
         return [
@@ -204,10 +204,10 @@ class Spectrum:
 
 
 def error_norm(spectrum: Spectrum, sweep: Sweep) -> float:
-    """Error norm e of Eq. 17c: the sum over the points of the squared relative errors of storage and loss modulus.
+    """Error norm e of Eq. 17c: sum of the squared relative residuals of storage and loss modulus.
 
     Raises:
-        ValueError: if one is of tension and the other of shear.
+        ValueError: if spectrum and sweep differ in ``deformation``.
     """
     if spectrum.deformation != sweep.deformation:
         raise ValueError(f"sweep.deformation = {sweep.deformation!r}: wanted {spectrum.deformation!r}, the spectrum's")
@@ -225,42 +225,42 @@ def fit(
     window: tuple[float, float] | None = None,
     intervals: bool = True,
 ) -> Spectrum:
-    """Fit a spectrum to the relative residuals of storage and loss modulus (Eq. 17c), or of relaxation or creep.
+    """Fit a Prony series to storage and loss modulus (Eq. 17c), stress relaxation or creep by relative residuals.
 
-    Moduli are at least zero. The number of terms is that of the best Bayesian information criterion, which takes the
-    scatter for independent: on a curve with systematic errors it errs towards more terms, up to what the curve can
-    bear at all (``Spectrum.floor``).
+    Moduli are non-negative. The number of terms minimises the Bayesian information criterion, which assumes independent
+    residuals: systematic errors of a curve favour more terms, down to the least possible error (``Spectrum.floor``).
 
-    The intervals are profile likelihoods at 95 %: all else is fitted anew at each value of a modulus, relaxation times
-    too where they are free, each up to the geometric mean with its neighbours, lest terms exchange places. Where the
-    others can still take a term's part, within serially correlated residuals, the interval holds for the relaxation
-    times as fitted, and says so. The noise is estimated from the residuals. Serially correlated residuals widen them.
-    Times that are given or on the logarithmic grid count as known, and a penalty as true. A modulus cannot be known
-    when zero will do, when nothing bounds it from above, and when its time is at or beyond an end of the data's window,
-    where the term stands for all that is faster or slower. An equilibrium modulus cannot be known when it is less than
-    half of the modulus at the slow end of the data.
+    Intervals are profile likelihoods at 95 %. At each value of a modulus all other moduli are refitted, and optimised
+    relaxation times too, each bounded by the geometric means with its neighbours, so that terms do not exchange roles.
+    If with serially correlated residuals the other terms can still replace a term, its interval is conditional on the
+    fitted relaxation times (``Interval.condition``). The noise variance is estimated from the residuals and inflated by
+    their serial correlation. Given and logarithmically spaced relaxation times and the penalty are treated as exact.
+    A modulus is undetermined if its interval includes zero or has no upper bound, or if its relaxation time lies at or
+    beyond an end of the data window, where the term represents all faster or slower relaxation. The equilibrium modulus
+    is undetermined if it is less than half of the modulus at the slow end of the data.
 
-    To creep a spectrum of compliances and retardation times is fitted, and turned into that of relaxation. Then
-    ``elements``, ``times``, ``window`` and ``evidence`` are of the former, and intervals are Laplace's approximation.
+    For creep a retardation spectrum is fitted and converted to the relaxation spectrum; ``elements``, ``times``,
+    ``window`` and ``evidence`` then refer to the retardation spectrum, and intervals are Laplace approximations.
 
     Args:
-        data: Sweep or master curve, relaxation, or creep.
+        data: Frequency sweep or master curve, stress relaxation, or creep.
         elements: Number of terms, or "auto".
-        times: "free" for optimised relaxation times; "log" for equal spaces in log time over the window, the paper's
-            choice; or the times themselves [s].
-        equilibrium: Whether there is a permanent modulus; or its value [Pa], which is then held.
-        regularization: Weight of the second differences of the moduli, each times the norm of its column of relative
-            residuals. Not for free times. "auto" takes the best criterion, with the effective number of parameters.
-        window: Shortest and longest relaxation time [s] of free and of equally spaced times. If None, equal spaces fill
-            the data's, from one over the highest to one over the lowest frequency, and free times may lie up to 30
-            times below it (3 times for relaxation and creep) and 3 times above.
-        intervals: Whether to find the intervals, which takes longer than the fit.
+        times: "free" for optimised relaxation times; "log" for logarithmic spacing over the window, as in the paper; or
+            the relaxation times [s].
+        equilibrium: Whether an equilibrium modulus is fitted, or its fixed value [Pa].
+        regularization: Weight of the penalty on second differences of the moduli, each scaled by the norm of its column
+            of relative residuals; not for optimised times. "auto" minimises the criterion with the effective number of
+            parameters.
+        window: Shortest and longest relaxation time [s] of optimised or logarithmically spaced times. If None,
+            logarithmic spacing covers the data, from one over the highest to one over the lowest frequency; optimised
+            times may be up to 30 times shorter (3 times for relaxation and creep) and 3 times longer.
+        intervals: Whether intervals are computed, which takes longer than the fit.
 
     Returns:
         The spectrum with intervals and evidence.
 
     Raises:
-        ValueError: for too few points, for values that are not positive, or arguments outside their range.
+        ValueError: for too few points, values that are not positive, or arguments outside their range.
     """
     if elements != "auto" and not (isinstance(elements, int) and elements >= 1):
         raise ValueError(f'elements = {elements!r}: wanted a number of at least 1 or "auto"')
@@ -322,7 +322,7 @@ def _grids(problem: Problem, times: str | Sequence[float] | np.ndarray, count: i
 
 
 def _known(problem: Problem, best: Found, seen: tuple[float, float], spare: float, optimised: bool) -> dict[str, Any]:
-    """Inflation and the intervals."""
+    """Variance inflation, and intervals of the equilibrium modulus and the moduli."""
     grown = inflation(problem, best)
     rise = best.error * grown * float(fisher.ppf(LEVEL, 1, spare)) / spare
     ends = list(profiles(problem, best, rise, optimised=optimised))
@@ -333,12 +333,12 @@ def _known(problem: Problem, best: Found, seen: tuple[float, float], spare: floa
         time = None if i < problem.first else best.times[i - problem.first]
         if time is not None and not fast < time < slow:
             side, more = ("fast", "higher frequencies or colder") if time <= fast else ("slow", "for longer or warmer")
-            why = f"stands for all that is {side}er than the data see: measure at {more}"
+            why = f"stands for all relaxation {side}er than the data window: measure at {more}"
             known.append(Interval(low=0.0, high=math.inf, unknown=why.replace("at for", "for")))
         elif time is not None and low == 0 < fixed_times[0]:
             known.append(Interval(low=fixed_times[0], high=fixed_times[1], condition=_HELD))
         else:
-            known.append(Interval(low=low, high=high, unknown="" if low > 0 else "the data agree with zero"))
+            known.append(Interval(low=low, high=high, unknown="" if low > 0 else "the data are consistent with zero"))
     if problem.constant is not None:
         known[0] = _settled(known[0], float(best.values[0] * problem.constant.max()))
     return {
@@ -349,7 +349,7 @@ def _known(problem: Problem, best: Found, seen: tuple[float, float], spare: floa
 
 
 def _from_creep(problem: Problem, best: Found, spare: float, optimised: bool, intervals: bool) -> dict[str, Any]:
-    """The relaxation spectrum of a retardation spectrum, with Laplace's intervals."""
+    """Relaxation spectrum of a fitted retardation spectrum, with intervals by Laplace approximation."""
     grown = inflation(problem, best)
     terms, errors = relaxing(problem, best, optimised=optimised)
     terms = {"equilibrium": float(terms.values[0]), "moduli": terms.values[1:], "times": terms.times}
@@ -359,7 +359,7 @@ def _from_creep(problem: Problem, best: Found, spare: float, optimised: bool, in
     known = []
     for value, error in zip((terms["equilibrium"], *terms["moduli"].tolist()), errors.tolist(), strict=True):
         factor = math.exp(min(reach * error, 700.0))
-        why = "" if factor < 10 else "known to no better than a factor of ten"
+        why = "" if factor < 10 else "the interval exceeds a factor of ten to either side"
         known.append(
             Interval(low=0.0 if why else value / factor, high=math.inf if why else value * factor, unknown=why)
         )
@@ -373,7 +373,7 @@ def _from_creep(problem: Problem, best: Found, spare: float, optimised: bool, in
 
 
 def _settled(known: Interval, share: float) -> Interval:
-    """An equilibrium modulus is not known where it is a small share of the modulus at the slow end of the data."""
+    """Mark the equilibrium modulus as undetermined if below ``_PERMANENT`` of the modulus at the slow end."""
     if share >= _PERMANENT:
         return known
     why = f"only {share:.0%} of the modulus at the slow end of the data is permanent: it is still falling there"

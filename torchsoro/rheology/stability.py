@@ -15,14 +15,14 @@ Formulation = Literal["updated", "total"]
 
 
 def moduli_over(moduli: np.ndarray, times: np.ndarray, omega: np.ndarray, viscous: float = 0.0) -> np.ndarray:
-    """Storage and loss modulus over the equilibrium modulus [2, n]; ``viscous`` is a viscosity over it [s]."""
+    """Storage and loss modulus over the equilibrium modulus [2, n]; ``viscous`` is viscosity over that modulus [s]."""
     wt = omega[:, None] * times
     part = moduli * wt / (1 + wt * wt)
     return np.stack([1 + (part * wt).sum(-1), part.sum(-1) + viscous * omega])
 
 
 def felt_share(times: np.ndarray, dt: float) -> np.ndarray:
-    """What the step feels of a modulus: b 2 / (1 + a), with a = exp(-dt / tau) and b = (1 - a) tau / dt."""
+    """Effective share of a modulus at time step dt: 2 b / (1 + a), a = exp(-dt / tau), b = (1 - a) tau / dt."""
     half = dt / (2 * times)
     return np.tanh(half) / half
 
@@ -30,7 +30,7 @@ def felt_share(times: np.ndarray, dt: float) -> np.ndarray:
 def courant_number(
     solid: Solid, felt: float, *, dt: float, cell: float, formulation: Formulation, viscosity: float = 0.0
 ) -> float:
-    """Courant number of one particle of the solid, whose elements the step feels as ``felt`` equilibrium moduli."""
+    """Courant number of one particle of the solid with Maxwell elements of effective relative modulus ``felt``."""
     one = torch.ones(1, dtype=torch.float64)
     body = Body(
         position=torch.zeros(1, 3, dtype=torch.float64),

@@ -1,8 +1,8 @@
-"""Time-temperature superposition: shift factors with their errors, the master curve, WLF and Arrhenius.
+"""Time-temperature superposition: shift factors with standard errors, master curve, WLF and Arrhenius laws.
 
-Convention, Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 11: at the reference temperature a modulus at the
-frequency a_T omega, or the time t / a_T, is b_T times what it is at T and omega, or t. So log10 a_T is positive below
-the reference.
+Convention (Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 11): with horizontal shift factor a_T and vertical
+shift factor b_T, E(a_T omega, T_ref) = b_T E(omega, T), and E(t / a_T, T_ref) = b_T E(t, T). So log10 a_T is positive
+below the reference temperature.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ KELVIN = 273.15
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shift:
-    """Shift factors, the coldest first.
+    """Horizontal and vertical shift factors, ordered from the coldest to the hottest curve.
 
     Attributes:
-        temperatures: [T] deg C, not decreasing.
-        log_a: log10 a_T [T] decades, 0 at the reference, positive below it.
+        temperatures: Temperatures [T] deg C, not decreasing.
+        log_a: log10 a_T [T] decades; 0 at the reference temperature, positive below it.
         reference: Reference temperature [deg C].
-        log_a_error: Standard error of the difference to the reference [T]; zeros if unknown.
-        log_b: log10 b_T [T] decades: what log10 of a modulus gains, and that of a compliance loses; zeros if None.
-        log_b_error: Its standard error [T].
-        covariance: Of log_a [T, T]; the squares of ``log_a_error`` on the diagonal if None.
-        overlap: Each pair of neighbours.
-        noise: Noise of each modulus (storage and loss, or the one there is) [decades].
-        misfit: By how much the curves of each modulus are no pieces of one curve, as standard deviation [decades].
+        log_a_error: Standard error of ``log_a`` relative to the reference temperature [T] decades; zeros if unknown.
+        log_b: log10 b_T [T] decades, added to log10 of a modulus, subtracted from log10 of a compliance; default zeros.
+        log_b_error: Standard error of ``log_b`` [T] decades.
+        covariance: Covariance of ``log_a`` [T, T]; diagonal with the squares of ``log_a_error`` if None.
+        overlap: Mismatch of each pair of neighbouring curves.
+        noise: Noise standard deviation of each modulus (storage and loss, or the single one) [decades].
+        misfit: Standard deviation of the discrepancy of a curve from the master curve, for each modulus [decades].
 
     Raises:
-        ValueError: if the numbers are not finite, their counts differ, or the temperatures decrease.
+        ValueError: for numbers that are not finite, different lengths, or decreasing temperatures.
     """
 
     temperatures: np.ndarray
@@ -77,7 +77,7 @@ class Shift:
 
     @property
     def determines_wlf(self) -> bool:
-        """Whether there are temperatures for the two constants of WLF: three beside the reference."""
+        """Whether at least three temperatures differ from the reference, which the two WLF constants require."""
         return int((np.abs(self.temperatures - self.reference) > 1e-9).sum()) > 2
 
 
@@ -89,17 +89,17 @@ def read_shift(
     units: Mapping[str, str] | None = None,
     sheet: str | None = None,
 ) -> Shift:
-    """Read a list of shift factors, with columns such as ``T`` and ``log_aT`` and the unit of temperature.
+    """Read a table of horizontal shift factors, with columns such as ``T`` and ``log_aT`` and the unit of temperature.
 
     Args:
-        path: File, as of :func:`torchsoro.rheology.measured.read`.
-        reference: deg C; where log10 a_T crosses 0 if None.
-        columns: Column of "temperature" or "log_a", where the header does not say.
-        units: Unit of "temperature", before what the file says.
+        path: File, as for :func:`torchsoro.rheology.measured.read`.
+        reference: Reference temperature [deg C]; interpolated where log10 a_T crosses 0 if None.
+        columns: Column of "temperature" or "log_a", where the header does not name it.
+        units: Unit of "temperature"; overrides the file.
         sheet: Sheet of a workbook.
 
     Raises:
-        ValueError: for what is missing, or a list that does not cross 0 and no reference.
+        ValueError: for a missing column, or without ``reference`` for a log10 a_T that does not cross 0.
         FileNotFoundError: if there is no such file.
         ModuleNotFoundError: for a workbook, without the package that reads it.
     """
@@ -127,23 +127,24 @@ def superpose(
     misfit: float | None = None,
     progress: Callable[[float], object] | None = None,
 ) -> Shift:
-    """Find the shifts under which isothermal curves are most likely pieces of one smooth curve.
+    """Estimate the shift factors that superpose isothermal curves into a smooth master curve.
 
-    All shifts are found together, see :mod:`torchsoro.rheology.alignment`; a first guess comes from pair after pair.
-    log10 a_T may not grow with temperature, and neighbours may leave a gap of half a decade at most. Errors grow from
-    the reference outwards, and are larger where curves are flat, overlap little or do not superpose; a step that the
-    data do not tell has an error of some decade. Storage and loss count by their noise and misfit, which are estimated
-    from the data's own roughness and from how well they superpose.
+    All shift factors maximise one likelihood, see :mod:`torchsoro.rheology.alignment`; initial values come from pairs
+    of neighbours. log10 a_T does not increase with temperature, and the gap between neighbouring shifted curves is at
+    most half a decade. Standard errors grow with the distance from the reference temperature, and where curves are
+    flat, overlap little or do not superpose; that of an undetermined step is about a decade. Storage and loss modulus
+    are weighted by their noise and discrepancy, which are estimated from the curves.
 
     Args:
-        curves: Sweeps, relaxation or creep tests in any order, at least two, of at least three points each.
-        reference: deg C, within the measured temperatures; between two of them the shift is interpolated.
-        vertical: Find vertical shifts too, the same for storage and loss.
-        moduli: Which of a sweep's moduli to use. The loss modulus of a stiff specimen often holds the instrument's.
-        misfit: By how much a curve may depart from the master curve, as standard deviation [decades]: estimated if
-            None. With 0 whatever differs is shift, as in a superposition by eye: more definite, and wrong where curves
-            are flat and their heights are not comparable.
-        progress: Is called with the share of the work done since its last call; the shares add up to 1.
+        curves: Frequency sweeps, relaxation or creep tests in any order, at least two, of at least three points each.
+        reference: Reference temperature [deg C], within the measured range; shifts are interpolated between curves.
+        vertical: Whether vertical shift factors are estimated, common to storage and loss modulus.
+        moduli: Moduli of a sweep to be used. For a stiff specimen the measured loss modulus often contains that of the
+            instrument.
+        misfit: Standard deviation of the discrepancy of a curve from the master curve [decades]; estimated if None.
+            With 0 all differences are attributed to shift factors, as in manual superposition: standard errors are
+            smaller, and shifts biased where curves are flat and differ by a vertical error.
+        progress: Called with the fraction of the work done since the previous call; the fractions add up to 1.
 
     Raises:
         ValueError: naming the argument or the curve, the value seen and the value wanted.
@@ -187,17 +188,17 @@ def superpose(
 
 
 def master(curves: Sequence[C], shift: Shift) -> C:
-    """The curves' points as one curve at the shift's reference.
+    """Master curve at the reference temperature of the shift factors.
 
     Args:
-        curves: As given to :func:`superpose`.
-        shift: From there, or published, with one temperature for each curve.
+        curves: As for :func:`superpose`.
+        shift: Shift factors, estimated or published, one temperature for each curve.
 
     Returns:
-        A curve of the same kind; where points of several curves fall on one frequency or time, their mean.
+        A curve of the same kind; points of equal shifted frequency or time are averaged.
 
     Raises:
-        ValueError: if the temperatures of curves and shift differ by more than 1 K.
+        ValueError: if temperatures of ``curves`` and ``shift`` differ by more than 1 K.
     """
     ordered = _ordered(curves, least=1)
     temperatures = np.array([curve.temperature for curve in ordered])
@@ -219,15 +220,15 @@ class Wlf:
     """log10 a_T = -C1 (T - Tr) / (C2 + T - Tr), Williams, Landel and Ferry, J. Am. Chem. Soc. 77 (1955) 3701.
 
     Attributes:
-        C1: Decades.
-        C2: [K].
-        reference: Tr [deg C].
-        C1_error: Standard error [decades].
-        C2_error: Standard error [K].
-        correlation: Of the two errors.
-        residual: Root mean square of measured less fitted shifts [decades].
-        quality: Root of chi squared over the degrees of freedom: about 1 if the law holds within the errors of the
-            shifts; nan if those are unknown. Above 1 the errors of C1 and C2 are already larger by it.
+        C1: First constant [decades].
+        C2: Second constant [K].
+        reference: Reference temperature Tr [deg C].
+        C1_error: Standard error of C1 [decades].
+        C2_error: Standard error of C2 [K].
+        correlation: Correlation coefficient of the two errors.
+        residual: Root mean square of measured minus fitted log10 a_T [decades].
+        quality: Square root of chi squared over the degrees of freedom: about 1 if the law holds within the standard
+            errors of the shifts; nan if those are unknown. Values above 1 are included in the errors of C1 and C2.
     """
 
     C1: float
@@ -243,7 +244,7 @@ class Wlf:
         """log10 a_T at temperatures [deg C].
 
         Raises:
-            ValueError: at or below Tr - C2, where the law has no meaning.
+            ValueError: at or below Tr - C2, the pole of the law.
         """
         above = np.asarray(temperature, dtype=np.float64) - self.reference
         if (above <= -self.C2).any():
@@ -251,7 +252,7 @@ class Wlf:
         return -self.C1 * above / (self.C2 + above)
 
     def at(self, reference: float) -> Wlf:
-        """The same law with another reference [deg C]: C2' = C2 + Tr' - Tr, C1' = C1 C2 / C2'.
+        """The law at another reference temperature [deg C]: C2' = C2 + Tr' - Tr, C1' = C1 C2 / C2'.
 
         Raises:
             ValueError: at or below Tr - C2.
@@ -271,11 +272,11 @@ class Arrhenius:
     """log10 a_T = E / (R ln 10) (1 / T - 1 / Tr), temperatures in K.
 
     Attributes:
-        activation_energy: E [J/mol].
-        reference: Tr [deg C].
-        activation_energy_error: Standard error [J/mol].
-        residual: Root mean square of measured less fitted shifts [decades].
-        quality: As of :class:`Wlf`.
+        activation_energy: Activation energy E [J/mol].
+        reference: Reference temperature Tr [deg C].
+        activation_energy_error: Standard error of E [J/mol].
+        residual: Root mean square of measured minus fitted log10 a_T [decades].
+        quality: As for :class:`Wlf`.
     """
 
     activation_energy: float
@@ -291,10 +292,10 @@ class Arrhenius:
 
 
 def wlf(shift: Shift) -> Wlf:
-    """Fit the WLF law to shifts, by their covariance; with equal weights if their errors are unknown.
+    """Fit the WLF law to log10 a_T by generalised least squares; with equal weights if the covariance is unknown.
 
     Raises:
-        ValueError: for less than three temperatures, apart from the reference, or shifts that do not fall with
+        ValueError: for fewer than three temperatures besides the reference, or log10 a_T that does not decrease with
             temperature.
     """
     T, reference = shift.temperatures, shift.reference
@@ -302,7 +303,8 @@ def wlf(shift: Shift) -> Wlf:
     if np.polyfit(T, shift.log_a, 1)[0] >= 0:
         raise ValueError(f"log_a = {shift.log_a}: wanted falling with temperature")
     low = float(min(T.min(), reference))
-    # B / (T - V) + constant, V = Tr - C2 the pole below all temperatures, B = C1 C2; both positive by their logarithms.
+    # log10 a_T = B / (T - V) + constant with the pole V = Tr - C2 below all temperatures and B = C1 C2; unknowns are
+    # the logarithms of B and of the distance to the pole, which keeps both positive.
 
     def model(p: np.ndarray) -> np.ndarray:
         pole = low - np.exp(p[1])
@@ -328,10 +330,10 @@ def wlf(shift: Shift) -> Wlf:
 
 
 def arrhenius(shift: Shift) -> Arrhenius:
-    """Fit the Arrhenius law to shifts, weighted as in :func:`wlf`.
+    """Fit the Arrhenius law to log10 a_T, weighted as in :func:`wlf`.
 
     Raises:
-        ValueError: for less than two temperatures, apart from the reference.
+        ValueError: for fewer than two temperatures besides the reference.
     """
     whiten = _whitening(shift, 1)
     unit = Arrhenius(activation_energy=1.0, reference=shift.reference).log_a(shift.temperatures)
@@ -348,20 +350,20 @@ def arrhenius(shift: Shift) -> Arrhenius:
 
 
 def _whitening(shift: Shift, parameters: int) -> np.ndarray:
-    """What makes the errors of the shifts independent and equal: V / s of their covariance V^T s^2 V [k, T]."""
+    """Whitening matrix of the shifts [k, T]: eigenvectors of their covariance over the standard deviations."""
     covariance = np.asarray(shift.covariance)
     away = np.abs(shift.temperatures - shift.reference) > 1e-9
     if away.sum() <= parameters:
-        raise ValueError(f"temperatures = {shift.temperatures}: wanted over {parameters}, apart from the reference")
+        raise ValueError(f"temperatures = {shift.temperatures}: wanted more than {parameters} besides the reference")
     if not covariance.any():
         return np.eye(len(away))
     values, vectors = np.linalg.eigh(covariance)
-    keep = values > 1e-10 * values.max()  # the reference itself is known
+    keep = values > 1e-10 * values.max()  # log10 a_T is exactly 0 at the reference
     return vectors[:, keep].T / np.sqrt(values[keep])[:, None]
 
 
 def _scale(residuals: np.ndarray, parameters: int, shift: Shift) -> tuple[float, float]:
-    """By what the covariance of a fit is to be multiplied, and the quality of the fit."""
+    """Factor of the covariance of a fit, at least 1 if errors are known, and the quality of the fit."""
     away = np.abs(shift.temperatures - shift.reference) > 1e-9
     reduced = float(residuals @ residuals) / (int(away.sum()) - parameters)
     return (max(1.0, reduced), float(np.sqrt(reduced))) if np.asarray(shift.covariance).any() else (reduced, np.nan)
@@ -375,7 +377,7 @@ def _errors(covariance: np.ndarray) -> dict[str, float]:
 
 
 def _ordered(curves: Sequence[C], least: int = 2) -> list[C]:
-    """The curves, checked, the coldest first."""
+    """Validated curves, ordered by temperature."""
     if len(curves) < least:
         raise ValueError(f"curves: {len(curves)}, wanted at least {least}")
     kinds = {(type(curve).__name__, curve.deformation) for curve in curves}
@@ -388,13 +390,13 @@ def _ordered(curves: Sequence[C], least: int = 2) -> list[C]:
 
 
 def _interpolation(temperatures: np.ndarray, reference: float) -> np.ndarray:
-    """Weights [T] with which the shifts at the temperatures make that at the reference: cubic in 1 / T at most."""
+    """Lagrange weights [T] that interpolate shifts to the reference temperature, at most cubic in 1 / T."""
     if not temperatures[0] - 1e-6 <= reference <= temperatures[-1] + 1e-6:
         raise ValueError(
-            f"reference = {reference}: wanted from {temperatures[0]:.4g} to {temperatures[-1]:.4g} deg C, which is "
-            "measured; convert with wlf(shift).at(reference) for another"
+            f"reference = {reference}: wanted from {temperatures[0]:.4g} to {temperatures[-1]:.4g} deg C, the "
+            "measured range; convert to a reference outside it with wlf(shift).at(reference)"
         )
-    place = np.cumsum(np.diff(temperatures, prepend=temperatures[0]) > SAME / 2)  # repeated temperatures are one
+    place = np.cumsum(np.diff(temperatures, prepend=temperatures[0]) > SAME / 2)  # repeated temperatures share a node
     counts = np.bincount(place)
     nodes = 1 / (np.bincount(place, temperatures) / counts + KELVIN)
     at = 1 / (reference + KELVIN)

@@ -1,7 +1,7 @@
-"""Terminal flow: whether the slow end of a curve is that of a liquid, which has no equilibrium modulus.
+"""Detection of terminal flow: power laws of a liquid, which has no equilibrium modulus, at the slow end of a curve.
 
-At low frequency G' of a liquid falls as w^2 and G'' as w; at long times its compliance grows as t. No critical gel,
-whose G' and G'' share one power below 1, reaches that (Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 3).
+In the terminal zone of a liquid G' ~ w^2, G'' ~ w and J ~ t. In a critical gel G' and G'' follow one power below 1
+(Ferry, Viscoelastic Properties of Polymers, 3rd ed., ch. 3).
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from scipy.stats import t as student
 from torchsoro.rheology.measured import Creep, Relaxation, Sweep
 
 SPAN = 10.0  # factor of frequency or time over which the slopes are taken: the slowest decade
-LEAST = 5  # points that a slope is taken of
-LEVEL = 0.95  # of the intervals
-STORAGE_SLOPE = 1.0  # d ln G' / d ln w above which no solid and no gel stays down to its low end
-CREEP_SLOPE = 0.9  # d ln J / d ln t likewise
+LEAST = 5  # smallest number of points of a slope
+LEVEL = 0.95  # confidence level of the slopes
+STORAGE_SLOPE = 1.0  # d ln G' / d ln w above which the curve ends in flow: solids and gels stay below
+CREEP_SLOPE = 0.9  # d ln J / d ln t above which the curve ends in flow
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slope:
-    """Power of frequency or time with which a modulus or compliance changes over the slowest decade.
+    """Exponent of the power law of a modulus or compliance over the slowest decade.
 
     Attributes:
         value: Exponent.
-        error: Half width of its 95 % interval.
+        error: Half width of its 95 % confidence interval.
     """
 
     value: float
@@ -41,12 +41,13 @@ class Slope:
 
 @dataclass(frozen=True, kw_only=True)
 class Flow:
-    """A curve that ends in flow.
+    """Terminal flow of a curve.
 
     Attributes:
-        slopes: Of storage and loss modulus over frequency, or of the compliance over time.
-        viscosity: Zero-shear viscosity, or a third of Trouton's in tension as measured: G'' / w or t / J [Pa s].
-        time: Mean relaxation time G' / (w G''), which the recoverable strain takes [s]; nan of creep.
+        slopes: Exponents of storage and loss modulus over frequency, or of the compliance over time.
+        viscosity: G'' / w or t / J [Pa s]: the zero-shear viscosity for data in shear, the elongational viscosity for
+            data in tension.
+        time: Mean relaxation time G' / (w G'') [s]; nan for creep.
     """
 
     slopes: tuple[Slope, ...]
@@ -55,7 +56,7 @@ class Flow:
 
     @property
     def sentence(self) -> str:
-        """The finding in words."""
+        """Exponents and viscosity in words."""
         if len(self.slopes) == 1:
             how = (
                 f"over the last decade of time the compliance follows the power {self.slopes[0]} of it (1 in a liquid)"
@@ -70,17 +71,17 @@ class Flow:
 
 
 def terminal_flow(curve: Sweep | Relaxation | Creep) -> Flow | None:
-    """Find whether a curve's slow end is that of a liquid, as far as the data reach.
+    """Detect terminal flow at the slow end of a curve.
 
-    A sweep ends in flow if its loss modulus exceeds the storage modulus there and the storage modulus' exponent is
-    above 1 with 95 % confidence; creep if the compliance's is above 0.9. Of relaxation nothing is said: its modulus
-    falls as fast in a solid that has an equilibrium modulus below what was measured.
+    Over the slowest decade, a sweep flows if the loss modulus exceeds the storage modulus and the exponent of the
+    storage modulus is above 1 with 95 % confidence; creep, if the exponent of the compliance is above 0.9. Stress
+    relaxation is not classified: the modulus of a solid with a small equilibrium modulus can fall equally fast.
 
     Args:
-        curve: Measured, or a master curve.
+        curve: Measured curve or master curve.
 
     Returns:
-        Exponents and viscosity; None if it does not flow, or for fewer than five points.
+        Exponents and viscosity; None without terminal flow, for stress relaxation, or for fewer than five points.
     """
     if isinstance(curve, Relaxation):
         return None
@@ -104,7 +105,7 @@ def terminal_flow(curve: Sweep | Relaxation | Creep) -> Flow | None:
 
 
 def _slowest(omega: np.ndarray) -> np.ndarray | None:
-    """Indices of the slowest decade, or of the slowest points if it holds few; None for too few points."""
+    """Indices of the slowest decade, at least ``LEAST`` points; None for fewer points."""
     order = np.argsort(omega)
     count = max(int((omega <= SPAN * omega.min()).sum()), LEAST)
     return order[:count] if len(omega) >= LEAST else None
