@@ -92,7 +92,6 @@ def test_automatic_step_is_stable_with_all_elements_and_grows_with_cell():
     fine, coarse = paper("auto"), paper("auto", cell=2 * CELL)
     assert fine.stable == coarse.stable == 5 and fine.dt == fine.elements[5].step
     assert 1e-5 < fine.dt < 1.2e-5 < coarse.dt  # the notes: stable at 10 us, not at 12 us
-    assert "nothing is left out" in fine.sentence
 
 
 @given(
@@ -124,10 +123,11 @@ def test_substitute_errors_and_stable_steps_match_direct_evaluation():
         assert material.loss_error == pytest.approx(loss, rel=0.02, abs=1e-9), name
         step = stable_step(particle(material.viscosity), material.prony(), cell=CELL)
         assert material.step == pytest.approx(step, rel=3e-4)
-        assert material.sentence.startswith(name)
+
     assert found["all elements"].loss_error == 0
-    assert "4 elements in place of 5" in found["refitted"].sentence
-    assert "3 elements and 149 Pa s in place of 5" in found["viscosity"].sentence
+    assert len(found["refitted"].moduli) == 4
+    assert len(found["viscosity"].moduli) == 3
+    assert found["viscosity"].viscosity == pytest.approx(149, abs=0.5)
     assert found["left out"].loss_error == pytest.approx(0.207, abs=0.002)
 
 
@@ -159,7 +159,7 @@ def test_refitted_elements_are_stable_and_more_accurate_than_lumped(dt, formulat
 
 def test_five_elements_match_twenty_five_within_1_percent_over_band():
     spent, easy = (budget(LONG, LONG.solid(0.4, 1070.0), cell=CELL, band=BAND, dt=dt) for dt in (3e-5, 1e-5))
-    assert spent.stable < easy.stable == 25 and "takes 5 of them" in easy.sentence
+    assert spent.stable < easy.stable == 25
     assert [m.name for m in substitutes(easy, match=100.0)] == ["all elements", "refitted"]
     errors = []
     for count in (1, 2, 3, 5):
@@ -182,10 +182,10 @@ def test_stable_series_of_five_elements_is_unchanged_by_choose():
 def test_elements_4_and_5_are_unstable_at_20_us_and_spring_at_100_us():
     spent = paper(2e-5)
     assert [row["stable"] for row in spent.rows()] == ["yes"] * 4 + ["no"] * 2
-    for part in ("elements 4 to 5", "5.77 us to 0.159 us", "2 times as many steps", "21 % of the loss"):
-        assert part in spent.sentence
-    assert "element 5 " in paper(1.1e-5).sentence
-    assert "even the equilibrium spring is not stable" in paper(1e-4).sentence
+    assert spent.elements[5].cost == pytest.approx(2, abs=0.2)
+    assert spent.elements[4].loss_lost == pytest.approx(0.21, abs=0.005)
+    assert [e.number for e in paper(1.1e-5).elements if not e.stable] == [5]
+    assert not paper(1e-4).elements[0].stable
 
 
 def test_elastic_solid_has_zero_storage_and_loss_error():

@@ -25,7 +25,7 @@ def folder(checks, name):
 def test_absent_recording_folders_are_skipped(checks, tmp_path, capsys):
     checks.main(tmp_path)
     said = capsys.readouterr().out
-    assert said.count("skipped, there is no folder") == 3
+    assert said.count("skipped") == 3
     assert str(tmp_path / "silicone-tensile-tests") in said
 
 

@@ -61,7 +61,7 @@ def test_prony_series_recovered_within_3_percent_from_sweep_file(modules, tmp_pa
     scale = read.solid.youngs_modulus / MODULUS
     np.testing.assert_allclose(scale * moduli(read.prony, omega), moduli(truth, omega), rtol=0.03)
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "Time-temperature superposition" in page and page.count("<img") == 3
+    assert page.count("<img") == 3
     assert read.left_out in page.replace("&#x27;", "'")
     robot = walker(dataclasses.replace(TINY, material=tmp_path / "out" / "material.toml", dt="auto"))
     assert robot.prony.elements == read.prony.elements

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from torchsoro.rheology.creep import interconverted
@@ -143,7 +143,10 @@ def test_given_relaxation_times_narrow_intervals_of_moduli():
     weights=st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
     fluidity=st.sampled_from([0.0, 1e-8]),
 )
-def test_complex_modulus_times_complex_compliance_is_one_after_interconversion(gaps, weights, fluidity):
+@example(gaps=[2.0, 1.0, 3.0, 1.0, 4.0, 2.0], weights=[0.0] * 6, fluidity=1e-8).xfail(
+    reason="13 decades of a liquid: rounding of its zero rate makes the creep compliance 1.5e-6 too small"
+)
+def test_complex_modulus_and_compliance_are_each_others_inverse(gaps, weights, fluidity):
     times, compliances = 1e-4 * 10 ** np.cumsum(gaps), 1e-6 * 10 ** np.array(weights[: len(gaps)])
     found = interconverted(1e-7, fluidity, compliances, times)
     omega = np.geomspace(1e-6, 1e6, 40)

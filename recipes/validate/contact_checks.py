@@ -18,7 +18,7 @@ from torchsoro.design.density import part
 
 Curve = tuple[str, int, float, np.ndarray, np.ndarray, np.ndarray]
 GRAVITY = 9.81
-VISCOSITY = 50.0  # brings a block to rest within some 0.1 s [Pa s]
+VISCOSITY = 50.0  # [Pa s], brings a block to rest within about 0.1 s
 
 
 def restitution(
@@ -28,12 +28,13 @@ def restitution(
     *,
     speed: float = 4.0,
 ) -> tuple[list[Row], list[Curve]]:
-    """Rebound of a cube dropped flat on a ground that sticks; cells and step are the paper's.
+    """Coefficient of restitution of a cube dropped flat on sticking ground, with the paper's cell and step.
 
-    For five elements in the total form that step is above the bound for every body; it takes a smaller one.
+    In the total formulation with five Maxwell elements the step is reduced to the stability bound.
 
     Returns:
-        Rows, and for each the form, elements, edge [mm], time [ms], height of the centre [mm] and its velocity [m/s].
+        Rows, and a curve for each: formulation, elements, edge [mm], time [ms], height of the centre [mm] and its
+        velocity [m/s].
     """
     rows, curves = [], []
     for form, size, count in itertools.product(forms, sizes, elements):
@@ -78,21 +79,21 @@ def ball_drop(
     gap: float = 0.05,
     duration: float = 0.3,
 ) -> tuple[list[Row], list[Curve]]:
-    """A ball of the paper's resin falls on a ground that sticks, as in the paper's Fig. S9, and bounces.
+    """Coefficient of restitution of a ball of the paper's resin on sticking ground (Fig. S9 of the paper).
 
-    The updated form takes the paper's step, the total one the largest that is stable.
+    The updated formulation uses the paper's step, the total one the largest stable step.
 
     Args:
-        elements: Maxwell elements of Table S1.
-        forms: Of the simulator.
-        diameter: Of the ball [m].
-        across: Cells in the diameter.
-        gap: From the ball to the ground [m].
-        duration: Of the simulation [s]; should hold the first rebound and its fall.
+        elements: Numbers of Maxwell elements of Table S1.
+        forms: Formulations of the simulator.
+        diameter: Diameter of the ball [m].
+        across: Number of cells across the diameter.
+        gap: Initial distance of the ball from the ground [m].
+        duration: Duration of the simulation [s]; must include the first rebound and the following fall.
 
     Returns:
-        Rows with the restitution (speed after the first impact over speed before), and curves as :func:`restitution`
-        with the diameter for the edge.
+        Rows with the restitution (speed after over speed before the first impact), and curves as for
+        :func:`restitution` with the diameter as edge.
     """
     rows, curves = [], []
     cell = diameter / across
@@ -142,9 +143,9 @@ def standing(
 ) -> list[Row]:
     """Height of a block at rest on smooth ground: H/2 - rho g H^2 / (3 E) for the centre of gravity.
 
-    The block is let go a part of a cell above the ground ("shift"), and as far off the grid's lines along x and y. It
-    is viscous, so that it comes to rest. In the updated form it does not fall: it feels the ground as soon as one of
-    its particles is less than a cell in front.
+    The block is released a fraction of a cell above the ground ("shift"), with the same offset from the grid along x
+    and y. Viscosity brings it to rest. In the updated formulation it does not fall, since contact acts on particles
+    within one cell of the ground.
     """
     rows = []
     for form, n, shift in itertools.product(forms, cells, shifts):
@@ -181,14 +182,16 @@ def sliding(
     edge: float = 0.03,
     speed: float = 1.0,
 ) -> list[Row]:
-    """Distance of a block that slides to rest on ground with Coulomb friction: v^2 / (2 mu g).
+    """Sliding distance of a block on ground with Coulomb friction: v^2 / (2 mu g).
 
-    It starts where it rests: on the ground, in the updated form by "shift" above it (see :func:`standing`), and as far
-    off the grid's lines along x and y. If it fell from there at mu = 0.6, it would trip and roll.
+    The block starts at its equilibrium height: on the ground, in the updated formulation by "shift" above it (see
+    :func:`standing`), with the same offset from the grid along x and y. Falling onto the ground at mu = 0.6 it would
+    tip over.
 
-    The block has the Maxwell elements of the paper's resin. Without any (``elements`` = 0) friction excites it, and the
-    total form, which has no losses, shows it: nodes at its lower face, which weigh a sixth of those inside, swing at up
-    to the speed of the block, stick for moments, and friction is then less than mu N. So it comes too far.
+    The block has the Maxwell elements of the paper's resin. Without them (``elements`` = 0) friction excites
+    vibrations, which the lossless total formulation does not damp: nodes of the lower face, of a sixth of the mass of
+    inner nodes, oscillate at up to the sliding speed and stick intermittently, where friction is below mu N. The
+    distance is then too long.
     """
     rows = []
     for form, n, shift, friction in itertools.product(forms, cells, shifts, frictions):

@@ -12,19 +12,19 @@ from torchsoro.sim2real.data.recording import write_table
 
 
 def setup(text: str, markers: Mapping[str, Sequence[float]], noise: float = 5e-5) -> str:
-    """Of the experiment, with its markers, and the noise of motion capture [m]."""
+    """Text of setup.toml with the markers and the standard deviation of motion capture noise [m]."""
     marker = "\n".join(f'[[marker]]\nname = "{name}"\nat = {list(at)}\n' for name, at in markers.items())
     return f'{text}\n{marker}\n[recording]\nkind = "mocap"\nnoise = {noise}\n'
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Files:
-    """Of a trial, or of one that is kept.
+    """Files of a trial.
 
     Attributes:
-        kept: Whether it is to be predicted only.
+        kept: Whether the trial is held out for prediction.
         markers: Columns of markers.csv.
-        pressure: Those of pressure.csv, if there is one.
+        pressure: Columns of pressure.csv, if there is one.
         trial: Text of trial.toml, if there is one.
         simulated: Columns of simulated.csv, if there is one.
     """
@@ -37,10 +37,10 @@ class Files:
 
 
 def fresh(out: Path) -> Path:
-    """A folder for an experiment.
+    """Folder of a new experiment.
 
     Raises:
-        ValueError: if it holds trials already, among which new ones would be lost.
+        ValueError: if it contains trials already.
     """
     if (out / "trials").exists() or (out / "heldout").exists():
         raise ValueError(f"out = {out}: holds an experiment already, wanted a new folder")

@@ -1,25 +1,25 @@
-"""Fits of the simulator's solid to finite-strain tests that others measured, and what they predict of tests left out.
+"""Fits of the simulator's solid to published finite-strain tests, and prediction of held-out tests.
 
     python recipes/validate/finite_checks.py RECORDINGS     # two to five minutes
 
-RECORDINGS is a folder with ``viscoelastic-shear-and-tension`` (an optically clear adhesive in shear, a material without
-a name in tension) and ``silicone-tensile-tests``; what is absent is skipped and said. The functions return their rows.
+RECORDINGS is a folder with ``viscoelastic-shear-and-tension`` (a clear adhesive in shear, an unnamed material in
+tension) and ``silicone-tensile-tests``; absent folders are skipped with a message. The functions return their rows.
 
-How the files are read:
+Interpretation of the files:
 
-- Tension, load and unload: stretch and nominal stress as named, times as written; they are the way over the rate. The
-  authors have smoothed the curves to some 85 points, and one begins with a step back.
-- Stepped cyclic shear: shear stress and strain by their names, since force and displacement swap places in one file. By
-  the times of the files the rates are 1, 2, 5 and 6 strains a *minute*; the file without a number is that of 2, and the
-  one of 0.1 1/s that of 6.
-- Monotonic shear: the times are not those of an even rate of shear. Even with them goes the unlabelled column, which is
-  strain / sqrt(1 + strain^2 / 4), a strain measure that levels off at 2; in the end the shear would go 40 to 170
-  times as fast as the file's name says. :func:`clocks` fits the tests with these times and with strain / rate: the
-  latter is nearer, a little up to a strain of 2 and by half over all, and is taken.
-- Silicones: engineering strain and stress, the strain that of the cross-head. Three files have times that a spreadsheet
-  continued as text (40.9, 40.10, 40.11), one a last time that goes back, so that times are strain / rate, at the speed
-  and length in the file's head; the fits do not depend on them. What comes after the largest stress is rupture and is
-  left out, 1 to 3 samples of three files.
+- Uniaxial loading and unloading: columns of stretch and nominal stress, times of the file, which equal accumulated
+  stretch over rate. The published curves are smoothed to about 85 points; one begins with a decreasing stretch.
+- Stepped cyclic shear: columns of shear stress and strain by name, since force and displacement are exchanged in one
+  file. From the times of the files the rates are 1, 2, 5 and 6 strains per *minute*; the file without a number has a
+  rate of 2 1/min, the one labelled 0.1 1/s a rate of 6 1/min.
+- Monotonic shear: the times of the files do not correspond to a constant shear rate. The unlabelled column, linear in
+  these times, is strain / sqrt(1 + strain^2 / 4), which saturates at 2; the shear rate at the end would be 40 to 170
+  times the rate in the file name. :func:`clocks` fits the tests with these times and with strain / rate: the latter
+  gives the smaller error, slightly up to a strain of 2 and by half over the whole range, and is used.
+- Silicones: engineering strain (cross-head) and engineering stress. Three files have times continued as text by a
+  spreadsheet (40.9, 40.10, 40.11), one a decreasing last time; times are therefore strain / rate, from speed and gauge
+  length in the head of the file. The fits do not depend on the times. Samples after the largest stress (rupture) are
+  omitted, 1 to 3 samples of three files.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _PER_MINUTE = {"": 2, "_0d1": 6, "_1": 1, "_5": 5}  # strains, by the ends of th
 
 
 def until(experiment: Experiment, largest: float) -> Experiment:
-    """A test up to where its deformation first exceeds ``largest``."""
+    """Test truncated before the first sample whose deformation exceeds ``largest``."""
     beyond = np.flatnonzero(experiment.deformation > largest)
     return experiment.part(np.arange(beyond[0] if len(beyond) else len(experiment.time)))
 
@@ -58,7 +58,7 @@ def tension(folder: Path) -> dict[float, list[Experiment]]:
 
 
 def monotonic(folder: Path, *, clock: bool = False) -> dict[float, list[Experiment]]:
-    """Tests in shear by their rate [1/s]; with ``clock`` at the times of the files instead of strain / rate."""
+    """Monotonic shear tests by rate [1/s], with times strain / rate, or those of the files if ``clock``."""
     paths = sorted((folder / "monotonic-shear-test").glob("*.csv"))
     return {_rate(path): [read(path, rate=None if clock else _rate(path))] for path in paths}
 
@@ -71,23 +71,22 @@ def stepped(folder: Path) -> dict[float, list[Experiment]]:
 
 
 def _rate(path: Path) -> float:
-    """As in the last part of the name: 0d03 is 0.03."""
+    """Rate in the last part of the file name: 0d03 is 0.03."""
     return float(path.stem.split("_")[-1].replace("d", "."))
 
 
 def split(
     tests: Mapping[float, Sequence[Experiment]], held: Sequence[float], *, specimens: bool = False, elements: int = 2
 ) -> Row:
-    """Fit on the tests of some rates, predict those of the others: relative errors [%] without and with viscosity.
+    """Fit a law without and with Maxwell elements to tests of some rates and predict the others: relative errors [%].
 
-    Both laws are Yeoh's with C20 and C30; the number of Maxwell elements, up to ``elements``, is that of the lowest
-    criterion (BIC) on the fitted tests.
+    Both laws are Yeoh laws with C20 and C30; the number of Maxwell elements minimises the BIC on the fitted tests.
 
     Args:
-        tests: By rate.
-        held: The rates to be predicted.
-        specimens: Whether each test may have a factor of its own, also where it is predicted.
-        elements: Most elements.
+        tests: Tests by rate.
+        held: Held-out rates.
+        specimens: Whether a stress factor of each test is fitted, also for the held-out tests.
+        elements: Largest number of Maxwell elements.
     """
     known = [e for rate in tests if rate not in held for e in tests[rate]]
     other = [e for rate in held for e in tests[rate]]
@@ -113,7 +112,7 @@ def split(
 
 
 def shear_and_tension(folder: Path) -> list[Row]:
-    """Half of the rates, or two of three, predict the others, in every kind of test."""
+    """Prediction of held-out rates from half or two thirds of the rates, for each kind of test."""
     rows: list[Row] = []
 
     def add(what: str, tests: Mapping[float, Sequence[Experiment]], helds: Sequence[Sequence[float]], **given) -> None:
@@ -131,7 +130,7 @@ def shear_and_tension(folder: Path) -> list[Row]:
 
 
 def clocks(folder: Path) -> list[Row]:
-    """Monotonic shear: how a fit to all rates follows them at the times of the files, and at strain / rate."""
+    """Error of a fit to all rates of monotonic shear, with times of the files and with times strain / rate."""
     rows: list[Row] = []
     for name, largest in ((f"to {MODERATE:g}", MODERATE), ("whole", math.inf)):
         for reading, clock in (("as written", True), ("strain / rate", False)):
@@ -146,7 +145,7 @@ def clocks(folder: Path) -> list[Row]:
 
 
 def silicones(folder: Path) -> list[Row]:
-    """Laws without viscosity, fitted to each pull until rupture, with intervals.
+    """Elastic laws fitted to each silicone up to rupture, with intervals.
 
     They are wide where a law does not follow the curve: its residuals go together, so that they tell little. C30 is 0
     where it would be negative, as the stress would then fall at some stretch. The last two columns are the error of the
@@ -178,7 +177,7 @@ def silicones(folder: Path) -> list[Row]:
 
 
 def pull_rate(path: Path) -> float:
-    """Speed over length [1/s] from the head of a file.
+    """Strain rate [1/s]: cross-head speed over gauge length, from the head of a file.
 
     Raises:
         ValueError: if the head has no such line.
@@ -204,7 +203,7 @@ def _speed(experiment: Experiment) -> tuple[float, float]:
 
 
 def _interval(found: Fit, name: str, unit: float = 1.0) -> str:
-    """A number with the ends of its interval; "?" where these are more than a factor of a hundred apart."""
+    """Constant with its interval as text; "?" for bounds more than a factor of 100 apart."""
     interval: Interval | None = found.intervals.get(name)
     if interval is None:
         return "-"

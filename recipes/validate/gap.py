@@ -1,21 +1,21 @@
-"""Put into an archived robot what its paper's simulation lacked, hide it, and make an experiment of what is seen.
+"""Synthetic experiment: simulate an archived robot with an effect that its described model omits.
 
     python recipes/validate/gap.py walker --hide tube --out runs/gap
     python recipes/explain.py runs/gap --out runs/gap-explained
 
-The robot is simulated as it was designed, by particles, in four trials with different pressures; eight points of one
-side are filmed, with noise. ``setup.toml`` holds what is believed, without what ``--hide`` names, and ``simulated.csv``
-of each trial where the same simulation has the points then:
+The robot is simulated by particles in four trials at different pressures; trajectories of eight markers on one side are
+recorded with noise. ``setup.toml`` describes the model without the effect named by ``--hide``, and ``simulated.csv`` of
+each trial holds the marker trajectories simulated with that model. Effects:
 
-- tube: the supply's tube at the rear, a mass on a spring with a dashpot;
-- relaxation: the Maxwell elements, which the paper left out of simulations that took too long;
-- air: the chamber's air is believed to be a spring beside the pressure that holds it already: it counts twice;
+- tube: supply tube at the rear: a mass on a spring and a dashpot;
+- relaxation: Maxwell elements, which the paper omitted from long simulations;
+- air: the model includes the stiffness of the chamber's air in addition to the pressure that already contains it;
 - asymmetry: one side softer than the other;
-- nothing: the twin's own error, to be seen before anything is believed of the others.
+- nothing: none; gives the discretization error of the twin, the baseline for the others.
 
-What was hidden is in ``<out>-truth.json``, beside the experiment. A demonstration, not a proof: body and contact are
-simulated by another formulation than the twin's, but the effects have the forms that it knows. With ``--no-simulated``
-the twin has to do by itself.
+The hidden effect is in ``<out>-truth.json``, beside the experiment. This is a demonstration, not a validation: body and
+contact are simulated by a formulation other than the twin's, but the effects have the parametric forms that the
+hypotheses assume. With ``--no-simulated`` the experiment has no ``simulated.csv``, and the twin simulates by itself.
 """
 
 from __future__ import annotations
@@ -41,47 +41,47 @@ from torchsoro.output.fabricate import surface
 from torchsoro.simulation.loads import Drag, Load, PointMass, Spring
 from torchsoro.simulation.material import Body, Prony
 
-TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # of the pressure
-RATE, FINE = 200.0, 1000.0  # Hz, of the camera and of what is simulated
+TRIALS, KEPT = {"full": 1.0, "most": 0.8, "less": 0.6}, {"kept": 0.9}  # pressure over that of the design
+RATE, FINE = 200.0, 1000.0  # sampling rates of the camera and of the simulation [Hz]
 MARKERS = 8
 TUBE = {"mass_kg": 2e-3, "stiffness_n_m": 10.0, "damping_n_s_m": 0.02}
-REACH = 4e-3  # m around the rearmost point, on which the tube hangs
-SOFT = 0.3  # of its modulus, that one side lacks
+REACH = 4e-3  # radius around the rearmost point in which the tube is attached [m]
+SOFT = 0.3  # relative reduction of the modulus of the softer side
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to hide in what."""
+    """Synthetic experiment from an archived robot with a hidden effect."""
 
     robot: tyro.conf.Positional[str]
     """Name of an archived robot, or a run's folder."""
     out: Path
     """Folder of the experiment."""
     hide: Literal["nothing", "tube", "relaxation", "air", "asymmetry"] = "nothing"
-    """What the experiment lacks."""
+    """Effect in the simulated recording that the model of the experiment omits."""
     strength: float = 1.0
-    """Of a tube or an asymmetry, times the usual."""
+    """Strength of tube or asymmetry, relative to the default."""
     duration: float = 0.2
-    """Of a trial [s]."""
+    """Duration of a trial [s]."""
     settle: float = 0.05
-    """Time before the actuation starts, to come to rest [s]."""
+    """Time at rest before the actuation [s]."""
     noise: float = 1e-4
-    """Standard deviation [m]."""
+    """Standard deviation of the marker noise [m]."""
     seed: int = 0
-    """Of the noise."""
+    """Seed of the noise."""
     simulated: bool = True
-    """Whether the experiment comes with the simulation of what is believed."""
+    """Whether the experiment includes the simulation with its described model."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where to compute."""
+    """Device of the simulation."""
 
 
 def elements(robot: Robot) -> list[list[float]]:
-    """Pairs of modulus and time."""
+    """Relative modulus and relaxation time [s] of each Maxwell element."""
     return torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
 
 
 def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tuple[Body, list[Load], dict[str, Any]]:
-    """The body and what is attached to it, with what is hidden; the truth. Its air has this stiffness [Pa]."""
+    """Body and loads with the hidden effect, and its true parameters; ``stiffness`` of the air [Pa]."""
     solid = body.chamber < 0
     x = body.position
     if options.hide == "tube":
@@ -107,7 +107,7 @@ def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tupl
 
 
 def believed(options: Options, robot: Robot, stiffness: float) -> str:
-    """Tables of setup.toml but for markers and recording; air of this stiffness is believed [Pa]."""
+    """Tables of setup.toml without markers and recording; ``stiffness`` of the air in the model [Pa]."""
     s = robot.settings
     known = [] if options.hide == "relaxation" else elements(robot)
     tables = [
@@ -129,7 +129,7 @@ def believed(options: Options, robot: Robot, stiffness: float) -> str:
 
 
 def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, rate: float) -> dict[str, np.ndarray]:
-    """Times [T] s and places of some particles [T, M, 3] m of a trial."""
+    """Times [T] s and positions of the marker particles [T, M, 3] m of a trial."""
     motion = robot.simulator()(
         body,
         duration=robot.settings.settle + robot.settings.duration,
@@ -145,7 +145,7 @@ def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, 
 
 
 def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: torch.Tensor) -> dict[str, np.ndarray]:
-    """As :func:`simulate`, of what is believed, by these settings."""
+    """As :func:`simulate`, with the model described in the experiment, by these settings."""
     robot = build(settings)
     if options.hide == "relaxation":
         robot.prony = Prony.paper(0)
@@ -154,7 +154,7 @@ def nominal(options: Options, settings: Settings, gamma: torch.Tensor, probes: t
 
 
 def columns(track: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Of a table of markers."""
+    """Columns of a table of markers."""
     named = {
         f"m{i}_{a}_m": track["place"][:, i, k] for i in range(track["place"].shape[1]) for k, a in enumerate("xyz")
     }
@@ -162,7 +162,7 @@ def columns(track: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def spread(places: np.ndarray, count: int) -> list[int]:
-    """Numbers of places [N, 3] that lie far from each other."""
+    """Indices of positions [N, 3] far from each other."""
     chosen = [0]
     while len(chosen) < min(count, len(places)):
         near = np.linalg.norm(places[:, None] - places[chosen], axis=-1).min(1)

@@ -1,14 +1,14 @@
 """The gradient of a walker's travel against central differences, along smooth random directions.
 
     python recipes/validate/gradient.py                       # coarse, on a laptop
-    python recipes/validate/gradient.py --preset paper --after 10  # 64,000 particles, of a design that is on its way
+    python recipes/validate/gradient.py --preset paper --after 10  # 64,000 particles, a partly optimised design
 
-From rest on the ground the body is inflated for a while. A central difference is only as good as the motion is smooth
-over the perturbation: where a foot that sticks is caught or let go a substep earlier it has a jump, so here feet slide
-(see ``--friction``) and air comes slowly (``--rise``); small perturbations drown in float32's rounding. So the table
-gives a range of sizes. "spread" is how far L strays from a straight line through the two ends and the middle, over the
-difference of the ends: large where the motion is not smooth. "mean" is the gradient's mean over the perturbation by
-Simpson's rule, which a central difference equals also where L is curved.
+The body is inflated from rest on the ground. A central difference requires a motion smooth over the perturbation. With
+sticking contact L jumps where a foot sticks or slips a substep earlier; therefore feet slide (``--friction``) and air
+enters slowly (``--rise``). Small perturbations are limited by float32 rounding, so the table covers a range of sizes.
+"spread" is the deviation of L at the centre from the line through both ends, over the difference of the ends: large for
+a motion that is not smooth. "mean" is the mean gradient over the perturbation by Simpson's rule, which a central
+difference also equals for curved L.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ class Options:
     preset: Literal["desk", "paper"] = "desk"
     """Size of the walker."""
     formulation: Literal["total", "updated"] = "total"
-    """Of the simulator."""
+    """Formulation of the simulator."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Where; auto takes CUDA if there is one."""
+    """Device; auto selects CUDA if available."""
     friction: Literal["stick"] | float = 0.5
-    """Of the ground. Where feet stick, travel has a jump for each that is caught or let go a substep earlier."""
+    """Coulomb coefficient of the ground; with "stick" travel jumps where a foot sticks or slips a substep earlier."""
     settle: float = 0.05
     """Time at rest [s]."""
     duration: float = 0.1
     """Time of actuation [s]."""
     rise: float = 0.06
-    """Time constant of filling [s]; where it is short, feet chatter on the ground."""
+    """Time constant of filling [s]; short values cause contact chatter."""
     after: int = 0
-    """Design iterations before, on travel alone."""
+    """Preceding design iterations, with travel as the only objective."""
     directions: int = 3
-    """How many."""
+    """Number of random directions."""
     sizes: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003, 0.001)
-    """Largest changes of the design field."""
+    """Amplitudes of the perturbation of the design field."""
 
 
 def smooth(robot: Robot, seed: int) -> Tensor:
-    """A random direction of the design field with a wave length of the body's, at most 1."""
+    """Random direction of the design field with wavelengths of the body size and amplitude at most 1."""
     g = torch.Generator().manual_seed(seed)
     x = robot.domain.positions / robot.domain.size[0]
     waves = [
@@ -70,7 +70,7 @@ def smooth(robot: Robot, seed: int) -> Tensor:
 
 
 def rows(settings: Settings, options: Options) -> list[dict[str, Any]]:
-    """The table."""
+    """Rows of the table, one for each direction and size."""
     robot = walker(settings)
     phi = robot.field.phi
     with torch.no_grad():

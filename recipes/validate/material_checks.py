@@ -1,11 +1,11 @@
-"""The way from a rheometer to a material, held against published measurements and against a known material.
+"""Validation of superposition and Prony fits against published measurements and against a known material.
 
-    python recipes/validate/material_checks.py RECORDINGS            # everything that is there
-    python recipes/validate/material_checks.py RECORDINGS adhesive   # shift factors, a fit, pyvisco's
-    python recipes/validate/material_checks.py RECORDINGS polyisoprene# shift factors, the authors' WLF law
-    python recipes/validate/material_checks.py RECORDINGS polystyrene# the same for creep
+    python recipes/validate/material_checks.py RECORDINGS            # all data sets in the folder
+    python recipes/validate/material_checks.py RECORDINGS adhesive   # shift factors, fit, comparison with pyvisco
+    python recipes/validate/material_checks.py RECORDINGS polyisoprene  # shift factors, published WLF law
+    python recipes/validate/material_checks.py RECORDINGS polystyrene   # shift factors of creep, published WLF law
     python recipes/validate/material_checks.py RECORDINGS shaker     # resonance of a mass on rubber
-    python recipes/validate/material_checks.py RECORDINGS resin      # Table S1 from noise; no recordings
+    python recipes/validate/material_checks.py RECORDINGS resin      # Table S1 with noise; no recordings
 
 RECORDINGS is a folder with dma-nrel-polymer (github.com/NREL/pyvisco), rheology-polyisoprene-tts
 (github.com/jorge-ramirez-upm/RepTate), creep-polystyrene-plazek (github.com/krlennon/mastercurves) and
@@ -37,27 +37,30 @@ from torchsoro.rheology.spectrum import Interval, Spectrum, error_norm, fit
 from torchsoro.rheology.superposition import Shift, Wlf, master, read_shift, superpose, wlf
 from torchsoro.simulation.material import Prony
 
-KNOWN = 0.15  # standard error of a shift factor up to which it is compared [decades]
-ROOM = 21.0  # of the shaker [deg C]
-RUBBER = {"poisson_ratio": 0.4, "density": 1260.0}  # stated: 0.494, which shear does not feel, but the step does
+KNOWN = 0.15  # largest standard error of log10 a_T of compared shift factors [decades]
+ROOM = 21.0  # temperature of the shaker test [deg C]
+RUBBER = {
+    "poisson_ratio": 0.4,
+    "density": 1260.0,
+}  # published: 0.494, which does not affect shear but reduces the stable step
 MASSES = (0.1178, 0.573, 1.196)  # [kg]
-WITHIN = 0.05  # by how much a modulus may be off
+WITHIN = 0.05  # largest relative error of a recovered modulus
 
 
 # -------------------------------------------------------------------------------------------------------- shift factors
 def compared(name: str, curves: Sequence[Any], theirs: Shift, *, limit: float, **how: Any) -> tuple[Row, Shift]:
-    """Shift factors of curves beside published ones, where ours are known; a difference of reference is taken out.
+    """Compare estimated and published shift factors, after removing the offset due to the reference temperature.
 
     Args:
-        name: For the table.
-        curves: Isothermal, as of :func:`torchsoro.rheology.superposition.superpose`.
-        theirs: Published, for the same temperatures.
-        limit: Root-mean-square difference that is asked for [decades].
+        name: Label in the table.
+        curves: Isothermal curves, as for :func:`torchsoro.rheology.superposition.superpose`.
+        theirs: Published shift factors at the same temperatures.
+        limit: Required root-mean-square difference of log10 a_T [decades], over standard errors below ``KNOWN``.
         how: Arguments of ``superpose``.
 
     Returns:
-        A row, and our shifts. "apart" is by how much neighbours' storage modulus (or compliance) differs after the
-        shift, over their common range, root mean square.
+        A row and the estimated shift factors. "apart" is the root-mean-square mismatch of log10 storage modulus (or
+        compliance) between neighbouring shifted curves over their common range.
     """
     begin = time.perf_counter()
     shift = superpose(curves, **how)
@@ -84,16 +87,16 @@ def compared(name: str, curves: Sequence[Any], theirs: Shift, *, limit: float, *
 
 
 def apart(curves: Sequence[Any], shift: Shift) -> float:
-    """Distance of neighbours' storage modulus (modulus, compliance) after a shift, root mean square [decades]."""
+    """Root-mean-square mismatch of log10 storage modulus (or compliance) of neighbouring shifted curves [decades]."""
     channel = channels_of(curves, "both")[0]
     x, y = channel.x + shift.log_a[channel.curve], channel.y + shift.log_b[channel.curve]
-    noise = np.array([1e-3])  # scales the quality alone, which is not used
+    noise = np.array([1e-3])  # affects only the quality, which is not used
     pairs = [distance([(x, y, channel.curve)], noise, i)[1] for i in range(len(curves) - 1)]
     return float(np.sqrt(np.nanmean(np.square(pairs))))
 
 
 def taken_apart(whole: Sweep, published: Shift) -> list[Sweep]:
-    """A published master curve as the sweeps of 0.1 to 100 Hz that it was put together from, by its shift factors."""
+    """Separate a published master curve into its sweeps of 0.1 to 100 Hz by the published shift factors."""
     measured = np.log10(2 * np.pi * np.geomspace(0.1, 100, 10))
     off = np.abs(np.log10(whole.omega)[:, None, None] - measured[:, None] - published.log_a)
     nearest = off.reshape(len(whole.omega), -1)
@@ -111,7 +114,7 @@ def taken_apart(whole: Sweep, published: Shift) -> list[Sweep]:
 
 
 def fitted(name: str, curve: Any, **how: Any) -> tuple[Row, Spectrum]:
-    """A spectrum with intervals, as many terms as the data ask for; in words how well it does."""
+    """Row of the fit of a curve, with the number of terms of least BIC, and the spectrum with intervals."""
     begin = time.perf_counter()
     found = fit(curve, **how)
     seconds = time.perf_counter() - begin
@@ -133,8 +136,12 @@ def fitted(name: str, curve: Any, **how: Any) -> tuple[Row, Spectrum]:
     return row, found
 
 
-def adhesive(folder: Path) -> None:
-    """A stiff adhesive, tension: the instrument's master curve, the published one, and the raw sweeps."""
+def adhesive(folder: Path) -> list[Row]:
+    """Stiff adhesive in tension: shift factors and fits of the instrument's, the published and the raw sweeps.
+
+    Returns:
+        Rows of the comparison of shift factors, the last one of the raw sweeps.
+    """
     how: dict[str, Any] = {"limit": 0.15, "moduli": "storage", "misfit": 0.0}
     rows, masters = [], {}
     if importlib.util.find_spec("python_calamine"):
@@ -152,26 +159,28 @@ def adhesive(folder: Path) -> None:
     listed = read_shift(folder / "freq_Eplexor_raw__shift_factors.csv")
     row, shift = compared("raw sweeps", curves, listed, reference=25.0, **how)
     masters["raw sweeps, our shifts"] = master(curves, shift)
-    show("Adhesive: our shift factors and the published ones, where ours are known to 0.15 decades", [*rows, row])
+    rows.append(row)
+    show("Adhesive: estimated and published shift factors, where the standard error is below 0.15 decades", rows)
     if row["met"] == "no":
         print(
-            f"The list that goes with the raw sweeps does not superpose them: neighbours' storage moduli stay "
-            f"{row['apart, theirs']:.4f} decades apart with it, {row['apart, ours']:.4f} with ours."
+            "The shift factors published with the raw sweeps do not superpose them: storage moduli of neighbouring "
+            f"curves differ by {row['apart, theirs']:.4f} decades with these, by {row['apart, ours']:.4f} with ours."
         )
     fits = {name: fitted(name, curve) for name, curve in masters.items()}
     show("Adhesive: Maxwell elements of its master curves", [row for row, _ in fits.values()])
     if importlib.util.find_spec("pyvisco") is None:
         print("pyvisco is not installed: comparison skipped; pip install -e '.[pyvisco]' brings it (117 packages)")
-        return
+        return rows
     for name, curve in masters.items():
         show(f"Adhesive, {name}: beside pyvisco", beside_pyvisco(curve, fits[name][1]))
+    return rows
 
 
 def beside_pyvisco(curve: Sweep, ours: Spectrum) -> list[Row]:
-    """Error e of Eq. 17c, number of terms and time of pyvisco's fits and of ours without intervals.
+    """Error e of Eq. 17c, number of terms and time of the fits by pyvisco and by torchsoro without intervals.
 
-    Ours are those with as many terms as pyvisco's, with the least number that is as good as the best of these, and
-    with the number that the data ask for.
+    Fits by torchsoro have the number of terms of each fit by pyvisco, the least number that reaches the smallest error
+    of pyvisco, and the number of least BIC.
     """
 
     def row(who: str, found: Spectrum, seconds: float) -> Row:
@@ -194,7 +203,7 @@ def beside_pyvisco(curve: Sweep, ours: Spectrum) -> list[Row]:
 
 
 def polyisoprene(folder: Path) -> None:
-    """Two melts, shear: the authors' law of a_T and b_T, as the headers of their master curves have it."""
+    """Two polyisoprene melts in shear: comparison with the published laws of a_T and b_T."""
     rows, fits = [], []
     for file, molar_mass in (("PI_226k_sweeps.csv", 225.9), ("PI_635k_sweeps.csv", 634.5)):
         curves: Any = read(folder / file)
@@ -221,7 +230,7 @@ def header(path: Path) -> dict[str, float]:
 
 
 def polystyrene(folder: Path) -> None:
-    """Creep in shear at ten temperatures (Plazek 1965), and the published WLF law."""
+    """Polystyrene creep in shear at ten temperatures (Plazek 1965): comparison with the published WLF law."""
     curves: Any = read(folder / "plazek_long.csv", deformation="shear")
     t = np.array([curve.temperature for curve in curves])
     law = Wlf(C1=10.7, C2=29.9, reference=100.0)
@@ -232,15 +241,15 @@ def polystyrene(folder: Path) -> None:
 
 # --------------------------------------------------------------------------------------------------------- the shaker
 def shaker(folder: Path, across: Sequence[int] = (2,)) -> list[Row]:
-    """Peaks of transmissibility of three masses on rubber discs, from the rubber's DMA alone, and as measured.
+    """Peak of transmissibility of three masses on rubber discs: predicted from DMA of the rubber, and measured.
 
-    "elastic" has the storage modulus at 1 Hz, as a quasi-static test would give it, and so no finite height. "fitted"
-    are all Maxwell elements and "for the simulator" the five at most that it gets, both in closed form; then those five
-    in a simulated pair of discs.
+    "elastic" uses the storage modulus at 1 Hz without loss, as from a quasi-static test, so that the peak is infinite.
+    "fitted" uses all Maxwell elements, "for the simulator" at most five, both in closed form; "simulated" uses the
+    latter in a simulation of the pair of discs.
 
     Args:
-        folder: With ``dma`` and ``shaker``.
-        across: Cells through a disc's thickness in the simulations.
+        folder: Folder with ``dma`` and ``shaker``.
+        across: Numbers of cells through the thickness of a disc, one simulation each.
     """
     curves: Any = read(folder / "dma" / "tf_015p.csv")
     spectrum = fit(master(curves, superpose(curves, reference=ROOM, vertical=True)), intervals=False)
@@ -285,14 +294,14 @@ def shaker(folder: Path, across: Sequence[int] = (2,)) -> list[Row]:
 
 # ---------------------------------------------------------------------------------------------------------- the resin
 def resin(noises: Sequence[float] = (0.01, 0.02, 0.03, 0.05), seeds: int = 20) -> list[Row]:
-    """Table S1 of the paper, found again in a master curve made from it, 0.01 to 1e7 rad/s, 126 frequencies.
+    """Recovery of the moduli of Table S1 from noisy master curves of 126 frequencies, 0.01 to 1e7 rad/s.
 
-    A modulus is found if it is within 5 %, or if its interval is wider than that to either side or says that it cannot
-    be known.
+    A modulus counts as recovered within 5 % of the true value, or if its interval is wider than that or marks it as
+    undetermined.
 
     Args:
-        noises: Relative standard deviations of each storage and loss modulus, normal and independent.
-        seeds: Master curves for each.
+        noises: Relative standard deviations of the normal, independent noise of storage and loss modulus.
+        seeds: Number of master curves for each noise.
     """
     rows = []
     for noise in noises:
@@ -320,7 +329,7 @@ def resin(noises: Sequence[float] = (0.01, 0.02, 0.03, 0.05), seeds: int = 20) -
 
 
 def table_s1(noise: float, seed: int) -> list[tuple[float, float, Interval]]:
-    """Modulus, true value [Pa] and interval: at equilibrium, then from the slowest; empty if not of five terms."""
+    """Fitted modulus, true modulus [Pa] and interval: equilibrium, then slowest first; empty unless of five terms."""
     truth = Prony.paper(5)
     true = 0.44e6 * np.append(1.0, truth.moduli.numpy())
     spectrum = Spectrum(
@@ -338,7 +347,7 @@ def table_s1(noise: float, seed: int) -> list[tuple[float, float, Interval]]:
 
 
 def wide(value: float, known: Interval) -> bool:
-    """Whether an interval says that a modulus is not known to 5 %."""
+    """Whether the half width of an interval exceeds 5 % of the modulus, or the modulus is undetermined."""
     return bool(known.unknown) or (known.high - known.low) / 2 > WITHIN * value
 
 
@@ -357,13 +366,13 @@ def main(
     seeds: int = 20,
     across: tuple[int, ...] = (2,),
 ) -> None:
-    """Check the way from a rheometer to a material against measurements of others.
+    """Validate superposition and Prony fits against published measurements and a known material.
 
     Args:
-        recordings: Folder of the measurements' folders.
-        check: What to check.
-        seeds: Noisy master curves of Table S1 for each noise.
-        across: Cells through a rubber disc of the shaker, for each simulation.
+        recordings: Folder with a folder of each published data set.
+        check: Check to be run.
+        seeds: Number of noisy master curves of Table S1 for each noise.
+        across: Numbers of cells through the thickness of a rubber disc, one simulation each.
     """
     for name, folder in FOLDERS.items():
         if check not in (name, "all"):

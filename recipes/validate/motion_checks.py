@@ -34,8 +34,8 @@ def rheology(
 ) -> list[Row]:
     """Storage and loss modulus of H <- a H + b dS, over the equilibrium modulus, against Eq. 17.
 
-    The recursion answers exp(i omega t) by sum_i g_i b_i (1 - 1/z) / (1 - a_i / z) in the end, z = exp(i omega dt).
-    Elements faster than a step are viscous dampers that lag by half a step, which shows first in the storage modulus.
+    The steady response of the recursion to exp(i omega t) is sum_i g_i b_i (1 - 1/z) / (1 - a_i / z), z = exp(i omega
+    dt). Elements faster than a step act as dashpots with a lag of half a step, which affects the storage modulus first.
     """
     rows = []
     for count, dt in cases:
@@ -52,7 +52,7 @@ def rheology(
 
 
 def moving(body: Body, gradient: torch.Tensor, elements: int = 0) -> torch.Tensor:
-    """State of the updated form whose particles know the velocity gradient [3, 3]; by itself they know none."""
+    """Initial state of the updated formulation with a given velocity gradient [3, 3] of the particles."""
     state = torch.zeros(1, layout.state_components(elements), body.position.shape[0], dtype=EXACT)
     state[0, layout.POSITION : layout.VELOCITY] = body.position.T
     state[0, layout.VELOCITY : layout.AFFINE] = gradient @ (body.position - body.position.mean(0)).T
@@ -69,7 +69,7 @@ def ramp(
 ) -> list[Row]:
     """The kernel's history in steady simple shear: H_xy = rate tau (1 - exp(-t / tau)).
 
-    The block is too heavy to mind its stress, so that it moves as it started. The total form keeps Z = H - b S.
+    The density is large enough for the stress not to change the motion. The total formulation stores Z = H - b S.
     """
     rate, prony = torch.zeros(3, 3, dtype=EXACT), Prony.paper(elements)
     rate[0, 1] = 1e-3
@@ -100,10 +100,10 @@ def ramp(
 
 
 def grows(count: int, dt: float, *, form: str, solid: Solid, speed: float = 0.0, steps: int = 2000) -> bool:
-    """Whether the noise (1 mm/s) of a cube of 5 cells grows tenfold in energy, or its impact ends the run.
+    """Whether the energy of velocity noise (1 mm/s) in a cube of 5 cells grows tenfold, or its impact fails.
 
-    Without losses, some of the noise that only the lattice's nodes see becomes visible in the particles; so not any
-    growth is one of instability.
+    Without losses, part of the noise that is initially resolved only by the nodes moves to the particles, so that
+    growth below a factor of ten does not indicate instability.
     """
     corner = (0.0, 0.0, 0.5 * PAPER_CELL) if speed else tuple(c * PAPER_CELL for c in (0.11, 0.27, 0.41))
     body = block((10, 10, 10), PAPER_CELL, corner, solid)
@@ -133,12 +133,12 @@ def stability(
     *,
     steps: int = 1500,
 ) -> list[Row]:
-    """Largest step at which noise does not grow, and at which a cube survives 4 m/s, in the paper's cell.
+    """Largest step without growth of noise, and largest step for an impact at 4 m/s, with the paper's cell.
 
-    Two Courant numbers at the limit: that of pressure waves with the stiffness mu (1 + sum g_i b_i) of one step; and
-    the package's (``material.courant``), which counts elements with the stiffness at the highest frequency that a step
-    resolves, where instability sets in. It is 1 throughout in the updated form, and 1 at least in the total form, where
-    it is a bound for every body, whatever its densities.
+    Two Courant numbers at the limit are given: that of pressure waves with the stiffness mu (1 + sum g_i b_i) of one
+    step; and that of ``torchsoro.simulation.stability.courant``, with the stiffness of the elements at the highest
+    resolved frequency, where instability starts. The latter is 1 in the updated formulation, and at least 1 in the
+    total formulation, where it is a bound for any density distribution.
     """
     rows = []
     for form in forms:

@@ -16,7 +16,7 @@ from torchsoro.rheology.spectrum import Spectrum
 
 
 def pyvisco_fits(curve: Sweep) -> list[tuple[str, Spectrum, float]]:
-    """Its fits of a master curve in tension: one term per decade, these optimised, and the number that it proposes.
+    """Fits by pyvisco of a master curve in tension: one term per decade, the same optimised, its proposed number.
 
     Returns:
         How it was fitted, the spectrum, and the time that it took [s].
@@ -43,7 +43,7 @@ def pyvisco_fits(curve: Sweep) -> list[tuple[str, Spectrum, float]]:
         rows = np.column_stack([curve.omega / (2 * np.pi), curve.storage / 1e6, curve.loss / 1e6])
         np.savetxt(file, rows, delimiter=",", header="f,E_stor,E_loss\nHz,MPa,MPa", comments="", fmt="%.17g")
         data, _ = pv.load.user_master(pv.load.file(str(file)), "freq", curve.temperature, "E")
-        data = pv.master.smooth(data, 1)  # over one point: as it is
+        data = pv.master.smooth(data, 1)  # window of one point: no smoothing
         found = []
         begin = time.perf_counter()
         plain, _ = pv.prony.fit(pv.prony.discretize(data), data, opt=False)

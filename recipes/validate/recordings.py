@@ -3,21 +3,21 @@
     python recipes/validate/recordings.py FOLDER/silicone-cantilever-beam --out runs/beam
     python recipes/explain.py runs/beam --out runs/beam-explained
 
-By the folder's name. The bar and the arm are those of Dubied, Michelis, Spielberg, Katzschmann (2022), of Dragon Skin
-10 and recorded by motion capture. What is believed is what their repository says: the modulus, fitted to a static
-sag, and no damping.
+The name of the folder selects the experiment. Bar and arm are those of Dubied, Michelis, Spielberg, Katzschmann (2022),
+of Dragon Skin 10, recorded by motion capture. The model has the modulus of their repository, fitted to a static
+deflection, and no damping.
 
-silicone-cantilever-beam: 100 x 30 x 30 mm, clamped at one end, held straight and let go, under its weight and with
-1.0006 N more at its upper free edge, believed to be a dead force. One recording of each kind is to be explained, the
-other is kept to be predicted; ``--fit weight`` keeps both recordings with the load instead.
+silicone-cantilever-beam: 100 x 30 x 30 mm, clamped at one end, held straight and released under its weight, without and
+with an additional 1.0006 N at the upper free edge, modelled as a dead load. One recording of each kind is to be
+explained, the other is held out; ``--fit weight`` holds out both recordings with the load instead.
 
-pneumatic-arm-segment: hangs, one of four chambers is inflated to 75, 100 and 150 mbar; 125 and 175 mbar are kept.
-The pressure is believed to be there at once. The section is not published: round walls of 2 mm are straight ones here.
+pneumatic-arm-segment: hangs; one of four chambers is inflated to 75, 100 and 150 mbar; 125 and 175 mbar are held out.
+The pressure is modelled as a step. The cross-section is not published: round walls of 2 mm are modelled as straight.
 
-bellows-actuator: the actuator of Caasenbrood, Pogromsky, Nijmeijer (2022), bent by 17 degrees and let go. Its section
-is not published: a solid bar of its length and mass, with the linear stiffness of its authors, is believed, which a
-force at its end holds. Recorded is an angle: the place of the end is that of an arc. Gravity, whose direction is not
-reported, is left out.
+bellows-actuator: the actuator of Caasenbrood, Pogromsky, Nijmeijer (2022), bent by 17 degrees and released. The
+cross-section is not published: the model is a solid bar of the same length and mass with the published linear
+stiffness, held by a force at its end. The recorded quantity is an angle; the position of the end is that of a circular
+arc. Gravity, whose direction is not reported, is omitted.
 """
 
 from __future__ import annotations
@@ -100,21 +100,21 @@ BELLOWS_RATE = 200.0  # Hz; the file has 10 kHz, interpolated
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """What to turn into what."""
+    """Experiment for explain.py from published recordings."""
 
     recordings: tyro.conf.Positional[Path]
-    """Folder with the recordings, of the name that it was published under."""
+    """Folder with the recordings, under its published name."""
     out: Path
     """Folder of the experiment."""
     fit: Literal["both", "weight"] = "both"
-    """Of the bar: explain one recording of each kind, or those under the weight alone."""
+    """For the bar: explain one recording of each kind, or only those without the load."""
 
 
 def table_of(path: Path) -> dict[str, np.ndarray]:
     """Columns of a CSV file.
 
     Raises:
-        ValueError: if it is not there.
+        ValueError: if the file does not exist.
     """
     if not path.is_file():
         raise ValueError(f"recordings = {path.parent}: no {path.name}, wanted the folder that holds it")
@@ -122,9 +122,9 @@ def table_of(path: Path) -> dict[str, np.ndarray]:
 
 
 def moved(table: dict[str, np.ndarray], markers: dict[str, tuple[float, ...]], still: slice, used: np.ndarray):
-    """Columns of markers: where they are believed to be, and how far they moved from there since they were still.
+    """Columns of markers: nominal position plus displacement since rest.
 
-    Markers were glued to within a millimetre: what counts is how far they moved.
+    Markers were placed to within a millimetre; only their displacement is used.
     """
     columns = {}
     for key, at in markers.items():
@@ -135,7 +135,7 @@ def moved(table: dict[str, np.ndarray], markers: dict[str, tuple[float, ...]], s
 
 
 def bar(options: Options) -> tuple[str, dict[str, Files]]:
-    """Let go."""
+    """Bar released from the straight state."""
     kept = ("weight_b", "load_b") if options.fit == "both" else ("load_a", "load_b")
     trials = {}
     for name, (file, first) in BAR_TRIALS.items():
@@ -148,7 +148,7 @@ def bar(options: Options) -> tuple[str, dict[str, Files]]:
 
 
 def arm(options: Options) -> tuple[str, dict[str, Files]]:
-    """One chamber inflated, and the others open."""
+    """Arm segment with one chamber inflated and the others vented."""
     chambers, trials = "", {}
     for side, (c, d) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         corners = np.array([[c * x - d * y, d * x + c * y, z] for x, y, z in ARM_CHAMBER])
@@ -159,7 +159,7 @@ def arm(options: Options) -> tuple[str, dict[str, Files]]:
         time = (np.arange(len(table["time_s"])) - ARM_BEGINS) / RATE
         used = (time >= 0) & (time <= ARM_LASTS)
         places = moved(table, ARM_MARKERS, slice(0, ARM_BEGINS - 1), used)
-        # A frame that was lost repeats the one before.
+        # Lost frames repeat the previous one.
         lost = np.all([np.diff(x, prepend=np.nan) == 0 for x in places.values()], axis=0)
         columns = {"time_s": time[used]} | {key: np.where(lost, np.nan, x) for key, x in places.items()}
         full = 100.0 * mbar
@@ -170,7 +170,7 @@ def arm(options: Options) -> tuple[str, dict[str, Files]]:
 
 
 def bellows(options: Options) -> tuple[str, dict[str, Files]]:
-    """Held in a bend, and let go."""
+    """Bellows actuator released from a bend."""
     table = table_of(options.recordings / "oscill_data_b17.csv")
     time = np.arange(0.0, BELLOWS_LASTS - BELLOWS_ENDS, 1 / BELLOWS_RATE)
     bend = np.radians(np.interp(time, table["time_s"], table["bending_angle_deg"]))

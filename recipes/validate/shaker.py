@@ -18,8 +18,8 @@ from structures import EXACT, HELD_LENGTH, block
 
 from torchsoro import Plane, PointMass, Prony, Simulator, Solid
 
-AREA = math.pi / 4 * (0.0335**2 - 0.0118**2)  # of one disc [m2]
-THICKNESS = 0.006  # of one disc [m]
+AREA = math.pi / 4 * (0.0335**2 - 0.0118**2)  # area of one disc [m2]
+THICKNESS = 0.006  # thickness of one disc [m]
 RUBBER = 0.0148  # mass of both discs [kg]
 
 
@@ -47,13 +47,13 @@ def read_sine(path: Path) -> Sine:
 
 
 def closed_form(storage: np.ndarray, loss: np.ndarray, frequency: np.ndarray, mass: float) -> np.ndarray:
-    """Transmissibility |k / (k - m w^2)| of a mass on the two discs, k = 2 G A / h, with a third of the rubber's mass.
+    """Transmissibility |k / (k - m w^2)| of a mass on two discs, k = 2 G* A / h, m with a third of the rubber's mass.
 
     Args:
-        storage: G' at the frequencies [n] Pa.
-        loss: G'' at the frequencies [n] Pa.
-        frequency: [n] Hz.
-        mass: Of the block between the discs [kg].
+        storage: Storage modulus G' at the frequencies [n] Pa.
+        loss: Loss modulus G'' at the frequencies [n] Pa.
+        frequency: Frequencies [n] Hz.
+        mass: Mass of the block between the discs [kg].
     """
     stiffness = 2 * (storage + 1j * loss) * AREA / THICKNESS
     return np.abs(stiffness / (stiffness - (mass + RUBBER / 3) * (2 * math.pi * frequency) ** 2))
@@ -69,24 +69,24 @@ def simulated(
     width: float = 0.024,
     duration: float = 0.04,
 ) -> np.ndarray:
-    """Transmissibility from a simulation of two blocks of rubber with the mass between them, seen from the shaken base.
+    """Simulated transmissibility of a mass between two rubber blocks, in the frame of the shaken base.
 
-    The outer faces are held and everything else feels a pulse of the base's acceleration; the answer is the ratio of
-    the spectra. Cells between the blocks, 30 times as stiff, carry the mass. The blocks have the discs' thickness, and
-    the masses are those of the discs in the ratio of the areas, less the 2 % by which a block so wide also bends
-    (Rivlin and Saunders: 1 + h^2 / (3 w^2)).
+    The outer faces are fixed, and a pulse of base acceleration acts as body force on everything else; the
+    transmissibility is the ratio of the spectra. Cells between the blocks, 30 times as stiff, carry the mass. The
+    blocks have the thickness of the discs; masses are scaled by the ratio of the areas and reduced by 2 % for the
+    bending of a block of this width (Rivlin and Saunders: 1 + h^2 / (3 w^2)).
 
     Args:
-        solid: The material.
-        prony: Its Maxwell elements.
-        frequency: [n] Hz.
-        masses: Of the block between the discs [kg]; simulated as a batch.
-        across: Cells through the thickness.
-        width: Of the block [m].
-        duration: Until the motion has died away [s].
+        solid: Equilibrium solid of the rubber.
+        prony: Maxwell elements of the rubber.
+        frequency: Frequencies [n] Hz.
+        masses: Masses of the block between the discs [kg], simulated as a batch.
+        across: Number of cells through the thickness.
+        width: Width of the block [m].
+        duration: Duration of the simulation, after which the motion has decayed [s].
 
     Returns:
-        [masses, n].
+        Transmissibility [masses, n].
     """
     cell = THICKNESS / across
     wide = 2 * round(width / cell)

@@ -1,6 +1,6 @@
 """The simulator against closed forms, and its two formulations against each other, one table per check.
 
-    python recipes/validate/simulator.py damping      # what the method adds to a cantilever: each form, step and cell
+    python recipes/validate/simulator.py damping      # numerical damping of a cantilever by formulation, step and cell
     python recipes/validate/simulator.py bar          # frequency of a cantilever against a Timoshenko beam
     python recipes/validate/simulator.py sphere       # pressurised thick sphere against Lame's solution
     python recipes/validate/simulator.py rheology     # Maxwell elements against Eq. 17 and a shear ramp
@@ -73,7 +73,7 @@ def draw_ball(path: Path, curves: Sequence[Curve]) -> None:
 
 
 def draw_rheology(path: Path) -> None:
-    """Moduli of the recursion (dots) on Eq. 17 (lines)."""
+    """Storage and loss modulus of the recursion (dots) and of Eq. 17 (lines)."""
     save, axes = _figure(
         path, [("omega [rad/s]", "storage modulus / equilibrium"), ("omega [rad/s]", "loss modulus / equilibrium")]
     )
@@ -108,7 +108,7 @@ def draw_bar(path: Path, rows: Sequence[Row]) -> None:
 
 
 def draw_walking(path: Path, rows: Sequence[Row], courses: Mapping[tuple[int, str], Row]) -> None:
-    """Course of the centre of gravity, and the differences over the cell."""
+    """Trajectory of the centre of gravity, and differences over the cell."""
     axes: list[Any]
     panels = [(f"time [ms], {n} particles along the edge", "forward (-), up (--) [mm]") for n, _ in courses]
     save, axes = _figure(path, [*dict.fromkeys(panels), ("cell [mm]", "largest difference of the c.o.g. [mm]")])

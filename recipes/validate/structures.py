@@ -39,10 +39,10 @@ def fast_wave(solid: Solid) -> float:
     return math.sqrt((solid.bulk + 4 / 3 * solid.shear) / solid.density)
 
 
-# Where a clamp of held nodes lies, in cells. The strain of a spline rises only slowly from zero at held nodes: under a
-# steady load s it is s (1 - q^i) at the i-th cell boundary, q = sqrt(3) - 2, as stiffness couples neighbours by 1:4:1.
-# So the bar is longer than it acts by -q / (1 - q) cells, counted from the last node that is held; half a cell in front
-# of the clamp's face, that leaves 1 / (2 sqrt(3)). The same holds for stretching, shear, and rotation.
+# Effective position of a clamp of fixed nodes, in cells. With quadratic splines, a steady load that causes the strain s
+# gives s (1 - q^i) at the i-th cell boundary, q = sqrt(3) - 2, from the 1:4:1 coupling of neighbours. The effective
+# length is therefore -q / (1 - q) cells shorter, counted from the last fixed node; half a cell in front of the face of
+# the clamp, 1 / (2 sqrt(3)) remains. The same holds for stretching, shear and rotation.
 HELD_LENGTH = 0.5 / math.sqrt(3.0)
 
 
@@ -58,12 +58,12 @@ def cantilever(
     duration: float,
     shift: float = 0.0,
 ) -> Row:
-    """Clamp a square bar at x = 0, let it go under gravity, and fit a damped oscillation to the tip.
+    """Release a square bar clamped at x = 0 under gravity, and fit a damped oscillation to the motion of the tip.
 
-    The bar goes on for two cells behind the clamp, where planes with unlimited adhesion hold every node. Nodes of the
-    total formulation lie half a cell beside the clamp's face, and the first in front of it is held, too. So that bar
-    acts as one that is ``HELD_LENGTH`` cells shorter, and is to be compared with a beam of its free length. ``shift``
-    moves the bar across the updated formulation's grid, along y and z, in cells.
+    The bar extends two cells behind the clamp, where planes with unlimited adhesion fix every node. In the total
+    formulation nodes lie half a cell beside the face of the clamp, and the first node in front of it is fixed as well:
+    the bar is equivalent to one ``HELD_LENGTH`` cells shorter and is compared with a beam of that length. ``shift``
+    offsets the bar from the grid of the updated formulation along y and z, in cells.
     """
     begin = time.perf_counter()
     cell = width / cells
@@ -175,13 +175,13 @@ def bar(
     forms: Sequence[str] = ("flip", "total"),
     duration: float = 0.6,
 ) -> tuple[list[Row], dict[str, float]]:
-    """Frequency of a bar, 100 x 20 x 20 mm, that hardly bends, and the order of the error by least squares.
+    """First natural frequency of a bar of 100 x 20 x 20 mm at small deflection, and order of the error in the cell.
 
-    The beam's clamp does not hinder lateral contraction; a solid's does if nu > 0. At nu = 0.4 that makes the solid
-    about 1.7 % stiffer than the beam, to which both forms tend. So there is an order at nu = 0 only.
+    Unlike the clamp of a beam, that of a solid prevents lateral contraction for nu > 0. At nu = 0.4 both formulations
+    converge to a frequency of a solid about 1.7 % stiffer than the beam; the order is therefore given at nu = 0 only.
 
     Returns:
-        Rows, and the order at nu = 0 for each form.
+        Rows, and the order at nu = 0 for each formulation.
     """
     rows, orders = [], {}
     for form, nu in itertools.product(forms, poisson):
@@ -203,13 +203,12 @@ def bar(
 def sphere(
     cells: Sequence[int] = (4, 6, 8, 12), *, pressure: float = 200.0, form: str = "flip", fictitious: float = 100.0
 ) -> list[Row]:
-    """Gas at constant pressure in a thick sphere, radii 10 and 20 mm, that drag brings to rest.
+    """Static displacement of a thick sphere, radii 10 and 20 mm, under constant internal pressure, relaxed by drag.
 
-    Lame: u = p a^3 / (b^3 - a^3) [(1 - 2 nu) r / E + (1 + nu) b^3 / (2 E r^2)]. A lattice has a staircase for a
-    surface: a and b are the radii of spheres that hold the volume of its particles. "displacement" is the
-    least-squares ratio to Lame over the shell, "cavity" the ratio of the volumes that the cavity gains.
-    ``fictitious`` is the shear modulus [Pa] that the total formulation needs in a chamber; it bears a little of the
-    pressure, too.
+    Lame: u = p a^3 / (b^3 - a^3) [(1 - 2 nu) r / E + (1 + nu) b^3 / (2 E r^2)]. The surface of a lattice is stepped;
+    a and b are the radii of spheres of equal volume. "displacement" is the least-squares ratio to Lame's solution over
+    the shell, "cavity" the ratio of the volume changes of the cavity. ``fictitious`` is the shear modulus [Pa] of the
+    chamber in the total formulation, which carries a small part of the pressure.
     """
     solid, outer, inner = Solid(), 0.02, 0.01
     rows = []

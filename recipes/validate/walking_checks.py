@@ -27,9 +27,9 @@ CAVITY = EDGE / 3  # of the air, which lies on planes of every lattice of 6, 12,
 WALL = EDGE / 12  # [mm]
 RAMP = 1.5  # over which density rises from void to solid [mm]
 
-# What the walker is made of beside its chamber: limits [mm] in x, |y| and z, and density. A rear leg from the chamber's
-# rear wall down to a sole, which bears the chamber as well; two front feet; a load in front on top; and, as in a design
-# that is not finished, grey on the chest.
+# Boxes of the walker besides its chamber: limits [mm] in x, |y| and z, and density. A rear leg from the rear wall of
+# the chamber to a sole, which also carries the chamber; two front feet; a load on top in front; and intermediate
+# density on the chest, as in an unconverged design.
 PARTS = (
     ((-18, -8), (-1, 6), (12.5, 17), 1.0),
     ((-18, -14), (-1, 6), (-1, 17), 1.0),
@@ -39,7 +39,7 @@ PARTS = (
     ((8, 18), (-1, 8), (23, 36), 1.0),
     ((9, 15), (-1, 8), (12, 20), 0.4),
 )
-# Material points that are followed [mm].
+# Tracked material points [mm].
 POINTS = {"heel": (-15.0, 4.0, 2.0), "knee": (-15.0, 4.0, 14.5), "chest": (7.3, 0.0, 17.5), "brow": (13.0, 4.0, 29.0)}
 
 
@@ -73,8 +73,8 @@ def design(domain: Domain, parts: int = 4) -> Tensor:
 def setting(particles: int, form: str, *, shift: float = 0.0, **changes: Any) -> Settings:
     """The desk walker with another number of particles along its edge, a multiple of 6.
 
-    The chamber is chosen such that its air is the same in all, and so is the density of the air, which the settings
-    would choose by the formulation. ``shift`` moves the grid of the updated form along x and y, in cells.
+    The volume of air in the chamber and its density, whose default depends on the formulation, are the same for all
+    lattices. ``shift`` offsets the grid of the updated formulation along x and y, in cells.
     """
     spacing = 1e-3 * EDGE / particles
     how = {"formulation": "updated", **arguments(form)}
@@ -92,7 +92,7 @@ def setting(particles: int, form: str, *, shift: float = 0.0, **changes: Any) ->
 
 
 def volume_ratios(domain: Domain, position: Tensor) -> Tensor:
-    """J [S, N] at the points of the total form, of which the particles' places [S, N, 3] tell all."""
+    """Volume ratio J [S, N] in the total formulation, from the positions of the particles [S, N, 3]."""
     lattice = Lattice.around(domain.positions, domain.cell)
     moved = (position.to("cpu", EXACT) - domain.positions).transpose(-1, -2)
     gradient = lattice.gradient(lattice.to_nodes(moved, "back")).permute(0, 3, 1, 2)
@@ -100,7 +100,7 @@ def volume_ratios(domain: Domain, position: Tensor) -> Tensor:
 
 
 def follow(domain: Domain, position: Tensor) -> np.ndarray:
-    """Places of the material points over time [S, points, 3] m, linear between particles."""
+    """Positions of the material points over time [S, points, 3] m, interpolated linearly between particles."""
     axes = [o + (np.arange(n) + 0.5) * domain.spacing for o, n in zip(domain.origin, domain.shape, strict=True)]
     points = 1e-3 * np.array(list(POINTS.values()))
     moved = (position.to("cpu", EXACT) - domain.positions).numpy().reshape(-1, *domain.shape, 3)
@@ -109,7 +109,7 @@ def follow(domain: Domain, position: Tensor) -> np.ndarray:
 
 
 def walk(particles: int, form: str, *, shift: float = 0.0, **changes: Any) -> tuple[Row, Row]:
-    """One simulation: what is printed of it, and its course (SI units) to compare with another."""
+    """Row and trajectories (SI units) of one simulation."""
     begin = time.perf_counter()
     settings = setting(particles, form, shift=shift, **changes)
     robot: Robot = walker(settings)
@@ -147,7 +147,7 @@ def walk(particles: int, form: str, *, shift: float = 0.0, **changes: Any) -> tu
 
 
 def difference(particles: int, what: str, one: Row, other: Row) -> Row:
-    """Of two courses of the same design, in mm and in percent of the longest way of a followed point."""
+    """Differences of two trajectories of a design, in mm and in percent of the longest path of a tracked point."""
     way = np.linalg.norm(one["points"] - one["points"][0], axis=-1).max()
     center = np.linalg.norm(one["center"] - other["center"], axis=-1).max()
     points = np.linalg.norm(one["points"] - other["points"], axis=-1).max()
@@ -161,15 +161,15 @@ def difference(particles: int, what: str, one: Row, other: Row) -> Row:
 def walking(
     counts: Sequence[int] = (12, 18, 24), forms: Sequence[str] = ("total", "apic", "flip"), **changes: Any
 ) -> tuple[list[Row], list[Row], dict[tuple[int, str], Row]]:
-    """A whole cycle (rest, filling, venting) of the same design on finer and finer lattices.
+    """Convergence of one cycle (rest, filling, venting) of a design with lattice refinement in both formulations.
 
-    The updated form runs with its first transfer on a grid shifted by half a cell, too: what that changes is the
-    accuracy of the updated form itself. The total form has no grid to shift.
+    The updated formulation is also run with its first transfer on a grid shifted by half a cell; the difference
+    measures its own discretization error. The total formulation has no background grid.
 
     Args:
-        counts: Particles along the edge, multiples of 6.
-        forms: "total", and what to compare it with.
-        changes: Of the settings.
+        counts: Numbers of particles along the edge, multiples of 6.
+        forms: "total", and the forms to compare with it.
+        changes: Changes of the settings.
 
     Returns:
         Rows of the simulations; rows of the differences, largest over time; the courses.

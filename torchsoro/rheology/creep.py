@@ -54,8 +54,9 @@ def interconverted(instantaneous: float, fluidity: float, compliances: np.ndarra
 def compliance(equilibrium: float, moduli: np.ndarray, times: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Creep compliance [n] 1/Pa of a relaxation spectrum at times [n] s after a step of unit stress.
 
-    The viscous strains obey v_i' = (e - v_i) / tau_i, the total strain is e = (1 + sum_i E_i v_i) / (E_inf + sum_i
-    E_i). Scaled by sqrt(E_i tau_i) the system is symmetric; its eigenmodes decay, except one of rate zero in a liquid.
+    The viscous strains obey v_i' = (e - v_i) / tau_i with the total strain
+    e = (1 + sum_i E_i v_i) / (E_inf + sum_i E_i). Scaled by sqrt(E_i tau_i) the system is symmetric; its eigenmodes
+    decay, except one of rate zero in a liquid.
 
     Args:
         equilibrium: Equilibrium modulus E_inf [Pa].

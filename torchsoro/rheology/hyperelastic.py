@@ -1,8 +1,7 @@
-"""Fits of the simulator's solid, neo-Hookean or Yeoh's with Maxwell elements, to tests at finite strain.
+"""Fits of a neo-Hookean or Yeoh solid with Maxwell elements to finite-strain tests.
 
-The model of a fit is the simulator's own discrete material (``rheology.pointwise``), so that what is fitted is what is
-simulated. Residuals are relative to each test's root mean square stress, and every test counts the same, whatever its
-number of samples.
+The model is the discrete material of the simulator (``rheology.pointwise``). Residuals are relative to the root mean
+square stress of each test, and tests have equal weight, independent of their number of samples.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ _LARGEST = {"shear": 0.1, "uniaxial": 0.02, "equibiaxial": 0.02}  # change of th
 
 @dataclass(frozen=True, kw_only=True)
 class Interval:
-    """A number of a fit with the ends of its interval, at ``LEVEL``."""
+    """Fitted constant with its confidence interval at ``LEVEL``."""
 
     value: float
     low: float
@@ -43,18 +42,18 @@ class Fit:
     Attributes:
         shear: Equilibrium shear modulus at rest, mu [Pa].
         stiffening: a and b; mu grows to mu (1 + a x + b x^2) at x = I1b - 3.
-        moduli: Of the Maxwell elements, relative to mu [M].
-        times: Their relaxation times [M] s, the longest first.
-        poisson_ratio: That was taken; tests of the stress alone do not tell it.
-        order: Number of stiffening terms that were fitted: 0 for neo-Hooke, 1 or 2 for Yeoh.
-        intervals: Of "shear" [Pa], "a", "b", "C20", "C30" [Pa], "g1", "tau1" [s] and so on, as far as fitted.
+        moduli: Moduli of the Maxwell elements over mu [M].
+        times: Relaxation times [M] s, descending.
+        poisson_ratio: Assumed Poisson ratio, which stress data alone do not determine.
+        order: Number of fitted stiffening terms: 0 for neo-Hooke, 1 or 2 for Yeoh.
+        intervals: Intervals of "shear" [Pa], "a", "b", "C20", "C30" [Pa], "g1", "tau1" [s] and so on, if fitted.
         error: Relative root mean square error over all tests, as of :meth:`error_of`.
-        bic: Bayesian information criterion; lower is better, for the same tests. It takes the residuals for
-            independent: where they are systematic it errs towards more numbers, and tests left out judge better.
-        inflation: How many times the variances grew with the residuals' serial correlation.
-        largest: Largest I1 - 3 in the tests; beyond, the law is extrapolated.
-        factors: Of the stress of each test, one after the other, if specimens were let differ; else all 1.
-        unknowns: Where the search ended, to begin another with.
+        bic: Bayesian information criterion; lower is better, for the same tests. It assumes independent residuals:
+            systematic residuals favour more constants, so that held-out tests are the better criterion.
+        inflation: Inflation of the variances by serial correlation of the residuals.
+        largest: Largest I1 - 3 in the tests; beyond it the law is extrapolated.
+        factors: Stress factor of each test if fitted (``specimens``), else 1.
+        unknowns: Final values of the unknowns, to start another fit from.
     """
 
     shear: float
@@ -73,18 +72,18 @@ class Fit:
 
     @property
     def law(self) -> Law:
-        """For :mod:`torchsoro.rheology.pointwise`."""
+        """Law for :mod:`torchsoro.rheology.pointwise`."""
         values = np.array([self.shear, *self.stiffening, *self.moduli, *self.times])
         return _law(torch.from_numpy(values), self.poisson_ratio, len(self.moduli))
 
     def solid(self, density: float) -> Solid:
-        """For the simulator.
+        """Solid for the simulator.
 
         Args:
-            density: [kg/m3].
+            density: Density [kg/m3].
 
         Raises:
-            ValueError: as ``Solid``: also if the law turns soft at some stretch, which a fit with ``stable`` does not.
+            ValueError: as for ``Solid``, including a stress that decreases with stretch, which ``stable`` excludes.
         """
         a, b = self.stiffening
         return Solid(
@@ -105,11 +104,11 @@ class Fit:
         return _Model([experiment]).stress(self.law).numpy()
 
     def error_of(self, experiments: Sequence[Experiment], *, specimens: bool = False) -> float:
-        """Relative root mean square error: of the stress, over its root mean square, each test counting the same.
+        """Root mean square error of the stress over the root mean square stress, with equal weight of each test.
 
         Args:
-            experiments: Tests, which the fit need not have seen.
-            specimens: Whether each stress may have a factor of its own, the best, so that the shape alone is judged.
+            experiments: Tests, fitted or held out.
+            specimens: Whether each prediction is scaled by its best factor, so that only the shape is compared.
         """
         squares = []
         for e in experiments:
@@ -131,17 +130,17 @@ def fit(
 ) -> Fit:
     """Fit a law to tests.
 
-    Intervals are of the linearised fit, with the noise estimated from the residuals and widened by their serial
-    correlation, as in :func:`torchsoro.rheology.spectrum.fit`.
+    Intervals follow from the linearised fit, with the variance estimated from the residuals and inflated by their
+    serial correlation, as in :func:`torchsoro.rheology.spectrum.fit`.
 
     Args:
         experiments: Tests of one material, of any modes.
         order: Stiffening terms: 0 for neo-Hooke, 1 for a, 2 for a and b.
         elements: Number of Maxwell elements, 0 to 5.
-        poisson_ratio: Of the law, 0 to below 0.5.
-        stable: Keep to laws whose stress grows with every stretch, also beyond the tests, which ``Solid`` asks for.
-        specimens: Let the specimens differ by a factor of their stress, whose geometric mean is 1.
-        start: A fit with one element less, else alike, to begin with; the new one is added where it helps most.
+        poisson_ratio: Poisson ratio of the law, 0 to below 0.5.
+        stable: Whether the stress must increase with stretch, also beyond the tests, as ``Solid`` requires.
+        specimens: Whether a stress factor of each specimen is fitted; their geometric mean is 1.
+        start: Fit with one element fewer and otherwise equal settings to start from.
 
     Raises:
         ValueError: for no tests, tests without stress, or numbers outside their range.

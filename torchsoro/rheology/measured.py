@@ -126,7 +126,7 @@ def read(
     The table is text (columns separated by comma, semicolon, tab or blanks) or a sheet of a workbook (.xls, .xlsx).
     Lines before the header row are skipped; a row of units may follow it. Columns of frequency, storage and loss
     modulus give sweeps; time and modulus give stress relaxation; time and compliance give creep. Columns are identified
-    by common names (``f``, ``omega``, ``E'``, ``E_stor``, ``G_loss_Pa``, ``T``, ``Set``, ``E_relax``, ...), units by the
+    by common names (``f``, ``omega``, ``E'``, ``E_stor``, ``G_loss_Pa``, ``T``, ``Set``, ``E_relax``), units by the
     header (``E' (MPa)``, ``G_storage_pa``) or the row of units. Missing or ambiguous columns and units raise an error
     that names the argument to declare them. If nominal and measured temperatures are present, rows are grouped by the
     nominal one, and the temperature of a curve is the mean of the measured ones.

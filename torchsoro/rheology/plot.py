@@ -1,4 +1,4 @@
-"""Figures of shifted curves, of a spectrum, and of what the simulator is given in its place."""
+"""Figures of shifted curves, of a relaxation spectrum, and of the reduced Prony series for the simulator."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Curve = Sweep | Relaxation | Creep
 
 
 def draw_budget(budget: Budget, materials: Sequence[Material]) -> Figure:
-    """Storage and loss modulus of the full series and of what stands for it, the robot's band shaded.
+    """Storage and loss modulus of the full and the reduced Prony series, the band of the robot shaded.
 
     Marks at the foot are one over the elements' relaxation times, as far as they lie within five decades of the band.
     """
@@ -53,7 +53,7 @@ def draw_budget(budget: Budget, materials: Sequence[Material]) -> Figure:
 
 
 def draw_shift(curves: Any, shift: Shift, curve: Any) -> Figure:
-    """Measured curves and the master curve, coloured by temperature; and the shift factors with WLF's law."""
+    """Measured curves and master curve, coloured by temperature, and shift factors with the WLF law."""
     figure = Figure(figsize=(11, 3.9), layout="constrained")
     raw, reduced, factors = figure.subplots(1, 3)
     low, high = min(c.temperature for c in curves), max(c.temperature for c in curves)
@@ -81,7 +81,7 @@ def draw_shift(curves: Any, shift: Shift, curve: Any) -> Figure:
 
 
 def draw_spectrum(curve: Curve, spectrum: Spectrum) -> Figure:
-    """The data and what the Maxwell elements make of them; below, the relative error."""
+    """Data and fitted Prony series; below, the relative residuals."""
     figure = Figure(figsize=(8.5, 4.8), layout="constrained")
     axis, below = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     if isinstance(curve, Sweep):
@@ -108,7 +108,7 @@ def draw_spectrum(curve: Curve, spectrum: Spectrum) -> Figure:
 
 
 def _series(curve: Curve) -> list[tuple[np.ndarray, np.ndarray, str]]:
-    """What to plot of a curve: abscissa, modulus, mark."""
+    """Abscissa, modulus and marker of each plotted quantity of a curve."""
     if isinstance(curve, Sweep):
         return [(curve.omega, curve.storage, "."), (curve.omega, curve.loss, "x")]
     return [(curve.time, curve.modulus if isinstance(curve, Relaxation) else curve.compliance, ".")]

@@ -1,15 +1,15 @@
-"""The simulator's material at one point: the stress of a prescribed history of deformation, as its kernels find it.
+"""Stress of the simulator's material at one point under a prescribed deformation history.
 
-The same laws and the same discrete update as in ``kernels.stress`` and ``kernels.constitutive``, in torch: neo-Hooke or
-Yeoh (``Solid``) with Maxwell elements whose history follows H <- a H + b (S' - S), the exact exponential of a step in
-which S changes linearly. Many tests at once, each with its own steps, and laws in a batch.
+Constitutive laws and discrete update equal those of ``kernels.stress`` and ``kernels.constitutive``: neo-Hookean or
+Yeoh solid (``Solid``) with Maxwell elements whose history variables follow H <- a H + b (S' - S), the exact exponential
+update for S linear within a step. Tests, each with its own steps, and laws are evaluated in batches.
 
-All of it is differentiable in the law's numbers, in two ways: by autograd; and, faster for the few numbers of a law and
-the many of a curve, by a complex step: a law with an imaginary part of 1e-30 in one of its numbers has 1e-30 times the
-derivative by it in the imaginary part of the stress, to rounding (Squire and Trapp 1998).
+The stress is differentiable with respect to the constants of the law by autograd and by the complex step, which is
+faster for few constants and many samples: with an imaginary part of 1e-30 in one constant, the imaginary part of the
+stress over 1e-30 is the derivative to rounding (Squire and Trapp 1998).
 
-Paths begin at rest: the step before the first sample leads there from the undeformed state. Steps may differ; the
-simulator's are all the same.
+Histories start from the undeformed, relaxed state; the first step leads to the first sample. Unlike in the simulator,
+steps may differ in length.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from torch import Tensor
 
 from torchsoro.simulation.material import Prony, Solid
 
-_NEWTON = 60  # steps at most; four or five do, but for wild laws
+_NEWTON = 60  # largest number of Newton iterations; four or five suffice for common constants
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Law:
-    """Numbers of a material at a point, with leading axes that broadcast against each other and against the tests.
+    """Constants of a material at a point; leading axes broadcast against each other and against the tests.
 
     Attributes:
-        shear: Equilibrium shear modulus at rest, mu [...] Pa.
+        shear: Equilibrium shear modulus mu in the undeformed state [...] Pa.
         bulk: Bulk modulus K [...] Pa; the stress of simple shear does not depend on it.
-        stiffening: a and b: mu grows to mu (1 + a x + b x^2) at x = I1b - 3 [..., 2].
-        moduli: Of the Maxwell elements, relative to mu [..., M].
-        times: Their relaxation times [..., M] s.
+        stiffening: Coefficients a and b of the modulus mu (1 + a x + b x^2), x = I1b - 3 [..., 2].
+        moduli: Moduli of the Maxwell elements over mu [..., M].
+        times: Relaxation times [..., M] s.
     """
 
     shear: Tensor
@@ -52,7 +52,7 @@ class Law:
         return cls(shear=shear, bulk=bulk, stiffening=torch.stack(stiffening), moduli=moduli, times=times)
 
     def factor(self, x: Tensor) -> Tensor:
-        """By what mu is multiplied at x = I1b - 3 [..., T]."""
+        """Stiffening factor of mu at x = I1b - 3 [..., T]."""
         a, b = self.stiffening.unsqueeze(-1).unbind(-2)
         return 1 + x * (a + b * x)
 
@@ -63,7 +63,7 @@ class Law:
 
 
 def pull_back(F: Tensor, law: Law) -> Tensor:
-    """What the Maxwell elements follow: the pull-back S of the deviatoric stress over mu [..., T, 3, 3]."""
+    """Pull-back S of the deviatoric stress over mu, the input of the Maxwell elements [..., T, 3, 3]."""
     J, C = _ratio(F), F.mT @ F
     trace = C.diagonal(dim1=-2, dim2=-1).sum(-1)
     factor = law.factor(J ** (-2 / 3) * trace - 3)
@@ -83,12 +83,12 @@ def piola(F: Tensor, Q: Tensor, law: Law) -> Tensor:
 
 
 def history(S: Tensor, dt: Tensor, law: Law) -> Tensor:
-    """Q = sum_i g_i H_i [..., T, 3, 3] along a path of S, step by step.
+    """Viscous overstress Q = sum_i g_i H_i [..., T, 3, 3] along a history of S.
 
     Args:
         S: From :func:`pull_back`.
-        dt: Length of the step that leads to each sample [..., T] s.
-        law: For the Maxwell elements.
+        dt: Duration of the step that ends at each sample [..., T] s.
+        law: Material with the Maxwell elements.
     """
     if not law.times.shape[-1]:
         return torch.zeros_like(S)
@@ -98,12 +98,12 @@ def history(S: Tensor, dt: Tensor, law: Law) -> Tensor:
 
 
 def _change(S: Tensor) -> Tensor:
-    """From step to step [..., T, k], at rest before the first."""
+    """Increments from step to step [..., T, k], from zero before the first."""
     return torch.cat([S[..., :1, :], S.diff(dim=-2)], -2)
 
 
 def _recurrence(decay: Tensor, drive: Tensor) -> Tensor:
-    """All H_n = decay_n H_(n-1) + drive_n [..., T, M, k] at once, from 0 on: spans of steps that double are joined.
+    """Parallel scan of H_n = decay_n H_(n-1) + drive_n [..., T, M, k] with H = 0 before the first step.
 
     Args:
         decay: [..., T, M, 1].
@@ -185,13 +185,13 @@ def _with_free(stretch: Tensor, dt: Tensor, law: Law, sides: int) -> tuple[Tenso
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Free:
-    """A path with free sides, in the principal stretches l_1 (given) and l_2 (free).
+    """History with stress-free sides in principal stretches: l_1 prescribed, l_2 unknown.
 
     Attributes:
-        given: l_1 [..., T].
-        dt: [..., T] s.
-        law: The material, its moduli mu and K with an axis for the steps.
-        sides: How many of the three stretches are free.
+        given: Prescribed stretch l_1 [..., T].
+        dt: Duration of each step [..., T] s.
+        law: Material, with an axis for the steps in mu and K.
+        sides: Number of unknown principal stretches, 1 or 2.
     """
 
     given: Tensor
@@ -200,10 +200,10 @@ class _Free:
     sides: int
 
     def solve(self, u: Tensor) -> Tensor:
-        """The ln l_2 [..., T] that free the sides, with their first derivatives, from a guess.
+        """Unknown ln l_2 [..., T] of zero lateral stress, with first derivatives, by Newton iteration from a guess.
 
-        Newton's steps for all steps of the path at once, in which what the elements remember of the steps before
-        follows a round later. Nearly incompressible it is little; else the steps become right one after the other.
+        All time steps are iterated at once; the Jacobian neglects the coupling to previous steps through the history
+        variables. That coupling is weak for nearly incompressible laws; otherwise steps converge in temporal order.
         """
         real = {k: _plain(getattr(self.law, k)) for k in ("shear", "bulk", "stiffening", "moduli", "times")}
         plain = replace(self, given=_plain(self.given), dt=_plain(self.dt), law=Law(**real))
@@ -216,7 +216,7 @@ class _Free:
                 break
         else:
             raise ValueError("no lateral stretch frees the sides: the law loses its stiffness, or bulk is not positive")
-        # As many rounds more change nothing, but bring the derivatives of the implicit function.
+        # As many iterations again leave the value unchanged and yield the derivatives of the implicit function.
         for _ in range(rounds if self.moving else 0):
             value, slope, _ = self.balance(u)
             u = u - value / _plain(slope)
@@ -224,12 +224,12 @@ class _Free:
 
     @property
     def moving(self) -> bool:
-        """Whether a derivative is asked for."""
+        """Whether a derivative is requested, by autograd or complex step."""
         numbers = (self.given, *(getattr(self.law, k) for k in ("shear", "bulk", "stiffening", "moduli", "times")))
         return any(t.is_complex() or t.requires_grad for t in numbers)
 
     def balance(self, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """At u = ln l_2: Kirchhoff stress along l_2, its slope by u within a step, and nominal stress along l_1."""
+        """Kirchhoff stress along l_2 at u = ln l_2, its derivative by u within a step, nominal stress along l_1."""
         law, m = self.law, self.sides
         c = (3 - m) / 3
         a, b = law.stiffening.unsqueeze(-2).unbind(-1)
@@ -245,12 +245,14 @@ class _Free:
             decay, gain = law.discrete(self.dt)
             H = _recurrence(decay.unsqueeze(-1), gain.unsqueeze(-1) * _change(S).unsqueeze(-2))
             Q = (law.moduli[..., None, :, None] * H).sum(-2)
-            felt = (law.moduli.unsqueeze(-2) * gain).sum(-1)  # how much of S of a step it feels itself
+            felt = (law.moduli.unsqueeze(-2) * gain).sum(
+                -1
+            )  # share of the increment of S that acts within its own step
         # The deviatoric parts of Fb A Fb^T along l_2 and l_1 differ by ``spread``, and their sum is zero.
         q_1, q_2 = Q.unbind(-1)
         spread = shrink * (factor * gap + J * (second * q_2 - first * q_1))
         mean = law.bulk / 2 * (J * (J - 1) + torch.log(J))
-        # For the slope, what they keep from the steps before is told from what they feel of this one.
+        # For the slope, contributions of previous steps are separated from those of the current one.
         kept = J * (second * q_2 - first * q_1) - factor * felt * gap
         kept_2 = J * second * q_2 - felt * factor * (second - trace / 3)
         slope = (a + 2 * b * x) * 2 * m * c * shrink * gap * (1 + felt) * gap
@@ -260,7 +262,7 @@ class _Free:
 
 
 def _plain(t: Tensor) -> Tensor:
-    """Without gradient, and without the imaginary part that carries one."""
+    """Real part, detached from the graph."""
     return t.detach().real
 
 
