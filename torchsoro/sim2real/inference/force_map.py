@@ -23,9 +23,11 @@ from torchsoro.sim2real.twin.twin import Twin
 SMALL = 1e-3  # of the body's length, by which a force bends it for its response to be measured
 PASSES = 3  # of simulations at most: the response to forces is not quite linear
 SHARES = np.array([1.0, 0.5, 0.25, 0.1])  # of a step that are tried
-ENOUGH = 0.05  # of the misfit, below which a pass is the last if it gains no more
+ENOUGH = 0.05  # of the chi-squared, below which a pass is the last if it gains no more
 ROUGH = 0.7  # of what the linear response promises, below which a force is only a hint
-ALIKE = 1.25  # of the misfit that the best patch leaves by itself, below which another might be the place as well
+INDISTINCT = (
+    1.25  # of the chi-squared that the best patch leaves by itself, below which another might be the place as well
+)
 STRONG = 0.5  # of the largest force, above which others are told
 
 
@@ -97,7 +99,7 @@ class ForceMap:
         forces: [T, P, W, 3] N, constant in a window; zero on patches that are not needed.
         deviations: Standard deviation of each [T, P, W, 3] N; infinite on patches that are not needed.
         misfits: That a force on each patch by itself would leave [P].
-        share: Of the misfit that the forces take away by the linear response; measurement errors, modulus and
+        share: Of the chi-squared that the forces take away by the linear response; measurement errors, modulus and
             pressure are fitted along, with and without them.
         simulated: The same by a simulation with these forces; far below ``share`` if the response is not linear.
     """
@@ -141,18 +143,18 @@ class ForceMap:
         needed = self.needed
         if not needed:
             return "No force on the body would explain what is left."
-        told = (
-            f"It would take {'; '.join(map(str, needed))}. That takes away {100 * self.share:.0f} % of the misfit by "
+        text = (
+            f"It would take {'; '.join(map(str, needed))}. That removes {100 * self.share:.0f} % of chi-squared by "
             f"the linear response, {100 * max(self.simulated, 0.0):.0f} % when simulated."
         )
         if self.simulated < ROUGH * self.share:
-            told += " The response is far from linear, so that this is no more than a hint."
+            text += " The response is far from linear, so that this is no more than a hint."
         here = int((self.places == needed[0].place).all(-1).argmax())
-        others = [p for p in np.flatnonzero(self.chi2s < ALIKE * self.chi2s[here]) if p != here]
+        others = [p for p in np.flatnonzero(self.chi2s < INDISTINCT * self.chi2s[here]) if p != here]
         if others:
             places = " or ".join("(" + ", ".join(f"{1e3 * v:.0f}" for v in self.places[p]) + ")" for p in others)
-            told += f" These markers hardly tell its place from {places} mm."
-        return told
+            text += f" These markers hardly tell its place from {places} mm."
+        return text
 
 
 def patches(twin: Twin, count: int) -> tuple[np.ndarray, list[Tensor]]:

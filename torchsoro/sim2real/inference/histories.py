@@ -16,7 +16,7 @@ from torchsoro.sim2real.twin.twin import MarkerMotion
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows
 ROUNDS = 3  # of straight lines, each at the measurement errors of the one before
-GAIN = 0.05  # of the cross-validated misfit, that one more patch has to take away
+GAIN = 0.05  # of the cross-validated chi-squared, that one more patch has to take away
 COST = 1.4  # of a degree of freedom, by which cross-validation does not follow the noise
 
 
@@ -25,8 +25,8 @@ class Solution:
     """Histories on some patches.
 
     Attributes:
-        criterion: Of generalised cross-validation: about the misfit of a sample that was left out.
-        misfit: Left over.
+        criterion: Of generalised cross-validation: about the chi-squared of a sample that was left out.
+        chi2: Left over.
         forces: [T, P, W, 3], in steps of those that were simulated; zero on patches that were not chosen.
         deviations: Standard deviation of each; infinite there.
         misfits: That each patch by itself leaves [P]; empty where that was not asked for.
@@ -62,7 +62,7 @@ class Histories:
         """Forces on as few patches as do, added one by one.
 
         Args:
-            before: Misfit without any force.
+            before: Chi-squared without any force.
         """
         count = self.shape[1]
         best = Solution(
@@ -177,7 +177,7 @@ def solve(
         at: Point of what is simulated, in scales.
         motions: As :class:`Lines` has them.
         forces: That the motions have [T, P, W, 3], in steps of those that are added.
-        before: Misfit without any force.
+        before: Chi-squared without any force.
     """
     solution, common = None, np.zeros(0)
     for _ in range(ROUNDS):

@@ -19,10 +19,10 @@ from torchsoro.sim2real.twin.twin import MarkerMotion
 SHORT = 0.02  # of a trial: no phase is shorter
 SLOPE = 0.5  # of the range of a pressure in a trial's duration, above which it rises or falls
 WIDE = 31  # thousandths of a trial, over which a pressure's slope is taken, as it may be noisy
-NEAR = 0.03  # of the body's longest edge, within which a plane is touched
+CONTACT_DISTANCE = 0.03  # of the body's longest edge, within which a plane is touched
 TURN = 0.05  # of the range of a swing, by which it has to come back to be over
 SWINGS = 8  # that are told apart
-BEYOND = 3.0  # times what noise and numerics explain, where recording and simulation part
+DEPARTURE = 3.0  # times what noise and numerics explain, where recording and simulation part
 CUTS = 30  # of a recording, up to which measurement errors are found
 LASTING = 0.01  # s, for which they have to stay apart
 ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth", "tenth")
@@ -186,7 +186,7 @@ def _parting(time: np.ndarray, values: np.ndarray) -> float | None:
     count = max(3, int(np.searchsorted(time, time[0] + LASTING)))
     if len(time) < count:
         return None
-    run = np.convolve(together(values) > BEYOND, np.ones(count), "valid") > count - 0.5
+    run = np.convolve(together(values) > DEPARTURE, np.ones(count), "valid") > count - 0.5
     return float(time[int(run.argmax())]) if run.any() else None
 
 
@@ -218,18 +218,18 @@ def phases(trial: Trial, motion: MarkerMotion) -> list[Phase]:
 
 def _runs(names: Sequence[str], time: np.ndarray) -> list[Phase]:
     """Equal names together; what is too short belongs to what is before it."""
-    kept: list[tuple[str, int]] = []
+    merged: list[tuple[str, int]] = []
     for name, group in itertools.groupby(names):
         count = len(list(group))
-        if kept and (count < SHORT * len(time) or kept[-1][0] == name):
-            kept[-1] = kept[-1][0], kept[-1][1] + count
-        elif kept and kept[-1][1] < SHORT * len(time):  # only the first can be
-            kept[-1] = name, kept[-1][1] + count
+        if merged and (count < SHORT * len(time) or merged[-1][0] == name):
+            merged[-1] = merged[-1][0], merged[-1][1] + count
+        elif merged and merged[-1][1] < SHORT * len(time):  # only the first can be
+            merged[-1] = name, merged[-1][1] + count
         else:
-            kept.append((name, count))
-    ends = np.cumsum([count for _, count in kept])
+            merged.append((name, count))
+    ends = np.cumsum([count for _, count in merged])
     edges = np.append(0.0, time[np.minimum(ends, len(time) - 1)])
-    return [Phase(name, float(a), float(b)) for (name, _), a, b in zip(kept, edges[:-1], edges[1:], strict=True)]
+    return [Phase(name, float(a), float(b)) for (name, _), a, b in zip(merged, edges[:-1], edges[1:], strict=True)]
 
 
 def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
@@ -267,7 +267,7 @@ def _contacts(trial: Trial, motion: MarkerMotion, time: np.ndarray) -> list[str]
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         above = np.minimum(above, ((moved - np.array(plane.point)) @ normal).min(1))
     touched, now = np.zeros(len(above), bool), False
-    for k, height in enumerate(above / (NEAR * max(s.size))):
+    for k, height in enumerate(above / (CONTACT_DISTANCE * max(s.size))):
         now = bool(height < (2 if now else 1))  # left only when it is well off
         touched[k] = now
     on = touched[np.clip(np.searchsorted(motion.time, time), 0, len(touched) - 1)]

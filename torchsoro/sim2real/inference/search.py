@@ -16,7 +16,9 @@ from torchsoro.sim2real.inference.resolution import cost
 
 COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
 STARTS = 3  # searches of each effect, from probe points that differ
-FAR = 3.0  # chi-squared per sample of the null model, above which searches begin with the first part of the trials
+EARLY_ABOVE = (
+    3.0  # chi-squared per sample of the null model, above which searches begin with the first part of the trials
+)
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
 INFLATED = 1.5  # chi-squared per sample of the best effect, above which its residual is added to the discrepancy
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
@@ -51,7 +53,7 @@ def search(
     each = cost(problem.twin, len(problem.trials), PARTLY)
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST))
     carried: list[Task] = []
-    if null_model.chi2 > FAR * null_model.samples:
+    if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
         # by the finer twin at the setup as stated does not hold for a motion that is so different.
         problem = problem.only(problem.trials, correction=problem.stated)
@@ -85,7 +87,7 @@ def search(
     best = _best([*problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS), *tried])
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
-    if best and best[0].chi2 > FAR * best[0].samples and each < PAIRS * budget:
+    if best and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.chi2 - f.samples < TWICE * left]
         best = _best([*best, *pairs])
@@ -110,12 +112,12 @@ def _refined(
 def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
     """Fits without those of the best that come to a simpler effect, which are fitted as that."""
     for fit in [f for f in best[:3] if len(f.effects) == 1]:
-        told = fit.effects[0].simpler(fit.values[0])
-        plain = [e for e in effects if told is not None and e.name == told[0]]
-        if told is None or not plain:
+        simple = fit.effects[0].simpler(fit.values[0])
+        plain = [e for e in effects if simple is not None and e.name == simple[0]]
+        if simple is None or not plain:
             continue
         known = len(fit.ln_factors)
-        start = np.concatenate([fit.point[:known], told[1] / problem.scales((plain[0],))[known:]])
+        start = np.concatenate([fit.point[:known], simple[1] / problem.scales((plain[0],))[known:]])
         (again,) = problem.fit([((plain[0],), start)], errors=fit.errors, rounds=ROUNDS)
         if again is not None and again.chi2 < fit.chi2 + 2 * FAINT * correlation(fit):
             best = _best([*(f for f in best if f is not fit), again])
@@ -139,7 +141,7 @@ def _probe_points(
 ) -> list[tuple[float, Hypothesis, np.ndarray]]:
     """What each effect's looks would leave, and where to begin a search; from nothing, and from what is believed."""
     bases = [problem.base(null_model)]
-    if null_model.chi2 > FAR * null_model.samples:
+    if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         bases.append(problem.base())
     probe_points = []
     for base in bases:

@@ -34,9 +34,9 @@ class Thresholds:
         covered: Times what noise and numerics explain, as believed, below which nothing is missing: all is within them.
         quiet: The same, without an effect, below which nothing is missing if none is believed.
         some: The same, above which an effect must take away ``part`` of it.
-        part: The least share of the misfit.
+        part: The least share of the chi-squared.
         beyond: As ``quiet``, with the best effect, above which it leaves something.
-        share: Of the misfit that the best effect takes away, below which what is left is of its own kind.
+        share: Of the chi-squared that the best effect takes away, below which what is left is of its own kind.
         lost: Largest error on trials left out, over that without an effect, at which an effect is believed.
         noisy: The same where noise and numerics explain most, or noise most of what is left of the trials left out
             without an effect, and the gain is above ``sure``.

@@ -14,7 +14,7 @@ from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.inference.force_map import ForceMap
 from torchsoro.sim2real.inference.heldout import Prediction
 from torchsoro.sim2real.inference.isolability import Isolability
-from torchsoro.sim2real.inference.phases import BEYOND, Mismatch, together
+from torchsoro.sim2real.inference.phases import DEPARTURE, Mismatch, together
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 PLACE, BODY = "#a3154a", "#52606d"
@@ -82,7 +82,7 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after
                 )
         for values, color, label in ((m.before, NOMINAL, "believed"), (m.after, EXPLAINED, after)):
             panel.plot(m.time, np.maximum(together(values), 0.1), color=color, lw=1.2, label=label)
-        panel.axhline(BEYOND, color="0.5", lw=0.8, ls=":")
+        panel.axhline(DEPARTURE, color="0.5", lw=0.8, ls=":")
         if m.start is not None:
             panel.axvline(m.start, color=PLACE, lw=1.2, label=f"departure, most at {m.marker}")
         panel.set(ylabel="standard deviations", yscale="log", xlim=(0, trial.setup.duration))
