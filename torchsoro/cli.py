@@ -68,8 +68,6 @@ def load(name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[dotted] = module  # dataclasses look their annotations up there
     spec.loader.exec_module(module)
-    # Its help shows the commands as they are called here.
-    module.__doc__ = re.sub(r"python recipes/(\w+)\.py", r"torchsoro \1", module.__doc__ or "")
     return module
 
 
@@ -91,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"error: command = {command!r}: wanted one of {', '.join(summaries())}", file=sys.stderr)
         raise SystemExit(2)
     else:
-        sys.argv[0] = f"torchsoro {command}"  # what the recipe's own usage line begins with
+        sys.argv[0] = f"torchsoro {command}"  # what the usage line and the examples of the recipe's help begin with
         load(command).cli(options)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -133,9 +134,16 @@ def program(
         import tyro  # takes a while to import
 
         with plain_errors():
-            main(tyro.cli(options, description=description, args=arguments))
+            main(tyro.cli(options, description=as_called(description), args=arguments))
 
     return cli
+
+
+def as_called(description: str | None) -> str:
+    """The description of a recipe, whose examples are those of the console script where that is what runs."""
+    text = description or ""
+    script = sys.argv[0].startswith("torchsoro ")
+    return re.sub(r"python recipes/(\w+)\.py", r"torchsoro \1", text) if script else text
 
 
 @contextlib.contextmanager

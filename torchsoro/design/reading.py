@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchsoro.command_line import plain_errors
+from torchsoro.command_line import as_called, plain_errors
 from torchsoro.design.settings import Settings, cuda_available
 
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
@@ -73,7 +73,7 @@ def from_command_line(
     # A preset that does not exist is refused by tyro.
     default = presets.get(name, presets["desk"])
     # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
-    text = re.sub(r"\n *(?=(?:python|torchsoro|tensorboard) )", "\n$ ", description or "")
+    text = re.sub(r"\n *(?=(?:python|torchsoro|tensorboard) )", "\n$ ", as_called(description))
     groups = tyro.cli(_grouped(default), args=arguments, description=text, config=(tyro.conf.OmitArgPrefixes,))
     chosen = {name: value for group in vars(groups).values() for name, value in vars(group).items()}
     return Settings(**chosen)
