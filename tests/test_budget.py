@@ -1,4 +1,4 @@
-"""What a time step bears of a material, and what may stand for the rest."""
+"""Stability of Maxwell elements at a time step, and reduced Prony series."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tests at finite strain: their checks, the way from rest through their samples, and the reader of their files."""
+"""Finite-strain experiments: validation, deformation history from rest, and file reader."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The recipe of finite-strain fits, on the recordings of others and without them."""
+"""Validation recipe of finite-strain fits, with and without the published recordings."""
 
 import importlib
 from pathlib import Path

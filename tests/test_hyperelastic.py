@@ -1,4 +1,4 @@
-"""Fits of laws to tests at finite strain: numbers recovered within their intervals, elements, specimens, refusals."""
+"""Hyperelastic fits to finite-strain tests: recovered constants, coverage of intervals, specimen factors, refusals."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The recipe that holds the way from a rheometer to a material against measurements: its parts, and what it skips."""
+"""Validation recipe of superposition and Prony fits: its functions, and skipped data sets."""
 
 from __future__ import annotations
 

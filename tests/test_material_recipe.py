@@ -1,4 +1,4 @@
-"""From a file of sweeps to a material that a robot is made of, on sweeps whose material is known; and the shaker."""
+"""Material file of a robot from synthetic sweeps and creep of a known Prony series; shaker simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measured curves: their checks, and tables as instruments and people write them."""
+"""Validation of measured curves, and the reader of text tables and workbooks."""
 
 import math
 import sys

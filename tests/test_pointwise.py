@@ -1,4 +1,4 @@
-"""The material at one point: the same stress and history as the kernels', free sides, closed forms, derivatives."""
+"""Pointwise stress against the kernels and closed forms, stress-free sides, and derivatives."""
 
 import math
 from dataclasses import replace

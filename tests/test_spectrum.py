@@ -1,4 +1,4 @@
-"""Spectra fitted to curves of known truth, what their intervals promise, and measured master curves."""
+"""Relaxation spectra recovered from synthetic curves, coverage of their intervals, and measured master curves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Superposition against sweeps of known shifts, its errors against their scatter, WLF, and published shift factors."""
+"""Shift factors and standard errors on synthetic sweeps, WLF and Arrhenius fits, and published shift factors."""
 
 import os
 from dataclasses import replace
@@ -368,7 +368,7 @@ def test_wlf_constants_from_storage_modulus_alone_match_instrument_within_2_stan
 
 @recordings
 def test_storage_modulus_mismatch_below_30_percent_of_that_with_published_raw_shifts():
-    # The list that goes with the raw sweeps differs by more than it should; this is why.
+    # The shift factors published with the raw sweeps differ from ours by more than 0.15 decades.
     folder = Path(RECORDINGS) / "dma-nrel-polymer"
     curves = read(folder / "freq_user_raw.csv")
     published = read_shift(folder / "freq_Eplexor_raw__shift_factors.csv")

@@ -43,14 +43,14 @@ def solidified(
     with their intervals.
 
     Args:
-        curve: Measured, or a master curve.
-        horizon: Longest time that is simulated [s].
-        lowest: Lowest angular frequency of the motions to be simulated [rad/s], for the remark.
-        elements: As of :func:`torchsoro.rheology.spectrum.fit`.
-        equilibrium: Equilibrium modulus from another test [Pa], which is then held; not for creep.
+        curve: Measured curve or master curve.
+        horizon: Longest simulated time [s].
+        lowest: Lowest angular frequency of the simulated motions [rad/s], for the remark.
+        elements: As for :func:`torchsoro.rheology.spectrum.fit`.
+        equilibrium: Fixed equilibrium modulus from another test [Pa]; not for creep.
 
     Raises:
-        ValueError: if nothing is left of the modulus at the horizon, and as of ``fit``.
+        ValueError: if the modulus at the horizon is zero, and as for ``fit``.
     """
     flow = terminal_flow(curve)
     told = flow.sentence if flow else ""

@@ -202,7 +202,7 @@ class _Model:
 
 @dataclass(frozen=True)
 class _Problem:
-    """Residuals of a fit in its unknowns.
+    """Residuals of a fit as functions of its unknowns.
 
     These are ln mu; what a exceeds its least by and sqrt(b), or a and b themselves, in units of the tests; then ln of
     the elements' moduli [Pa] and ln of their times [s]; then ln of the factors of all specimens but the first.
@@ -217,17 +217,17 @@ class _Problem:
 
     @cached_property
     def model(self) -> _Model:
-        """Of the tests."""
+        """Model of all tests."""
         return _Model(self.experiments)
 
     @cached_property
     def largest(self) -> float:
-        """The largest I1 - 3."""
+        """Largest I1 - 3 in the tests."""
         return max(float(e.invariant.max()) for e in self.experiments)
 
     @cached_property
     def scale(self) -> np.ndarray:
-        """What stresses are divided by [n] Pa, so that each test counts the same and the squares add up to n e^2."""
+        """Divisor of the stresses [n] Pa, for equal weight of the tests and a sum of squares of n e^2."""
         count = sum(len(e.time) for e in self.experiments)
         even = [e.rms() * math.sqrt(len(e.time) * len(self.experiments) / count) for e in self.experiments]
         return np.repeat(even, [len(e.time) for e in self.experiments])
@@ -239,12 +239,12 @@ class _Problem:
 
     @cached_property
     def secant(self) -> float:
-        """A modulus of the right size [Pa]."""
+        """Scale of the modulus, for initial values [Pa]."""
         return max(float(np.abs(e.stress).max() / math.sqrt(e.invariant.max())) for e in self.experiments) / 2
 
     @cached_property
     def window(self) -> tuple[float, float]:
-        """Logarithms of the shortest and the longest relaxation time [s] that the tests may see."""
+        """Logarithms of the shortest and longest relaxation time [s] covered by the tests."""
         steps = min(float(e.path(_LARGEST[e.mode])[1].min()) for e in self.experiments)
         return math.log(steps), math.log(10 * max(float(e.time[-1]) for e in self.experiments))
 
@@ -265,11 +265,11 @@ class _Problem:
 
     @property
     def others(self) -> int:
-        """Specimens with a factor among the unknowns."""
+        """Number of specimens with a fitted stress factor."""
         return len(self.experiments) - 1 if self.specimens else 0
 
     def factors(self, x: np.ndarray) -> np.ndarray:
-        """Of the stress of each test [..., tests]."""
+        """Stress factor of each test [..., tests]."""
         logs = x[..., x.shape[-1] - self.others :]
         if not self.specimens:
             return np.ones((*x.shape[:-1], len(self.experiments)))
@@ -282,12 +282,12 @@ class _Problem:
         return self.model.stress(law).numpy() * factors / self.scale
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
-        """Derivatives of the scaled stress [n, K]."""
+        """Derivatives of the scaled stress by the unknowns [n, K]."""
         return (np.imag(self.stress(x + 1j * _STEP * np.eye(len(x)))) / _STEP).T
 
     @cached_property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of the unknowns."""
+        """Bounds of the unknowns."""
         middle, (fast, slow), m = math.log(self.secant), self.window, self.elements
         small, large = middle - math.log(1e4), middle + math.log(1e4)
         least = 0.0 if self.stable else -np.inf
@@ -296,7 +296,7 @@ class _Problem:
         return np.array(low), np.array(high)
 
     def guesses(self, start: Fit | None) -> list[np.ndarray]:
-        """Where to begin."""
+        """Initial values of the unknowns."""
         middle, (fast, slow), m = math.log(self.secant), self.window, self.elements
         if start is not None and m == len(start.moduli) + 1:
             elastic, rest, factors = np.split(start.unknowns, [1 + self.order, 2 * m - 1 + self.order])
@@ -307,7 +307,7 @@ class _Problem:
         return [np.array([*elastic, *[middle - 1] * m, *np.linspace(slow, fast, m + 2)[1:-1], *factors])]
 
     def solve(self, guess: np.ndarray) -> OptimizeResult:
-        """Least squares from a guess."""
+        """Least squares from initial values."""
         low, high = self.bounds
         room = 1e-6 * np.where(np.isfinite(high - low), high - low, 1.0)
         return least_squares(
@@ -325,7 +325,7 @@ class _Problem:
         """The fit with its intervals."""
         x, n, count = found.x, len(self.measured), len(found.x)
         error, grown = 2 * float(found.cost), self._inflation(found.fun)
-        # Intervals are found in a and b themselves, which have no bounds, only ends that the law is kept within.
+        # Intervals are computed in a and b, which are unbounded, and then limited to the stable range of the law.
         free, at = self._unbounded(x)
         low, high = self.bounds
         held = (x - low < 1e-5) | (high - x < 1e-5)
@@ -355,7 +355,7 @@ class _Problem:
         )
 
     def _unbounded(self, x: np.ndarray) -> tuple[_Problem, np.ndarray]:
-        """The same problem in a and b, and its unknowns."""
+        """The same problem with a and b as unknowns, and their values."""
         _, a, b = self.numbers(x)[:3]
         at = x.copy()
         at[1 : 1 + self.order] = [a * self.largest, b * self.largest**2][: self.order]
@@ -364,7 +364,7 @@ class _Problem:
     def _intervals(
         self, x: np.ndarray, covariance: np.ndarray, order: np.ndarray, wide: float, stable: bool
     ) -> dict[str, Interval]:
-        """Of all numbers, by their derivatives by the unknowns; those of positive numbers are of the logarithm."""
+        """Intervals of all constants by error propagation; logarithmic for positive constants."""
         numbers = self.numbers(x + 1j * _STEP * np.eye(len(x)))
         mu, a, b = numbers[:, 0], numbers[:, 1], numbers[:, 2]
         named = {"shear": mu}
