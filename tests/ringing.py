@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from setups import CLAMP, marker, material
 from test_experiment import experiment
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
@@ -17,30 +18,17 @@ from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
 EDGE = 0.01
-SETUP = """
+SETUP = f"""
 title = "bar"
 duration = 0.2
 
 [body]
 size = [0.06, 0.02, 0.02]
 
-[material]
-density = 1000.0
-youngs_modulus = 1e5
-poisson_ratio = 0.3
-prony = [[0.3, 0.01]]
-
-[[clamp]]
-box = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]
-
-[[marker]]
-name = "tip"
-at = [0.06, 0.01, 0.02]
-
-[[marker]]
-name = "side"
-at = [0.04, 0.0, 0.01]
-
+{material(poisson_ratio=0.3, prony="[[0.3, 0.01]]")}
+{CLAMP}
+{marker("tip", 0.06, 0.01, 0.02)}
+{marker("side", 0.04, 0.0, 0.01)}
 [recording]
 noise = 5e-5
 """

@@ -13,27 +13,21 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import strategies as st
+from setups import CLAMP, marker, material
 
 from torchsoro.sim2real import inputs, pipeline
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
 
-SETUP = """title = "finger"
+SETUP = f"""title = "finger"
 duration = 0.5
 
 [body]
 size = [0.08, 0.02, 0.02]
 
-[material]
-density = 1000.0
-youngs_modulus = 1e5
-poisson_ratio = 0.4
-prony = [[0.5, 0.01]]
-
-[[clamp]]
-box = [[-0.001, -0.001, -0.001], [0.0001, 0.021, 0.021]]
-
+{material()}
+{CLAMP}
 [[chamber]]
 name = "one"
 box = [[0.01, 0.005, 0.005], [0.035, 0.015, 0.015]]
@@ -51,14 +45,8 @@ friction = 0.3
 box = [[0.07, 0.0, 0.0], [0.08, 0.02, 0.02]]
 force = [0.0, 0.0, -0.1]
 
-[[marker]]
-name = "tip"
-at = [0.08, 0.01, 0.02]
-
-[[marker]]
-name = "side"
-at = [0.04, 0.0, 0.01]
-
+{marker("tip", 0.08, 0.01, 0.02)}
+{marker("side", 0.04, 0.0, 0.01)}
 [recording]
 noise = 1e-4
 """

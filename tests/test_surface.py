@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from setups import marker, material
 
 from torchsoro.design.mesh import Surface, read_surface
 from torchsoro.sim2real.data.experiment import read_experiment
@@ -17,26 +18,19 @@ from torchsoro.sim2real.inference.model import predict_trial, read_model, write_
 from torchsoro.sim2real.twin.ensemble import SAFETY, Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
-SETUP = """
+SETUP = f"""
 title = "bar"
 gravity = [0.0, 0.0, -1.0]
-duration = {duration}
-{body}
-[material]
-density = 1000.0
-youngs_modulus = 1e5
-poisson_ratio = 0.3
-
+duration = {{duration}}
+{{body}}
+{material(poisson_ratio=0.3, prony="")}
 [[clamp]]
 box = [[-0.001, -1.0, -1.0], [0.0001, 1.0, 1.0]]
 
-[[marker]]
-name = "tip"
-at = [0.08, 0.01, 0.01]
-
+{marker("tip", 0.08, 0.01, 0.01)}
 [recording]
 noise = 5e-5
-{more}
+{{more}}
 """
 BOX = "[body]\nsize = [0.08, 0.02, 0.02]\n"
 MESH = '[body]\nshape = "mesh"\nfile = "body.stl"\nscale = 1e-3\n'

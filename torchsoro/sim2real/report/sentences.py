@@ -7,16 +7,8 @@ import math
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
 from torchsoro.sim2real.inference.ranking import Candidate
+from torchsoro.sim2real.report import words
 from torchsoro.sim2real.report.explanation import Explanation, effect_rows
-from torchsoro.sim2real.report.words import (
-    MAIN,
-    effect_words,
-    error_number,
-    error_words,
-    interval,
-    quantity_words,
-    with_unit,
-)
 
 BELIEVED = 3.0  # prior standard deviations, beyond which the fitted value of a measurement error is not credible
 
@@ -53,7 +45,7 @@ def evidence(e: Explanation) -> list[str]:
         if v.ranking:
             best = v.ranking[0]
             found.append(
-                f"The best of the known effects, {effect_words(best.fit.name)}, explains "
+                f"The best of the known effects, {words.effect_words(best.fit.name)}, explains "
                 f"{100 * best.explained:.0f} % of the difference."
             )
         if e.forces:
@@ -63,9 +55,9 @@ def evidence(e: Explanation) -> list[str]:
     second = next((c for c in v.ranking if c is not v.chosen[0]), None) if v.kind == "explained" else None
     if second is not None:
         found.append(
-            f"Next best is {effect_words(second.fit.name)}, which explains {100 * max(second.explained, 0):.0f} % of "
-            f"the difference, against {100 * v.chosen[0].explained:.0f} %, and whose chi-squared is "
-            f"{second.fit.chi2 / v.chosen[0].fit.chi2:.3g} times as large."
+            f"Next best is {words.effect_words(second.fit.name)}, which explains "
+            f"{100 * max(second.explained, 0):.0f} % of the difference, against {100 * v.chosen[0].explained:.0f} %, "
+            f"and whose chi-squared is {second.fit.chi2 / v.chosen[0].fit.chi2:.3g} times as large."
         )
     if v.chosen:
         found.append(_incredible_errors(e))
@@ -92,8 +84,10 @@ def _incredible_errors(e: Explanation) -> str:
     large = []
     for name, value, deviation in zip(observation.names, e.best.errors, observation.deviations, strict=True):
         if abs(value) > BELIEVED * deviation:
-            words, unit = error_words(name)
-            large.append(f"{words} {error_number(value, unit)} (prior ±{error_number(deviation, unit)})")
+            name_of_error, unit = words.error_words(name)
+            large.append(
+                f"{name_of_error} {words.error_number(value, unit)} (prior ±{words.error_number(deviation, unit)})"
+            )
     if not large:
         return ""
     sentence = f"More is missing than this, since measurement errors are fitted beyond belief: {', '.join(large)}."
@@ -108,14 +102,14 @@ def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = 
     """An effect with its place and its main quantities, or all of them if ``every``."""
     parts = []
     for row in effect_rows(candidate.fit, 0.0, problem):
-        main = MAIN.get(row["name"], ())
+        main = words.MAIN.get(row["name"], ())
         numbers = [
-            f"{quantity_words(row['name'], name)} {with_unit(p['value'], p['unit'], name)} "
-            f"(90 %: {interval(p['low'], p['high'], p['unit'], name)})"
+            f"{words.quantity_words(row['name'], name)} {words.with_unit(p['value'], p['unit'], name)} "
+            f"(90 %: {words.interval(p['low'], p['high'], p['unit'], name)})"
             for name, p in row["parameters"].items()
             if every or not main or name in main
         ]
-        parts.append(f"{effect_words(row['name'])}{_place(row)}: {', '.join(numbers)}")
+        parts.append(f"{words.effect_words(row['name'])}{_place(row)}: {', '.join(numbers)}")
     return " and ".join(parts)
 
 
