@@ -7,7 +7,7 @@ import functools
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, Protocol, TypeVar, dataclass_transform
 
 import pydantic
 from pydantic import Field
@@ -115,9 +115,14 @@ def progress_bar(stage: str) -> Iterator[Callable[[int, int], None]]:
         yield show
 
 
-def program(
-    main: Callable[[Any], object], options: type, description: str | None
-) -> Callable[[Sequence[str] | None], None]:
+class CommandLine(Protocol):
+    """What runs a recipe with the arguments of a command line, the process's own if None."""
+
+    def __call__(self, arguments: Sequence[str] | None = None) -> None:
+        """Read the arguments and run."""
+
+
+def program(main: Callable[[Any], object], options: type, description: str | None) -> CommandLine:
     """The command line of a recipe: options are read and checked, and errors are told in a line.
 
     Args:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from torchsoro.command_line import as_called, plain_errors
+from torchsoro.command_line import CommandLine, as_called, plain_errors
 from torchsoro.design.settings import Settings, cuda_available
 
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
@@ -30,7 +30,7 @@ GROUPS = {
 
 def design_program(
     main: Callable[[Settings], object], presets: Mapping[str, Settings], description: str | None
-) -> Callable[[Sequence[str] | None], None]:
+) -> CommandLine:
     """The command line of a design recipe; see :func:`torchsoro.command_line.program`.
 
     Args:
