@@ -13,6 +13,7 @@ import tyro
 
 from torchsoro import Prony, Simulator, Solid, Waveform, fill, ground
 from torchsoro.benchmark import naive, timing
+from torchsoro.simulation.ops.affine import velocity_gradient
 
 CPU = torch.device("cpu")
 
@@ -101,6 +102,9 @@ def test_naive_step_is_the_simulators():
     body = dataclasses.replace(body, velocity=0.1 * torch.randn(domain.count, 3, generator=generator))
     dt, steps, cell, pressure = 2e-5, 40, domain.cell, 20e3
     stepper = naive.Naive(body, Prony.paper(3), cell=cell, dt=dt, low=(-4 * cell,) * 3, nodes=(16,) * 3)
+    # The simulator begins with the gradient of the velocities.
+    origin, x, v = torch.tensor([[-4 * cell, -4 * cell, 0.0]]), body.position[None], body.velocity[None]
+    stepper.C.from_numpy(velocity_gradient(x, v, origin=origin, cell=cell)[0].numpy())
     for _ in range(steps):
         stepper.step(pressure)
     seen = Simulator(cell=cell, dt=dt, low=(-4 * cell,) * 3, high=(12 * cell,) * 3)(
