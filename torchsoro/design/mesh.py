@@ -6,11 +6,19 @@ import functools
 import itertools
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import meshio
+import lazy_loader
 import numpy as np
-import trimesh
 from scipy import ndimage
+
+# Both take half a second to import, and most bodies are boxes.
+if TYPE_CHECKING:
+    import meshio
+    import trimesh
+else:
+    meshio, trimesh = lazy_loader.load("meshio"), lazy_loader.load("trimesh")
+
 
 FLAT = 0.999  # cosine of the angle to an axis, above which a triangle lies across it
 WIDE = 0.05  # of the area of the body's box across an axis, from which on faces at one place count
