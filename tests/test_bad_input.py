@@ -48,7 +48,7 @@ def without_simulation(recipes: dict[str, ModuleType]) -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(loop, "simulate", diverge)
-        patch.setattr(recipes["compare"], "perform", diverge)
+        patch.setattr("torchsoro.output.comparison.perform", diverge)
         patch.setattr("torchsoro.output.delivery.show", lambda *_, **__: (FOUND, SimpleNamespace(report=STARTED)))
         yield
 

@@ -3,29 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 import torch
 import tyro
 
 from torchsoro import Prony, Simulator, Solid, Waveform, fill, ground
-from torchsoro.benchmark import naive, timing
+from torchsoro.benchmark import naive, sections, timing
 from torchsoro.simulation.ops.affine import velocity_gradient
 
 CPU = torch.device("cpu")
 
 
 @pytest.fixture(scope="module")
-def recipes() -> SimpleNamespace:
-    return SimpleNamespace(benchmark=importlib.import_module("benchmark"), naive=naive, timing=timing)
-
-
-@pytest.fixture(scope="module")
-def benchmark(recipes) -> ModuleType:
-    return recipes.benchmark
+def benchmark() -> ModuleType:
+    return sections
 
 
 def small(benchmark, **changes):
@@ -137,7 +131,7 @@ def test_measures_every_case(benchmark):
 
 def test_prints_a_line_for_each_size_and_writes_all_numbers(benchmark, capsys, tmp_path):
     path = tmp_path / "numbers.json"
-    results = benchmark.main(small(benchmark, only=("table", "bits", "five"), steps=6, json=path))
+    results = benchmark.run(small(benchmark, only=("table", "bits", "five"), steps=6, json=path))
     out, err = capsys.readouterr()
     assert "CPU threads" in out and "512 particles" in err
     lines = out.splitlines()

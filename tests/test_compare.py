@@ -17,6 +17,7 @@ from tiny import TINY
 from torchsoro.design.objective import center_of_gravity
 from torchsoro.design.robot import walker
 from torchsoro.errors import SimulationDiverged
+from torchsoro.output import comparison
 from torchsoro.output.archive import load_design, load_shape
 
 CHOSEN = ("design", "double_modulus", "half_cell", "iteration_0")
@@ -26,12 +27,12 @@ LONG = 2.5 * PERIOD
 
 
 @pytest.fixture(scope="module")
-def compare(recipes) -> ModuleType:
-    return recipes["compare"]
+def compare() -> ModuleType:
+    return comparison
 
 
 def check(compare: ModuleType, robot: Path, out: Path, *only: str, **changes: Any) -> dict[str, dict[str, Any]]:
-    return compare.main(compare.Options(robot=str(robot), out=out, only=only, device="cpu", **changes))
+    return compare.compare(str(robot), out, only=only, device="cpu", **changes)
 
 
 @pytest.fixture(scope="module")

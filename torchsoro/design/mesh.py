@@ -16,6 +16,7 @@ from scipy import ndimage
 if TYPE_CHECKING:
     import meshio
     import trimesh
+    from trimesh import Trimesh
 else:
     meshio, trimesh = lazy_loader.load("meshio"), lazy_loader.load("trimesh")
 
@@ -37,7 +38,7 @@ class Surface:
         mesh: In m.
     """
 
-    mesh: trimesh.Trimesh
+    mesh: Trimesh
 
     @property
     def origin(self) -> tuple[float, float, float]:
