@@ -39,7 +39,7 @@ def test_help_and_the_package_load_neither_torch_nor_taichi():
     assert f"torchsoro {importlib.metadata.version('torchsoro')}" in ended.stdout
 
 
-@pytest.mark.parametrize("name", ["walker", "climber", "replay", "compare", "view", "explain", "material", "convert", "benchmark"])
+@pytest.mark.parametrize("name", cli.COMMANDS)
 def test_help_of_a_command_loads_neither_torch_nor_taichi(name):
     code = (
         "import sys; from torchsoro import cli\n"
