@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -85,6 +86,7 @@ def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> 
         ValueError: if the body as it is believed does not bear what acts on it.
     """
     discretization = measure(inputs.experiment, inputs.ensemble, inputs.fine, report=tick)
+    twins: dict[str, Any] = {"ensemble": inputs.ensemble, "fine": inputs.fine}
     problem = FitProblem(
         inputs.experiment,
         inputs.ensemble.twin,
@@ -92,9 +94,8 @@ def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> 
         discretization=discretization.deviation,
         shift=discretization.shift,
         correction=discretization.correction,
-        ensemble=inputs.ensemble,
-        fine=inputs.fine,
         report=tick,
+        **twins,
     )
     return problem, discretization
 
