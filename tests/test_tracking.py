@@ -196,7 +196,7 @@ def test_refuses_what_is_no_table_of_deeplabcut(tmp_path, change, settings, mess
         ({"axes": ("x", "up")}, r"axes = x, up, wanted different ones"),
         ({"axes": ("x", "-x")}, r"axes = x, -x, wanted different ones"),
         ({"axes": ("x", "")}, r"axes = x, , wanted different ones"),
-        ({"scale": -1.0}, r"scale = -1\.0, wanted a positive number"),
+        ({"scale": -1.0}, r"scale = -1\.0, wanted metres in"),
         ({"origin": (0.0, float("nan"))}, r"origin = \(0\.0, nan\), start = None, wanted finite"),
         ({"start": float("inf")}, r"start = inf, wanted finite"),
     ],

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import importlib
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +50,7 @@ class Frame:
         start: Time by the file's clock that becomes 0 [s]; what is before is left out. None for the first sample.
 
     Raises:
-        ValueError: for axes that are none, a scale that is not positive, or numbers that are not finite.
+        ValueError: for axes that are none, a scale beyond 1e-9 to 1000, or numbers that are not finite.
     """
 
     axes: Sequence[str] | None = None
@@ -63,10 +62,10 @@ class Frame:
         letters = [axis.removeprefix("-") for axis in self.axes or ()]
         if not {*letters} <= {*AXES} or len({*letters}) != len(letters):
             raise ValueError(f"axes = {', '.join(self.axes or ())}, wanted different ones of x, y, z, -x, -y, -z")
-        if self.scale is not None and not 0 < self.scale < math.inf:
-            raise ValueError(f"scale = {self.scale}, wanted a positive number of metres")
-        if not np.isfinite([*(self.origin or ()), self.start or 0.0]).all():
-            raise ValueError(f"origin = {self.origin}, start = {self.start}, wanted finite numbers")
+        if self.scale is not None and not 1e-9 <= self.scale <= 1e3:
+            raise ValueError(f"scale = {self.scale}, wanted metres in the file's unit of length, 1e-9 to 1000")
+        if not (np.abs([*(self.origin or ()), self.start or 0.0]) <= 1e9).all():
+            raise ValueError(f"origin = {self.origin}, start = {self.start}, wanted finite numbers up to 1e9")
 
 
 def read(
