@@ -77,3 +77,10 @@ def test_a_command_gets_its_options(capsys, monkeypatch):
         cli.main(["walker", "--slope", "-1"])
     assert ended.value.code == 2
     assert "slope = -1" in capsys.readouterr().err
+
+
+def test_help_into_a_pipe_that_is_closed_early_ends_without_a_word():
+    command = f"{sys.executable} -m torchsoro.cli walker --help | head -n 1"
+    ended = subprocess.run(command, shell=True, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    assert ended.stdout.startswith("usage: torchsoro walker")
+    assert not ended.stderr

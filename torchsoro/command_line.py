@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -160,6 +161,9 @@ def plain_errors() -> Iterator[None]:
     """
     try:
         yield
+    except BrokenPipeError:  # whoever read the output, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that nothing fails when it is flushed
+        raise SystemExit(0) from None
     except (ValueError, SimulationDiverged, OSError, MemoryError) as error:
         print(f"error: {error or 'not enough memory'}", file=sys.stderr)
         raise SystemExit(2 if isinstance(error, ValueError) else 1) from error
