@@ -10,6 +10,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from test_experiment import experiment
 from test_twin import EDGE, hollow
@@ -69,6 +70,7 @@ def test_on_a_gpu(tmp_path, cuda):
     assert check(near, 1e-4) > 40
 
 
+@pytest.mark.slow
 def test_on_a_simulated_gpu():
     # Numba reads this when it is imported.
     done = subprocess.run(

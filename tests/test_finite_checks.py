@@ -73,6 +73,7 @@ def test_viscous_law_halves_prediction_error_at_held_out_rates(checks):
     assert row["prediction, elastic [%]"] > 3 * row["prediction, viscous [%]"]
 
 
+@pytest.mark.slow
 @recordings
 def test_yeoh_error_below_5_percent_for_all_17_silicones(checks):
     rows = checks.silicones(folder(checks, "silicone-tensile-tests"))

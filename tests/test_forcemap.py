@@ -152,6 +152,7 @@ def test_a_load_and_swings_are_phases(tmp_path):
 # The whole --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_report_says_which_force_no_effect_stands_for(made, tmp_path, monkeypatch):
     from torchsoro.sim2real import pipeline as explain
 

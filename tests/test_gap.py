@@ -39,6 +39,7 @@ def simulated(found):
     return np.stack([t.simulated.place[:: round(0.005 / 0.001)] for t in found.trials])
 
 
+@pytest.mark.slow
 def test_hidden_effects_are_in_the_recording_and_not_in_the_setup(hide):
     plain, truth = hide("nothing")
     assert truth == {} and [t.name for t in plain.heldout] == ["kept"]

@@ -249,6 +249,7 @@ def batch(judge, tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_a_sealed_case_shows_no_truth(judge, batch):
     for case in (batch / "cases").iterdir():
         names = {str(p.relative_to(case)) for p in case.rglob("*") if p.is_file()}
@@ -267,6 +268,7 @@ def write_answer(folder, case, answer):
     (folder / case / "explanation.json").write_text(json.dumps(answer))
 
 
+@pytest.mark.slow
 def test_a_perfect_and_a_silent_answer_are_scored_as_such(judge, batch, tmp_path, capsys):
     truth = json.loads((batch / "truth.sealed").read_text())
     assert {c["kind"] for c in truth["cases"]} == {"effect", "null", "decoy", "pair", "outside"}
@@ -310,6 +312,7 @@ def test_a_perfect_and_a_silent_answer_are_scored_as_such(judge, batch, tmp_path
     assert silent["false alarms, nulls and decoys (<= 10 %)"].endswith("0/2")
 
 
+@pytest.mark.slow
 def test_score_refuses_what_was_changed_after_sealing(judge, batch, tmp_path):
     path = next(iter(sorted((batch / "cases").rglob("markers.csv"))))
     before = path.read_bytes()
@@ -321,6 +324,7 @@ def test_score_refuses_what_was_changed_after_sealing(judge, batch, tmp_path):
         path.write_bytes(before)
 
 
+@pytest.mark.slow
 def test_ask_runs_the_tool_on_a_copy_and_once(judge, batch, tmp_path):
     tool = tmp_path / "tool.py"
     tool.write_text(

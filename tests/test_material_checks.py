@@ -71,6 +71,7 @@ def test_error_norm_not_above_pyvisco_for_same_number_of_terms(checks):
         assert min(ours) <= row["e (Eq. 17c)"]
 
 
+@pytest.mark.slow
 @recordings
 def test_storage_modulus_mismatch_of_raw_adhesive_sweeps_below_30_percent_of_published(checks):
     row = checks.adhesive(Path(RECORDINGS) / "dma-nrel-polymer")[-1]

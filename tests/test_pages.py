@@ -92,6 +92,7 @@ def data(tmp_path_factory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_page_for_each_figure(pages, data, tmp_path, capsys):
     written = pages.main(data, tmp_path / "out")
     assert sorted(path.name for path in written) == sorted(f"{name}.png" for name in PAGES)
@@ -170,6 +171,7 @@ def test_damaged_files_are_refused(pages, data, tmp_path):
             pages.Found(tmp_path / "walker").motion("design")
 
 
+@pytest.mark.slow
 def test_command_line_ends_with_a_line(tmp_path):
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, str(RECIPES / "validate" / "pages.py"), *arguments]
