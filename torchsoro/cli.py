@@ -59,9 +59,8 @@ def load(name: str) -> ModuleType:
     Raises:
         ValueError: for a command that does not exist.
     """
-    known = summaries()
-    if name not in known:
-        raise ValueError(f"command = {name!r}: wanted one of {', '.join(known)}")
+    if name not in COMMANDS:
+        raise ValueError(f"command = {name!r}: wanted one of {', '.join(COMMANDS)}")
     dotted = f"torchsoro.recipes.{name}"
     spec = importlib.util.spec_from_file_location(dotted, recipe_folder() / f"{name}.py")
     assert spec is not None and spec.loader is not None
@@ -85,12 +84,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(usage())
     elif command == "--version":
         print(f"torchsoro {importlib.metadata.version('torchsoro')}")
-    elif command not in summaries():
-        print(f"error: command = {command!r}: wanted one of {', '.join(summaries())}", file=sys.stderr)
-        raise SystemExit(2)
     else:
+        try:
+            recipe = load(command)
+        except ValueError as error:
+            print(f"error: {error}", file=sys.stderr)
+            raise SystemExit(2) from None
         sys.argv[0] = f"torchsoro {command}"  # what the usage line and the examples of the recipe's help begin with
-        load(command).cli(options)
+        recipe.cli(options)
 
 
 if __name__ == "__main__":

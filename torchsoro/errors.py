@@ -1,4 +1,4 @@
-"""The error of a simulation that breaks down; bad input is a plain ``ValueError`` before any work."""
+"""The error of a simulation that breaks down, and the refusal of gradients that do not exist."""
 
 from __future__ import annotations
 

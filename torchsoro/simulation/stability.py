@@ -68,9 +68,13 @@ def courant(
     Raises:
         ValueError: if there is no such formulation, or for bad loads.
     """
+    _check(formulation)
+    return _courant(attach(body, loads), prony, dt, cell, formulation)
+
+
+def _check(formulation: str) -> None:
     if formulation not in ("updated", "total"):
         raise ValueError(f'formulation = {formulation!r}: wanted "updated" or "total"')
-    return _courant(attach(body, loads), prony, dt, cell, formulation)
 
 
 def _courant(attached: Attached, prony: Prony | None, dt: float, cell: float, formulation: str) -> Courant:
@@ -174,7 +178,7 @@ def stable_step(
     Raises:
         ValueError: see :func:`courant`.
     """
-    courant(body, prony, dt=1.0, cell=cell, formulation=formulation)
+    _check(formulation)
     attached = attach(body, loads)
     low, high = 0.0, 1.0
     while high - low > 1e-4 * high:
