@@ -20,6 +20,7 @@ PACKAGE = ROOT / "torchsoro"
 ORDER = """
 errors
 storage command_line
+simulation.laws
 simulation.kernels
 simulation.runtime
 simulation.ops

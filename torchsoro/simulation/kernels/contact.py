@@ -2,6 +2,7 @@
 
 import taichi as ti
 
+from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     PLANE,
     PLANE_ADHESION,
@@ -46,53 +47,18 @@ def normal_of(plane_kind: ti.template(), k, like):
 
 @ti.func
 def response(u, n, stick, friction, hold):
-    """Velocity of a node after one plane; ``hold`` is the largest pull-off speed that adhesion cancels in this step.
-
-    A node that approaches (or is held back by adhesion) sticks: u = 0; or slides: its normal part vanishes and its
-    tangential part shrinks by at most ``friction`` times what presses it on the plane, adhesion included. A node torn
-    off keeps the rest of its speed.
-    """
-    r = u
-    normal = u.dot(n)
-    if normal > hold:
-        r = u - hold * n
-    elif normal < 0 or hold > 0:
-        if stick == 1:
-            r = u * 0
-        else:
-            tangential = u - normal * n
-            speed = tangential.norm()
-            loss = friction * (hold - normal)
-            r = u * 0
-            if speed > loss:
-                r = tangential * (1 - loss / speed)
-    return r
+    """``laws.response`` of vectors."""
+    r0, r1, r2 = laws.response(u[0], u[1], u[2], n[0], n[1], n[2], stick, friction, hold)
+    return ti.Vector([r0, r1, r2])
 
 
 @ti.func
 def response_adjoint(u, n, stick, friction, hold, r_bar):
-    """Adjoint of :func:`response`: gradients by u, friction and hold."""
-    u_bar = r_bar
-    friction_bar = u[0] * 0
-    hold_bar = u[0] * 0
-    normal = u.dot(n)
-    if normal > hold:
-        hold_bar = -r_bar.dot(n)
-    elif normal < 0 or hold > 0:
-        u_bar = r_bar * 0
-        if stick == 0:
-            tangential = u - normal * n
-            speed = tangential.norm()
-            loss = friction * (hold - normal)
-            if speed > loss:
-                direction = tangential / speed
-                loss_bar = -direction.dot(r_bar)
-                flat = r_bar - r_bar.dot(n) * n
-                u_bar = flat - loss / speed * (flat - direction.dot(flat) * direction)
-                u_bar -= loss_bar * friction * n
-                friction_bar = loss_bar * (hold - normal)
-                hold_bar = loss_bar * friction
-    return u_bar, friction_bar, hold_bar
+    """``laws.response_adjoint`` of vectors: gradients by u, friction and hold."""
+    u0_bar, u1_bar, u2_bar, friction_bar, hold_bar = laws.response_adjoint(
+        u[0], u[1], u[2], n[0], n[1], n[2], stick, friction, hold, r_bar[0], r_bar[1], r_bar[2]
+    )
+    return ti.Vector([u0_bar, u1_bar, u2_bar]), friction_bar, hold_bar
 
 
 @ti.func

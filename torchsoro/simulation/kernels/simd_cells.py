@@ -31,7 +31,7 @@ def remove_stale_code() -> None:
     Numba by itself compares the file of the outermost function only.
     """
     here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in here.glob("*.py"))
+    newest = max(source.stat().st_mtime for source in (here.parent / "laws.py", *here.glob("*.py")))
     for index in here.glob("__pycache__/*.nbi"):
         with contextlib.suppress(OSError):
             if index.stat().st_mtime < newest:

@@ -1,0 +1,107 @@
+"""The laws run by Taichi, by Numba and by plain Python, and their adjoints against central differences."""
+
+import ast
+import inspect
+import math
+from types import FunctionType
+
+import numpy as np
+import pytest
+import taichi as ti
+
+from torchsoro.simulation import laws as text
+from torchsoro.simulation.kernels.laws_numba import real
+from torchsoro.simulation.kernels.laws_taichi import laws
+from torchsoro.simulation.runtime import init
+
+NAMES = [name for name, law in vars(text).items() if isinstance(law, FunctionType)]
+STATES = 500
+
+
+def arguments(name: str) -> np.ndarray:
+    """Random arguments of a law [STATES, arguments], of order one, by the names that they have."""
+    rng = np.random.default_rng(3)
+    normal = rng.normal(size=(3, STATES))
+    normal /= np.linalg.norm(normal, axis=0)
+    columns = []
+    for argument in inspect.signature(getattr(text, name)).parameters:
+        if argument in ("n0", "n1", "n2"):
+            column = normal[int(argument[1])]
+        elif argument == "stick":
+            column = rng.integers(0, 2, STATES)
+        elif argument in ("friction", "hold"):
+            column = rng.uniform(0, 1, STATES) * rng.integers(0, 2, STATES)
+        else:
+            column = rng.normal(size=STATES)
+        columns.append(column)
+    return np.stack(columns, 1)
+
+
+def by_python(name: str, given: np.ndarray) -> np.ndarray:
+    """What a law returns for arguments [n, arguments], in plain Python."""
+    found = [getattr(text, name)(*row) for row in given.tolist()]
+    return np.array(found, dtype=np.float64).reshape(len(given), -1)
+
+
+def by_numba(name: str, given: np.ndarray) -> np.ndarray:
+    """The same by Numba, in the precision of the arguments."""
+    law = getattr(real(given.dtype.type), name)
+    return np.array([law(*row) for row in given], dtype=np.float64).reshape(len(given), -1)
+
+
+def by_taichi(name: str, given: np.ndarray, results: int) -> np.ndarray:
+    """The same by Taichi."""
+    init()
+    law, (count, width) = getattr(laws, name), given.shape
+
+    @ti.kernel
+    def run(a: ti.types.ndarray(), out: ti.types.ndarray()):
+        for i in range(count):
+            found = law(*[a[i, k] for k in ti.static(range(width))])
+            for k in ti.static(range(results)):
+                out[i, k] = found[k] if ti.static(results > 1) else found
+
+    out = np.zeros((count, results), given.dtype)
+    run(given, out)
+    return out
+
+
+@pytest.mark.parametrize(("dtype", "within"), [(np.float32, 1e-5), (np.float64, 1e-12)])
+@pytest.mark.parametrize("name", NAMES)
+def test_taichi_numba_and_python_agree_on_a_law(name, dtype, within):
+    given = arguments(name).astype(dtype)
+    expected = by_python(name, given)
+    assert np.isfinite(expected).all()
+    size = 1 + np.abs(expected)
+    for found in (by_numba(name, given), by_taichi(name, given, expected.shape[1])):
+        assert (np.abs(found - expected) / size).max() < within
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.endswith("_adjoint")])
+def test_an_adjoint_agrees_with_central_differences(name):
+    forward = name.removesuffix("_adjoint")
+    parameters = list(inspect.signature(getattr(text, forward)).parameters)
+    given, step = arguments(name), 1e-6
+    inputs, bars = given[:, : len(parameters)], given[:, len(parameters) :]
+    found = by_python(name, given)
+    wanted = [k for k, parameter in enumerate(parameters) if parameter not in ("n0", "n1", "n2", "stick")]
+    assert found.shape[1] == len(wanted)
+    checked = 0
+    for column, k in enumerate(wanted):
+        move = np.zeros(len(parameters))
+        move[k] = step
+        plus, minus, twice = ((by_python(forward, inputs + by * move) * bars).sum(1) / step for by in (1, -1, 2))
+        here = (by_python(forward, inputs) * bars).sum(1) / step
+        # Away from corners, where slopes to either side differ.
+        smooth = np.abs(plus - 2 * here + minus) + np.abs(twice - 2 * plus + here) < 1e-3
+        checked += smooth.sum()
+        np.testing.assert_allclose(found[smooth, column], ((plus - minus) / 2)[smooth], rtol=1e-6, atol=1e-6)
+    assert checked > 0.9 * STATES * len(wanted)
+
+
+def test_numbers_in_the_laws_are_exact_in_float32():
+    tree = ast.parse(inspect.getsource(text))
+    numbers = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant)]
+    numbers = [value for value in numbers if isinstance(value, int | float)]
+    assert numbers
+    assert all(math.isclose(float(np.float32(value)), value, rel_tol=0, abs_tol=0) for value in numbers)
