@@ -11,8 +11,9 @@ from torch import Tensor
 from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fill
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.rollout import initial_state, rollout
+from torchsoro.simulation.ops.rollout import rollout
 from torchsoro.simulation.ops.scene import Inputs, Scene
+from torchsoro.simulation.ops.state import updated_state
 
 H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
 DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s
@@ -194,7 +195,7 @@ def problem(
         history = 0.1 * randn(batch, 6 * elements, count) * (kind != layout.ABSENT)
         tensors["state"] = torch.cat([motion, history.flatten(1)], 1)
     else:
-        tensors["state"] = initial_state(x, 0.3 * randn(*x.shape), elements)
+        tensors["state"] = updated_state(x, 0.3 * randn(*x.shape), elements)
         affine = tensors["state"][:, layout.AFFINE :]
         affine += 0.1 * randn(*affine.shape)
     reach = 20.0 * spread

@@ -14,7 +14,7 @@ import torchsoro
 from torchsoro import Body, Chamber, Domain, Gas, Prony, Region, SimulationDiverged, Solid, fill, simp, stable_step
 from torchsoro.design.density import without_void
 from torchsoro.simulation.kernels import constitutive, layout
-from torchsoro.simulation.ops.rollout import initial_state
+from torchsoro.simulation.ops.state import updated_state
 from torchsoro.simulation.stability import STABLE_COURANT, courant
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
@@ -74,7 +74,7 @@ def test_a_particle_in_the_kernels_has_the_moduli_of_eq_17(elements, omega):
     dt = 2 * math.pi / omega / per_cycle
     cycles = 2 + math.ceil(6 * 0.273 * omega / (2 * math.pi)) if omega < 1e3 else 60
     zeros = torch.zeros(1, 1, 3, dtype=torch.float64)
-    state = initial_state(zeros, zeros, elements).reshape(-1)
+    state = updated_state(zeros, zeros, elements).reshape(-1)
     coefficients = torch.zeros(layout.COEFFICIENTS, dtype=torch.float64)
     coefficients[layout.BULK], coefficients[layout.SHEAR] = 2.0, 1.0
     answer, none, flags = torch.zeros(2).double(), torch.zeros(1).double(), torch.zeros(2, dtype=torch.int32)

@@ -15,7 +15,7 @@ from torchsoro import Prony, Solid
 from torchsoro.rheology.pointwise import Law, equibiaxial, history, pull_back, simple_shear, stress, uniaxial
 from torchsoro.simulation.kernels import constitutive, layout
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.rollout import initial_state
+from torchsoro.simulation.ops.state import updated_state
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -57,7 +57,7 @@ def test_stress_history_equals_updated_kernel_of_one_particle(elements):
     before = torch.cat([torch.eye(3).double()[None], F[:-1]])
     gradients = F @ torch.linalg.inv(before) - torch.eye(3)
     zeros = torch.zeros(1, 1, 3, dtype=torch.float64)
-    state = initial_state(zeros, zeros, elements).reshape(-1)
+    state = updated_state(zeros, zeros, elements).reshape(-1)
     coefficients = torch.zeros(layout.COEFFICIENTS, dtype=torch.float64)
     coefficients[layout.BULK], coefficients[layout.SHEAR] = SOLID.bulk, SOLID.shear
     coefficients[layout.STIFFENING : layout.STIFFENING + 2] = vector(0.3, 0.2)

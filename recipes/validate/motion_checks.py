@@ -12,9 +12,10 @@ from structures import EXACT, FORMS, arguments, block
 from tables import Row
 
 from torchsoro import Body, Prony, SimulationDiverged, Simulator, Solid, ground
+from torchsoro.simulation.formulation import formulation_of
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.total import total_state
+from torchsoro.simulation.ops.state import total_state
 from torchsoro.simulation.stability import courant, stable_step
 
 PAPER_CELL, PAPER_STEP = 1.75e-3, 1e-5
@@ -146,7 +147,7 @@ def stability(
         for count, nu in cases:
             solid, prony = Solid(poisson_ratio=nu), Prony.paper(count)
             body = block((2, 2, 2), PAPER_CELL, (0, 0, 0), solid)
-            formulation = "total" if form == "total" else "updated"
+            formulation = formulation_of(**{"formulation": "updated", **arguments(form)})
             expected = stable_step(body, prony, cell=PAPER_CELL, formulation=formulation)
             limits = []
             for speed in (0.0, 4.0):

@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +24,7 @@ from torchsoro.design.domain import Chamber, Domain
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import square_wave
 from torchsoro.simulation.contact import ground
+from torchsoro.simulation.formulation import FormulationName, formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.simulator import Simulator
 from torchsoro.simulation.stability import stable_step
@@ -41,6 +42,8 @@ LOOPS = {
 }
 
 
+# What a forward step moves of a particle beside its history and of a node, and how many nodes lie beyond the cells.
+NUMBERS = {"updated": (2 * 24 + 7, 14, 3), "total": (4, 19, 2)}
 VOID_RANGE = (0.1, 0.3)  # as in the design recipes
 
 
@@ -64,7 +67,7 @@ class Case:
     """
 
     count: int
-    formulation: Literal["updated", "total"]
+    formulation: FormulationName
     device: torch.device
     steps: int
     elements: int = 3
@@ -91,7 +94,7 @@ class Case:
 
     def body(self, gamma: Tensor) -> Body:
         """The lattice filled with material."""
-        gas = Gas(density=3.0 if self.formulation == "total" else 100.0)
+        gas = Gas(density=formulation_of(self.formulation).air_density)
         return fill(self.domain, gamma, solid=Solid(), gas=gas, void_range=VOID_RANGE)
 
     @cached_property
@@ -234,10 +237,9 @@ def least_bytes(case: Case) -> int:
     displacement and velocity both ways, force written and read, the mass.
     """
     history = 6 * case.elements
-    updated = case.formulation == "updated"
-    nodes = math.prod(n // 2 + (3 if updated else 2) for n in case.domain.particles)
-    numbers = 2 * (24 + history) + 7 if updated else 2 * history + 4
-    return 4 * (case.domain.count * numbers + nodes * (14 if updated else 19))
+    of_particle, of_node, beyond = NUMBERS[case.formulation]
+    nodes = math.prod(n // 2 + beyond for n in case.domain.particles)
+    return 4 * (case.domain.count * (of_particle + 2 * history) + nodes * of_node)
 
 
 def child(code: str, **environment: str) -> str:
@@ -248,7 +250,7 @@ def child(code: str, **environment: str) -> str:
     return done.stdout
 
 
-def trace(count: int, formulation: Literal["updated", "total"], device: str, steps: int, elements: int) -> None:
+def trace(count: int, formulation: FormulationName, device: str, steps: int, elements: int) -> None:
     """Print the milliseconds of each Taichi task in a forward run and in its gradient; for a process of its own."""
     from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.design.domain import Domain, Region
+from torchsoro.simulation.formulation import AIR
 from torchsoro.simulation.material import Body, Gas, Number, Solid, value_of
 
 
@@ -32,9 +33,6 @@ def simp(gamma: Tensor, *, epsilon: Number = 1e-5, power: Number = 3.0) -> Tenso
 
 
 VOID_DRAG = 1e3  # drag over mass of void, and of the air in a chamber [1/s]
-# Density of air in the total-Lagrangian form [kg/m3]: small, yet large enough that waves of the chambers' fictitious
-# shear modulus are slower than the solid's.
-AIR = 3.0
 
 
 def fill(

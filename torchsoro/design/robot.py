@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsoro.design.density import AIR, fill, without_void
+from torchsoro.design.density import fill, without_void
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
@@ -19,6 +19,7 @@ from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 from torchsoro.simulation.contact import Plane, ground
+from torchsoro.simulation.formulation import formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
 from torchsoro.simulation.simulator import Simulator, Trajectory
@@ -88,7 +89,7 @@ class Robot(nn.Module):
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
         air = s.air_density
         if air == "auto":
-            air = AIR if s.formulation == "total" else Gas().density
+            air = formulation_of(s.formulation).air_density
         self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=air)
         self.prony = Prony.paper(s.elements)
         if s.material is not None:

@@ -19,7 +19,8 @@ from torchsoro.rheology.leastsquares import Problem, free
 from torchsoro.rheology.measured import Sweep
 from torchsoro.rheology.residuals import relative_residuals
 from torchsoro.rheology.spectrum import Spectrum
-from torchsoro.rheology.stability import Formulation, courant_number, felt_share, largest_step, moduli_over
+from torchsoro.rheology.stability import courant_number, felt_share, largest_step, moduli_over
+from torchsoro.simulation.formulation import FormulationName
 from torchsoro.simulation.material import Prony, Solid
 from torchsoro.simulation.stability import STABLE_COURANT
 
@@ -112,7 +113,7 @@ class Budget:
     Attributes:
         dt: Time step [s].
         cell: Edge of a grid cell [m].
-        formulation: Formulation of the simulator.
+        formulation: FormulationName of the simulator.
         band: Lowest and highest angular frequency of the robot's motion [rad/s].
         solid: Equilibrium solid.
         elements: The equilibrium spring, then the elements from the slowest.
@@ -121,7 +122,7 @@ class Budget:
 
     dt: float
     cell: float
-    formulation: Formulation
+    formulation: FormulationName
     band: tuple[float, float]
     solid: Solid
     elements: tuple[Element, ...]
@@ -168,7 +169,7 @@ def budget(
     cell: float,
     band: tuple[float, float],
     dt: float | Literal["auto"] = "auto",
-    formulation: Formulation = "updated",
+    formulation: FormulationName = "updated",
 ) -> Budget:
     """Evaluate stability, cost and modulus error of each Maxwell element at a time step.
 
@@ -180,7 +181,7 @@ def budget(
         cell: Edge of a grid cell [m].
         band: Lowest and highest angular frequency of the robot's motion [rad/s].
         dt: Time step [s]; "auto" for the largest stable one with all elements.
-        formulation: Formulation of the simulator.
+        formulation: FormulationName of the simulator.
 
     Raises:
         ValueError: for a spectrum without equilibrium modulus, a batch of materials, or numbers outside their range.

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
 
 import numpy as np
 import torch
 
+from torchsoro.simulation.formulation import FormulationName
 from torchsoro.simulation.material import Body, Solid
 from torchsoro.simulation.stability import STABLE_COURANT, courant
-
-Formulation = Literal["updated", "total"]
 
 
 def moduli_over(moduli: np.ndarray, times: np.ndarray, omega: np.ndarray, viscous: float = 0.0) -> np.ndarray:
@@ -28,7 +26,7 @@ def felt_share(times: np.ndarray, dt: float) -> np.ndarray:
 
 
 def courant_number(
-    solid: Solid, felt: float, *, dt: float, cell: float, formulation: Formulation, viscosity: float = 0.0
+    solid: Solid, felt: float, *, dt: float, cell: float, formulation: FormulationName, viscosity: float = 0.0
 ) -> float:
     """Courant number of one particle of the solid with Maxwell elements of effective relative modulus ``felt``."""
     one = torch.ones(1, dtype=torch.float64)
@@ -50,7 +48,7 @@ def largest_step(
     times: np.ndarray,
     *,
     cell: float,
-    formulation: Formulation,
+    formulation: FormulationName,
     viscosity: float = 0.0,
 ) -> float:
     """Largest stable step [s], by bisection in log time; as ``torchsoro.simulation.material.stable_step``."""

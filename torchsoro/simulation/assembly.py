@@ -245,20 +245,15 @@ def check_weight(weight: Tensor, count: int) -> Tensor:
     return weight
 
 
-def check_start(start: Tensor, scene: Scene, inputs: Inputs, formulation: str) -> None:
-    """Refuse a state to start from that is not one of this body and formulation."""
+def check_start(start: Tensor, inputs: Inputs, wanted: tuple[int, ...], formulation: str) -> None:
+    """Refuse a state to start from that is not one of this body and formulation, of the shape ``wanted``."""
     if not isinstance(start, Tensor):
         raise ValueError(f"start: {type(start).__name__}, wanted a Trajectory or its final state")
     like, elements = inputs.coefficients, inputs.prony.shape[1]
-    batch, _, points = like.shape
-    if scene.lattice is None:
-        wanted = (batch, layout.state_components(elements), points)
-    else:
-        wanted = (batch, layout.lattice_components(scene.lattice.nodes, points, elements))
     if tuple(start.shape) != wanted:
         raise ValueError(
-            f"start: a state of shape {tuple(start.shape)}, wanted {wanted}, as for {batch} simulation(s) of this body "
-            f"with {elements} Maxwell elements in the {formulation!r} formulation"
+            f"start: a state of shape {tuple(start.shape)}, wanted {wanted}, as for {wanted[0]} simulation(s) of this "
+            f"body with {elements} Maxwell elements in the {formulation!r} formulation"
         )
     if start.dtype != like.dtype or start.device != like.device:
         raise ValueError(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # default budget by device, bytes
 _LARGEST = 2**31 - 1  # most numbers in a buffer, which Taichi indexes with 32 bits
-_NODE_SHARE = 1.15  # bytes kept of particles and nodes, over those of the particles alone
+NODE_SHARE = 1.15  # bytes kept of particles and nodes, over those of the particles alone
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class Plan:
 
 
 def plan_checkpoints(
-    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = _NODE_SHARE
+    *, steps: int, state_bytes: int, element_bytes: int, budget: int, node_share: float = NODE_SHARE
 ) -> Plan:
     """Choose a plan within a memory budget: everything kept if it fits, else segments.
 

@@ -82,7 +82,7 @@ class Gas:
         viscosity: Shear viscosity mu_v [Pa s].
         volume_viscosity: zeta [Pa s].
         density: [kg/m3]; artificially high, as the updated form's stable step falls with its square root. The
-            total-Lagrangian form stands ``AIR``, which is next to nothing.
+            total-Lagrangian form stands ``formulation.AIR``, which is next to nothing.
         shear: Fictitious shear modulus of the chamber's points in the total-Lagrangian form [Pa], which keeps them
             apart: the pressure of a chamber is uniform, and air resists no distortion.
 

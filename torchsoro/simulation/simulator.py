@@ -19,23 +19,17 @@ from torchsoro.simulation.assembly import (
     check_start,
     check_weight,
     gravity_at,
-    on_lattice,
     supply_at,
 )
 from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
-from torchsoro.simulation.contact import Plane, check_offsets
-from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.formulation import Formulation, FormulationName, formulation_of
 from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
-from torchsoro.simulation.ops.affine import velocity_gradient
-from torchsoro.simulation.ops.rollout import initial_state, refuse_transforms, rollout
+from torchsoro.simulation.ops.rollout import refuse_transforms, rollout
 from torchsoro.simulation.ops.scene import Inputs, Scene
-from torchsoro.simulation.ops.total import total_state
 from torchsoro.simulation.runtime import uncompiled
 from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
-
-TRANSFERS = {"apic": 0.0, "flip": 1.0}
-FORMULATIONS = ("updated", "total")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -83,20 +77,20 @@ class Simulator(nn.Module):
         dt: Substep [s]; "auto" takes the largest that is stable for the body at hand and divides the sampling interval.
         low: Lower corner of the analysis box [m].
         high: Upper corner of the analysis box [m].
-        transfer: Of the updated formulation. "apic" (the paper's) takes a particle's velocity and its gradient C from
-            the grid: angular momentum is kept to rounding, and vibrations that the grid does not resolve are damped at
-            every substep. "flip" (affine FLIP) adds only what changed on the grid to the velocity, and takes C from the
-            grid: vibrations are hardly damped, but angular momentum changes at every substep by sum m x (v - v_grid),
-            by the part of the velocities that the grid does not resolve. A cube of 0.44 MPa that turns freely at 60
-            rad/s with a substep of 0.1 ms loses in five turns, with apic, 0.02, 0.05 and 0.11 % of its speed for edges
-            of 2, 4 and 6 cells; with flip 25, 6.8 and 2.8 %.
-        formulation: "updated" or "total".
+        transfer: Of the updated formulation by name. "apic" (the paper's; where None) takes a particle's velocity and
+            its gradient C from the grid: angular momentum is kept to rounding, and vibrations that the grid does not
+            resolve are damped at every substep. "flip" (affine FLIP) adds only what changed on the grid to the
+            velocity, and takes C from the grid: vibrations are hardly damped, but angular momentum changes at every
+            substep by sum m x (v - v_grid), by the part of the velocities that the grid does not resolve. A cube of
+            0.44 MPa that turns freely at 60 rad/s with a substep of 0.1 ms loses in five turns, with apic, 0.02, 0.05
+            and 0.11 % of its speed for edges of 2, 4 and 6 cells; with flip 25, 6.8 and 2.8 %.
+        formulation: "updated" or "total", or one of the objects in :mod:`torchsoro.simulation.formulation`.
         memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 6 GiB on CUDA if None.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
         safety: Share of the largest stable step that dt = "auto" takes.
 
     Raises:
-        ValueError: for numbers that are not finite and positive, an empty box, or an unknown transfer.
+        ValueError: for numbers that are not finite and positive, an empty box, or an unknown formulation or transfer.
     """
 
     def __init__(
@@ -106,8 +100,8 @@ class Simulator(nn.Module):
         dt: float | Literal["auto"],
         low: Sequence[float],
         high: Sequence[float],
-        transfer: str = "apic",
-        formulation: Literal["updated", "total"] = "updated",
+        transfer: str | None = None,
+        formulation: FormulationName | Formulation = "updated",
         memory_budget: int | None = None,
         segment: int | None = None,
         safety: float = 0.9,
@@ -122,20 +116,15 @@ class Simulator(nn.Module):
                 raise ValueError(f"{name} = {value}: wanted finite and positive")
         if len(low) != 3 or len(high) != 3 or not all(b - a > 6 * cell for a, b in zip(low, high, strict=True)):
             raise ValueError(f"low, high = {tuple(low)}, {tuple(high)}: wanted three numbers each, over 6 cells apart")
-        if transfer not in TRANSFERS:
-            raise ValueError(f"transfer = {transfer!r}: wanted one of {', '.join(map(repr, TRANSFERS))}")
-        if formulation not in FORMULATIONS:
-            raise ValueError(f"formulation = {formulation!r}: wanted one of {', '.join(map(repr, FORMULATIONS))}")
-        self.cell, self.transfer, self.safety = float(cell), transfer, safety
-        self.formulation: Literal["updated", "total"] = formulation
+        self.formulation = formulation_of(formulation, transfer)
+        self.cell, self.safety = float(cell), safety
         self.dt: float | Literal["auto"] = "auto" if dt == "auto" else float(dt)
         self.low, self.high = _triple(low), _triple(high)
         self.memory_budget, self.segment = memory_budget, segment
 
     def extra_repr(self) -> str:
         """For ``print``."""
-        how = f"transfer={self.transfer!r}" if self.formulation == "updated" else "formulation='total'"
-        return f"cell={self.cell:g} m, dt={self.dt} s, {how}"
+        return f"cell={self.cell:g} m, dt={self.dt} s, {self.formulation}"
 
     @uncompiled
     def forward(
@@ -186,8 +175,7 @@ class Simulator(nn.Module):
         if self.dt != "auto":
             steps, every = _steps(duration, sample_every, self.dt)
         check_body(body)
-        if self.formulation == "updated":
-            check_offsets(planes)
+        self.formulation.check_planes(planes)
         if start is None:
             self._check_inside(x)
         dt = self.step(body, prony, duration=duration, sample_every=sample_every, loads=loads)
@@ -216,12 +204,12 @@ class Simulator(nn.Module):
         scene = self._scene(attached, planes, where, dt)
         velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
         x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
-        if self.formulation == "total":
-            scene, whole, x, velocity, weights = on_lattice(scene, whole, x, velocity, weights)
-        if state is not None:
-            check_start(state, scene, whole, self.formulation)
+        scene, whole, x, velocity, weights = self.formulation.place(scene, whole, x, velocity, weights)
+        if state is None:
+            state = self.formulation.initial(scene, whole, x, velocity, moving=body.velocity is not None)
         else:
-            state = self._state(scene, whole, x, velocity, moving=body.velocity is not None)
+            shape = self.formulation.state_shape(scene, whole)
+            check_start(state, whole, shape, self.formulation.name)
         samples = sorted({*range(0, steps + 1, every), steps})
         observed, final = self._integrate(scene, whole, state, weights, samples, began, progress)
         shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in observed]
@@ -235,7 +223,7 @@ class Simulator(nn.Module):
         return Scene(
             dt=dt,
             cell=self.cell,
-            blend=TRANSFERS[self.transfer],
+            blend=self.formulation.blend,
             low=self.low,
             high=self.high,
             kind=kind,
@@ -246,14 +234,6 @@ class Simulator(nn.Module):
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
             probes=probes,
         )
-
-    def _state(self, scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
-        """State of the undeformed body."""
-        elements = whole.prony.shape[1]
-        if scene.lattice is not None:
-            return total_state(scene.lattice, x, velocity, scene.kind != layout.ABSENT, elements)
-        spin = velocity_gradient(x, velocity, origin=whole.origin, cell=self.cell) if moving else None
-        return initial_state(x, velocity, elements, affine=spin)
 
     def _integrate(
         self,
@@ -272,13 +252,12 @@ class Simulator(nn.Module):
         )
         segment, keep = steps if progress is None else max(64, math.ceil(steps / 100)), False
         if differentiable:
-            share = {} if scene.lattice is None else {"node_share": 1 + 3 * scene.lattice.nodes / state.shape[1]}
             plan = plan_checkpoints(
                 steps=steps,
                 state_bytes=state.numel() * state.element_size(),
                 element_bytes=state.element_size(),
                 budget=self.memory_budget or MEMORY[state.device.type],
-                **share,
+                node_share=self.formulation.node_share(scene, state),
             )
             segment, keep = (plan.segment, plan.keep) if self.segment is None else (self.segment, False)
         parts: list[tuple[Tensor, ...]] = []
@@ -304,11 +283,7 @@ class Simulator(nn.Module):
         count = torch.arange(steps + 1, dtype=torch.float64)
         if not isinstance(start, Trajectory):
             return 0, count * dt
-        if start.dt != dt and self.formulation == "total" and prony is not None and prony.elements:
-            raise ValueError(
-                f"start: a trajectory with a substep of {start.dt:g} s, wanted the {dt:g} s of this run, on which the "
-                "histories of Maxwell elements depend in the total-Lagrangian formulation"
-            )
+        self.formulation.check_continued(start.dt, dt, prony)
         since = float(start.time[-1])
         began = round(since / dt)
         # A whole number of substeps later, the times are those of one run, bit for bit.

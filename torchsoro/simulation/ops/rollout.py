@@ -53,25 +53,6 @@ _BACKWARD = _define(
 )
 
 
-def initial_state(x: Tensor, v: Tensor, elements: int, affine: Tensor | None = None) -> Tensor:
-    """State of undeformed particles without history (a gas keeps J = 1 where a solid keeps F[0, 0] = 1).
-
-    Args:
-        x: Positions [B, N, 3] in m.
-        v: Velocities [B, N, 3] in m/s.
-        elements: Number of Maxwell elements.
-        affine: Velocity gradient [B, N, 3, 3] in 1/s; zero if None.
-
-    Returns:
-        State [B, S, N], differentiable by x, v and affine.
-    """
-    batch, count, _ = x.shape
-    F = torch.eye(3, dtype=x.dtype, device=x.device).reshape(1, 9, 1).expand(batch, 9, count)
-    C = x.new_zeros(batch, 9, count) if affine is None else affine.flatten(-2).transpose(1, 2)
-    H = x.new_zeros(batch, 6 * elements, count)
-    return torch.cat([x.transpose(1, 2), v.transpose(1, 2), C, F, H], dim=1)
-
-
 def _integrator(
     scene: Scene, inputs: Inputs, first: int, samples: Sequence[int]
 ) -> SegmentIntegrator | TotalSegmentIntegrator:
@@ -229,7 +210,7 @@ def rollout(
     Args:
         scene: What stays the same: grid, particle kinds, planes, probes.
         inputs: Coefficients and what acts over time.
-        state: [B, S, N], see :func:`initial_state`; or [B, L], see ``total.total_state``, if the scene has a lattice,
+        state: [B, S, N], see ``state.updated_state``; or [B, L], see ``total_state`` there, if the scene has a lattice,
             whose points then stand for the particles everywhere.
         weight: Particle weights of the centre of gravity [B, N].
         first: Number of the segment's first substep in the whole run, for messages.

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.kernels import layout, total, total_adjoint
-from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice, numbers, spline
+from torchsoro.simulation.ops.lattice import QUADRATURE, numbers, spline
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.ops.segment import empty_record
@@ -22,25 +22,6 @@ CHUNK = 1024  # substeps between two checks for divergence
 REPEATS = 2  # substeps in a launch on a GPU, forward; backward a launch takes less time than the substep
 TALLIES = 64  # shares in which sums over all nodes or points are taken
 _NEVER = 2**31 - 1
-
-
-def total_state(lattice: Lattice, x: Tensor, v: Tensor, present: Tensor, elements: int) -> Tensor:
-    """State of an undeformed body without history.
-
-    Args:
-        lattice: Where its particles lie.
-        x: Positions of the points [B, points, 3] in m: the lattice's, moved as a whole.
-        v: Velocities [B, points, 3] in m/s.
-        present: bool [points], where there is a particle.
-        elements: Number of Maxwell elements.
-
-    Returns:
-        State [B, L], differentiable by x (as a shift of the whole) and v.
-    """
-    shift = (x - lattice.places.to(x))[:, present].mean(1)
-    d = shift.unsqueeze(-1).expand(-1, -1, lattice.nodes)
-    rest = x.new_zeros(x.shape[0], 6 * elements * lattice.count)
-    return torch.cat([d.flatten(1), lattice.project(v, present).flatten(1), rest], 1)
 
 
 _SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")
