@@ -48,7 +48,7 @@ def made(tmp_path_factory):
             seen = observation.observe(ensemble([s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
-        return FitProblem(dataclasses.replace(found, trials=tuple(trials)), twin, ensemble=ensemble)
+        return FitProblem(dataclasses.replace(found, trials=tuple(trials)), ensemble)
 
     return record
 

@@ -15,12 +15,12 @@ from scipy.integrate import solve_ivp
 from torchsoro.sim2real.hypotheses.body_effects import Density, Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.inference.cosines import Response, cleared, compare, first_seen, imitation, settle
-from torchsoro.sim2real.inference.discretization import DiscretizationError
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.likelihood import Tolerances
 from torchsoro.sim2real.inference.next_experiment import REPEAT, Proposal, advice, next_experiment
 from torchsoro.sim2real.inference.ranking import Candidate
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import Verdict
 from torchsoro.sim2real.report.drawings import draw_cosines
 from torchsoro.sim2real.report.explanation import Explanation, as_json
@@ -181,9 +181,9 @@ class Broken(Idle):
 @pytest.fixture(scope="module")
 def problem(made):
     """From rest, under its own weight, believed to be springy: no time but that of density and modulus."""
-    twin, ensemble, record = made
+    _, ensemble, record = made
     recorded = record(None)
-    return FitProblem(recorded, twin, trials=recorded.trials[:1], ensemble=ensemble)
+    return FitProblem(recorded, ensemble, trials=recorded.trials[:1])
 
 
 @pytest.fixture(scope="module")
@@ -205,9 +205,7 @@ def test_cosine_of_identical_effects_is_one(screened):
 def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than_like_drag(problem):
     """With a modulus that is known well: within a wide belief, it takes up most of what a mass does."""
     trial, names = problem.trials[0], ("modulus", "density", "attached_mass", "drag")
-    sure = FitProblem(
-        problem.experiment, problem.twin, trials=[trial], ensemble=problem.ensemble, tolerances=Tolerances(modulus=1e-3)
-    )
+    sure = FitProblem(problem.experiment, problem.ensemble, trials=(trial,), tolerances=Tolerances(modulus=1e-3))
     modulus, density, mass, drag = range(4)
     found = isolability(sure, [effect(name) for name in names])
     assert found.cosines[density, modulus] > 0.97 and found.cosines[modulus, density] > 0.97
@@ -259,7 +257,7 @@ def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(pro
     )
     found = Explanation(
         problem=problem,
-        discretization=DiscretizationError(deviation=(), shift=(), correction={}, edges=(0.01,), walls=(2,)),
+        discretization=DiscretizationError(edges=(0.01,), walls=(2,)),
         verdict=verdict,
         before=(),
         after=(),

@@ -163,14 +163,14 @@ def test_a_round_bar_that_is_thrown_bears_it(tmp_path):
     twin = Twin(thrown, edge=0.006, across=2)
     ensemble, trial = Ensemble(twin), dataclasses.replace(found.trials[0], setup=thrown)
     assert twin.grid.cut and ensemble([twin.scenario(trial)])[0].sound.all()
-    ensemble.safety = SAFETY  # that of a box
-    assert not ensemble([twin.scenario(trial)])[0].sound.all()
+    as_of_a_box = dataclasses.replace(ensemble, safety=SAFETY)
+    assert not as_of_a_box([twin.scenario(trial)])[0].sound.all()
 
 
 def test_a_model_takes_its_mesh_along(tmp_path):
     found = folder(tmp_path / "experiment", prism(CORNERS, 0, 20))
     twin = Twin(found.setup, edge=0.01, across=2)
-    (fit,) = FitProblem(found, twin, ensemble=Ensemble(twin)).fit([((), None)], rounds=1)
+    (fit,) = FitProblem(found, Ensemble(twin)).fit([((), None)], rounds=1)
     assert fit is not None
     out = tmp_path / "out"
     out.mkdir()

@@ -82,7 +82,7 @@ def test_mass_centre_and_wall_areas_of_a_chambered_box_match_its_geometry(trial)
     whole, hole = math.prod(t.setup.size), 0.02 * 0.008 * 0.005
     middle = (whole * np.array(t.setup.center) - hole * np.mean(CHAMBER, axis=0)) / solid
     np.testing.assert_allclose(((mass[:, None] * twin.places).sum(0) / mass.sum()).numpy(), middle)
-    assert Ensemble(twin).volumes[0] == pytest.approx(hole)
+    assert Ensemble(twin).chamber_volume[0] == pytest.approx(hole)
     _, _, _, axes, areas, _ = twin.grid.walls
     for axis, area in enumerate((0.008 * 0.005, 0.02 * 0.005, 0.02 * 0.008)):
         assert areas[axes == axis].sum() == pytest.approx(0.0, abs=1e-12)

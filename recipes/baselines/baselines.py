@@ -165,7 +165,9 @@ def full_search(problem: FitProblem, budget: float, **thresholds: float) -> Answ
 
 def without_discretization_error(problem: FitProblem) -> FitProblem:
     """The same, as if the corrected twin made no error."""
-    return problem.only(problem.trials, discretization=[np.zeros_like(n) for n in problem.discretization])
+    known = problem.discretization
+    none = {name: np.zeros_like(n) for name, n in known.deviation.items()}
+    return problem.only(problem.trials, discretization=known.replace(deviation=none))
 
 
 # A network of forces -----------------------------------------------------------------------------------------------
@@ -368,10 +370,10 @@ def main(options: Options) -> Answer | None:
     torch.set_num_threads(1)  # threads belong to the ensembles
     inputs = read_inputs(whole)
     if options.method in get_args(Ablation):
-        problem, _ = correct(inputs)
+        problem = correct(inputs)
     else:
         ensemble = inputs.ensemble
-        problem = FitProblem(inputs.experiment, ensemble.twin, trials=inputs.trials, ensemble=ensemble, lasting=0.0)
+        problem = FitProblem(inputs.experiment, ensemble, trials=inputs.trials, lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
         "modulus-and-damping": lambda: fit_parameters(problem, ["modulus", "viscoelastic"]),

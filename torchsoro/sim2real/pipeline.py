@@ -10,14 +10,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.data.recording import write_table
-from torchsoro.sim2real.inference.discretization import DiscretizationError, measure
+from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
 from torchsoro.sim2real.inference.heldout import Prediction, at_clocks_of, predict
@@ -75,7 +74,7 @@ def predict_markers(options: Options) -> dict[str, np.ndarray]:
     return columns
 
 
-def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> tuple[FitProblem, DiscretizationError]:
+def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> FitProblem:
     """What effects are fitted to: recordings, a twin, and the error that its cells make, by a twin with smaller ones.
 
     Args:
@@ -85,19 +84,14 @@ def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> 
     Raises:
         ValueError: if the body as it is believed does not bear what acts on it.
     """
-    discretization = measure(inputs.experiment, inputs.ensemble, inputs.fine, report=tick)
-    twins: dict[str, Any] = {"ensemble": inputs.ensemble, "fine": inputs.fine}
-    problem = FitProblem(
+    return FitProblem(
         inputs.experiment,
-        inputs.ensemble.twin,
+        inputs.ensemble,
         trials=inputs.trials,
-        discretization=discretization.deviation,
-        shift=discretization.shift,
-        correction=discretization.correction,
+        discretization=measure(inputs.experiment, inputs.ensemble, inputs.fine, report=tick),
+        fine=inputs.fine,
         report=tick,
-        **twins,
     )
-    return problem, discretization
 
 
 def shown(
@@ -154,7 +148,8 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     """The explanation, and the trials that it shows."""
     trials, kept = list(inputs.trials), list(inputs.kept)
     progress.stage("comparing cell sizes")
-    problem, discretization = correct(inputs, progress.tick)
+    problem = correct(inputs, progress.tick)
+    discretization = problem.discretization
     progress.stage("simulating what each effect would change")
     tells = isolability(problem)
     progress.stage("searching among the effects")
@@ -168,7 +163,8 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         following = next_experiment(problem, one, other)
     everything, before, after = shown(problem, best, trials, kept, progress.note)
     # Without the discrepancy of the best effect, by which the errors were inflated for the verdict.
-    known = problem.only(problem.trials, discretization=discretization.deviation)
+    deviation = discretization.deviation
+    known = problem.only(problem.trials, discretization=problem.discretization.replace(deviation=deviation))
     forces = None
     if verdict.kind == "unknown_physics":
         try:

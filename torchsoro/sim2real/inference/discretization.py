@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -15,6 +14,7 @@ from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, added
 from torchsoro.sim2real.inference.observation import Priors
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
@@ -24,25 +24,6 @@ GAP = 2e-5  # distance by which planes are moved to see how much the moment of c
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
 OWN = 1 / 3  # share of the difference to a supplied simulation that may change with an effect
 FLOOR = 0.003  # least error of a twin over the size of the motion
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class DiscretizationError:
-    """Error of the twin by its discretization.
-
-    Attributes:
-        deviation: For each trial [M, A] m, once it is corrected, and modulus, pressure and measurement errors fitted.
-        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
-        correction: By trial, what the finer twin then adds to the motion that is believed [S, M, ...].
-        edges: Of the cells of the twins that were compared [m], the one in use first.
-        walls: Cells through the thinnest wall, or edge, of each.
-    """
-
-    deviation: tuple[np.ndarray, ...]
-    shift: tuple[float, ...]
-    correction: dict[str, MarkerMotion]
-    edges: tuple[float, ...]
-    walls: tuple[int, ...]
 
 
 def measure(
@@ -64,17 +45,18 @@ def measure(
         report: Called with a line after each batch of simulations.
     """
     setup, twin = experiment.setup, ensemble.twin
-    trials = [t for t in experiment.trials if t.recording is not None]
-    everything = [*trials, *(t for t in experiment.heldout if t.recording is not None)]
+    trials = tuple(t for t in experiment.trials if t.recording is not None)
+    everything = (*trials, *(t for t in experiment.heldout if t.recording is not None))
     common = {"noise": 1e-4, "report": report}
-    there = FitProblem(experiment, fine.twin, trials=everything, ensemble=fine, **common)
+    there = FitProblem(experiment, fine, trials=everything, **common)
     other = [_as_simulated(motion, t) for motion, t in zip(_believed(there), everything, strict=True)]
-    here = FitProblem(experiment, twin, trials=trials, ensemble=ensemble, priors=EXACT, **common)
+    here = FitProblem(experiment, ensemble, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
-    shift = np.zeros(len(here.common)) if fit is None else fit.ln_factors
-    own = _believed(FitProblem(experiment, twin, trials=everything, ensemble=ensemble, shift=tuple(shift), **common))
+    shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors)
+    shifted = DiscretizationError(shift=shift)
+    own = _believed(FitProblem(experiment, ensemble, trials=everything, discretization=shifted, **common))
     correction = added(everything, own, other)
-    here = FitProblem(experiment, twin, trials=trials, ensemble=ensemble, **common)
+    here = FitProblem(experiment, ensemble, trials=trials, **common)
     # The error falls with the square of the cell size, which gives that of the finer twin from the difference of the
     # two; impacts on planes do not converge at that order, so that there the whole difference counts.
     ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
@@ -82,18 +64,18 @@ def measure(
     shares = [OWN if t.simulated else 1.0 if s.grounds else smooth for t, s in zip(trials, here.scenarios, strict=True)]
     deviations = [_apart(here, other[: len(trials)], shares)]
     deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
-    found = []
-    for i, motion in enumerate(own[: len(trials)]):
+    found = {}
+    for i, (trial, motion) in enumerate(zip(trials, own, strict=False)):
         left = SAFETY * np.sqrt(sum(d[i] ** 2 for d in deviations))
         seen = here.observation.observe(motion, i, np.zeros(len(here.observation.deviations)))
         # No marker is taken to be far better than the others.
         shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
-        found.append(np.maximum(left, max(shared / 2, FLOOR * moved)))
+        found[trial.name] = np.maximum(left, max(shared / 2, FLOOR * moved))
     thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.cavities else t.walls for t in (twin, fine.twin))
     return DiscretizationError(
-        deviation=tuple(found),
-        shift=tuple(shift),
+        deviation=found,
+        shift=shift,
         correction=correction,
         edges=(twin.edge, fine.twin.edge),
         walls=thinnest,
@@ -143,7 +125,7 @@ def _apart(here: FitProblem, other: Sequence[MarkerMotion], shares: Sequence[flo
     recorded = _recordings_of(here, other)
     fit = here.only(recorded).fit([((), None)], rounds=2)[0]
     if fit is None:
-        return [np.zeros(n.shape) for n in here.discretization]
+        return [np.zeros_like(here.discretization.of(t)) for t in here.trials]
     return [
         share * np.sqrt(((t.recording.place - seen) ** 2).mean(0))
         for t, seen, share in zip(recorded, fit.seen, shares, strict=True)

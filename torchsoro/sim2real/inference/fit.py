@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.inference.gauss_newton import GaussNewton, Point, Search
+from torchsoro.sim2real.inference.gauss_newton import Answer, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood
 from torchsoro.sim2real.inference.probing import ranked_starts
 
@@ -56,6 +56,7 @@ class Fit:
         return " + ".join(e.name for e in self.effects) or "nothing"
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class FitProblem(Likelihood):
     """Recordings and a twin, to which effects are fitted; see :class:`Likelihood` for its arguments."""
 
@@ -67,7 +68,16 @@ class FitProblem(Likelihood):
         """
         at = np.zeros(len(self.common)) if known is None else known.point
         errors = np.zeros(len(self.observation.deviations)) if known is None else known.errors
-        return self._alone(GaussNewton(self, ()).linearise(at, errors, np.arange(len(at))))
+        search = GaussNewton(self, ()).linearise(at, errors, np.arange(len(at)))
+        asked = next(search)
+        try:
+            while True:
+                asked = search.send(Answer(motions=self.simulate([asked])[0]))
+        except StopIteration as end:
+            point, _ = end.value
+        if point is None:
+            raise ValueError(BREAKS)
+        return point
 
     def probe(self, effects: Sequence[Hypothesis], base: Point) -> list[list[tuple[float, np.ndarray]]]:
         """How far effects may reduce chi-squared, by one simulation of each probe point and linear responses.
@@ -124,12 +134,11 @@ class FitProblem(Likelihood):
         while asked:
             order = list(asked)
             # Where the ensemble has room, derivatives take no longer than the step by itself.
-            wide = sum(1 + len(solvers[i].low) for i in order) * len(self.trials)
+            wide = sum(1 + solvers[i].unknowns for i in order) * len(self.trials)
             answers = self.simulate([asked[i] for i in order])
             for i, motions in zip(order, answers, strict=True):
-                solvers[i].eager = wide <= self.ensemble.room
                 try:
-                    asked[i] = searches[i].send(motions)
+                    asked[i] = searches[i].send(Answer(motions=motions, eager=wide <= self.ensemble.room))
                 except StopIteration as end:
                     ends[i] = end.value
                     del asked[i]
@@ -150,17 +159,6 @@ class FitProblem(Likelihood):
         ahead = end.J.T @ (end.r - end.columns @ step) - weight**2 * end.errors
         errors = end.errors + np.linalg.solve(end.J.T @ end.J + np.diag(weight**2), ahead)
         return dataclasses.replace(fit, point=end.at + step, errors=np.delete(errors, number))
-
-    def _alone(self, search: Search) -> Point:
-        """The end of one search by itself."""
-        asked = next(search)
-        try:
-            while True:
-                asked = search.send(self.simulate([asked])[0])
-        except StopIteration as end:
-            if end.value is None:
-                raise ValueError(BREAKS) from None
-            return end.value
 
     def _fit(self, solver: GaussNewton, point: Point) -> Fit:
         """A point as a fit, in SI units."""

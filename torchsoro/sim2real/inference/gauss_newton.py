@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -21,7 +22,22 @@ LONGEST_MOVE = 1.5  # of a place in a step, in tenths of the body's size
 DAMPING = 1e-2  # of the first step (Levenberg and Marquardt), times the diagonal of the normal matrix
 DAMPING_LIMITS = (1e-4, 10.0)  # least damping of a step; a search ends that would need more than the most
 
-Search = Generator[Request, list[MarkerMotion], "Point | None"]
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Answer:
+    """What a search is sent for its request.
+
+    Attributes:
+        motions: Of each trial.
+        eager: Whether derivatives may be asked for with every step, as where there is room for their simulations.
+    """
+
+    motions: list[MarkerMotion]
+    eager: bool = False
+
+
+Search = Generator[Request, Answer, "Point | None"]
+Linearisation = Generator[Request, Answer, "tuple[Point | None, bool]"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,27 +63,44 @@ class Point:
     motions: list[MarkerMotion]
 
 
+@dataclass(frozen=True, eq=False)
 class GaussNewton:
     """Searches for the best values of some effects.
 
-    Args:
+    Attributes:
         likelihood: What chi-squared is of.
         effects: That are fitted, along with modulus and pressure.
-
-    Attributes:
-        held: Unknowns that stay as stated: the modulus beside an effect that is the modulus without its prior.
-        eager: Whether derivatives are asked for with every step, as where there is room for their simulations.
     """
 
-    def __init__(self, likelihood: Likelihood, effects: Effects) -> None:
-        self.likelihood, self.effects, self.eager = likelihood, effects, False
-        common = likelihood.common
-        self.low, self.high = likelihood.bounds(effects)
-        held = [any(isinstance(e, type(one)) for e in effects) for one, _ in common]
-        self.held = np.array(held + [False] * (len(self.low) - len(held)))
-        places = [[False] * len(e.quantities) + [True] * (3 * e.local) for e in effects]
-        self.places = np.array([False] * len(common) + [p for own in places for p in own])
-        self.weight = 1 / likelihood.observation.deviations  # of the measurement errors
+    likelihood: Likelihood
+    effects: Effects
+
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the unknowns, in scales."""
+        return self.likelihood.bounds(self.effects)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns that are simulated."""
+        return len(self.bounds[0])
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """Unknowns that stay as stated: the modulus beside an effect that is the modulus without its prior."""
+        held = [any(isinstance(e, type(one)) for e in self.effects) for one, _ in self.likelihood.common]
+        return np.array(held + [False] * (self.unknowns - len(held)))
+
+    @cached_property
+    def places(self) -> np.ndarray:
+        """Unknowns that are coordinates of a place."""
+        places = [[False] * len(e.quantities) + [True] * (3 * e.local) for e in self.effects]
+        return np.array([False] * len(self.likelihood.common) + [p for own in places for p in own])
+
+    @cached_property
+    def weight(self) -> np.ndarray:
+        """Of the measurement errors."""
+        return 1 / self.likelihood.observation.deviations
 
     def search(self, start: np.ndarray | None, errors: np.ndarray, rounds: int, *, settle: bool) -> Search:
         """A search from a point.
@@ -81,10 +114,10 @@ class GaussNewton:
         Returns:
             The last point; None where the simulation of the first breaks down.
         """
-        at = np.zeros(len(self.low)) if start is None else np.clip(np.asarray(start, float), self.low, self.high)
+        at = np.zeros(self.unknowns) if start is None else np.clip(np.asarray(start, float), *self.bounds)
         at = np.where(self.held, 0.0, at)
         damping, moving = DAMPING, np.flatnonzero(~self.held)
-        current = yield from self.linearise(at, errors, moving)
+        current, eager = yield from self.linearise(at, errors, moving)
         if current is None:
             return None
         fresh = True  # whether the derivatives were simulated at this point
@@ -92,14 +125,15 @@ class GaussNewton:
             step = self.step(current, damping)
             if not step.any():
                 break
-            eager = self.eager
-            ahead = yield from self.linearise(current.at + step, current.errors, moving if eager else moving[:0])
+            asked = moving if eager else moving[:0]
+            complete = eager
+            ahead, eager = yield from self.linearise(current.at + step, current.errors, asked)
             gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
             if ahead is not None and gained > 0:
-                if not eager:
+                if not complete:
                     ahead = dataclasses.replace(ahead, columns=_updated(current, ahead))
                 converged = fresh and gained < max(0.5, 1e-3 * ahead.chi2)
-                current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), eager
+                current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), complete
                 if converged:
                     break
             elif fresh:
@@ -109,20 +143,29 @@ class GaussNewton:
                 continue
             # Derivatives that were updated along the way no longer lead far.
             if not fresh and gained < 0.3 * current.chi2:
-                again = yield from self.linearise(current.at, current.errors, moving)
+                again, eager = yield from self.linearise(current.at, current.errors, moving)
                 if again is None:
                     break
                 current, fresh = again, True
         if settle and not fresh:
-            again = yield from self.linearise(current.at, current.errors, moving)
+            again, _ = yield from self.linearise(current.at, current.errors, moving)
             current = again or current
         return current
 
-    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray) -> Search:
-        """A point with its derivatives by the unknowns ``moving``; None if its simulation breaks down."""
+    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray) -> Linearisation:
+        """A point with its derivatives by the unknowns ``moving``, None if its simulation breaks down.
+
+        Beside it whether the next may have derivatives, too, as where there is room for them.
+        """
+        steps = np.where(at + STEP > self.bounds[1], -STEP, STEP)
+        answer = yield self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
+        return self._point(at, errors, moving, steps, answer.motions), answer.eager
+
+    def _point(
+        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, steps: np.ndarray, motions: list[MarkerMotion]
+    ) -> Point | None:
+        """A point from the motions there and beside it."""
         likelihood = self.likelihood
-        steps = np.where(at + STEP > self.high, -STEP, STEP)
-        motions = yield self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
         if not np.all([m.sound for m in motions]):
             return None
         base = [m.alone(0) for m in motions]
@@ -139,6 +182,7 @@ class GaussNewton:
     def step(self, point: Point, damping: float) -> np.ndarray:
         """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""
         fixed, step = self.held.copy(), np.zeros_like(point.at)
+        low, high = self.bounds
         prior, slope = self.likelihood.prior_residual(point.at, self.held)
         most = np.where(self.places, LONGEST_MOVE, LONGEST_STEP * (np.abs(point.at) + 4.0))
         for _ in range(len(step)):
@@ -153,12 +197,12 @@ class GaussNewton:
             step[free] = np.linalg.solve(H, whole.T @ point.r - pull)[:n]
             step = np.clip(step, -most, most)
             ahead = point.at + step
-            below, above = (ahead < self.low) & (point.at <= self.low), (ahead > self.high) & (point.at >= self.high)
+            below, above = (ahead < low) & (point.at <= low), (ahead > high) & (point.at >= high)
             beyond = free & (below | above)
             if not beyond.any():
                 break
             fixed |= beyond
-        return np.clip(point.at + step, self.low, self.high) - point.at
+        return np.clip(point.at + step, low, high) - point.at
 
     def covariance(self, point: Point) -> np.ndarray:
         """Of the unknowns at a point, in scales [K, K]; zero where they are held."""

@@ -6,6 +6,7 @@ The recorded coordinates do not enter. Responses are simulated at the setup as s
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,8 +21,6 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
-from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerMotion
 
 SAME = 0.97  # cosine above which one effect passes for another
@@ -86,8 +85,7 @@ def isolability(
     asked = [
         ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
     ]
-    problem = problem.only(problem.trials)
-    problem.ensemble = Even(problem.twin, problem.ensemble.threads, problem.ensemble.device)
+    problem = problem.only(problem.trials, ensemble=dataclasses.replace(problem.ensemble, even=True))
     base, *found = problem.simulate([((), still), *asked])
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)
@@ -117,19 +115,6 @@ def isolability(
         detectable=detectable * np.array([q.scale for q in first]),
         cosines=cosines,
     )
-
-
-class Even(Ensemble):
-    """Simulates all variations with the same time step, so that its error cancels in their differences."""
-
-    def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerMotion]:
-        """Simulate, as :class:`Ensemble` does."""
-        self.step = min(float(super(Even, self).stable(s).min()) for s in scenarios)
-        return super().__call__(scenarios)
-
-    def stable(self, s: Scenario) -> np.ndarray:
-        """The step of all [B] s."""
-        return np.full(s.batch, self.step)
 
 
 def prior_residual_of(problem: FitProblem) -> PriorResidual:

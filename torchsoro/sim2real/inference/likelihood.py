@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -18,6 +19,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
 from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel, Priors
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
@@ -27,6 +29,11 @@ FEWEST = 8  # samples of the first part of a trial, below which it is not used
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
+
+
+def _silent(line: str) -> None:
+    """Report nothing."""
+
 
 Effects = tuple[Hypothesis, ...]
 Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
@@ -42,104 +49,105 @@ class Tolerances:
 
 @dataclass
 class Tally:
-    """Number of simulations."""
+    """Number of simulations; the only thing here that changes."""
 
     simulations: int = 0
 
+    def count(self, simulations: int) -> None:
+        """So many more."""
+        self.simulations += simulations
 
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Likelihood:
     """Recordings, a twin and its error, and chi-squared of motions.
 
-    Args:
+    Attributes:
         experiment: What to explain.
-        twin: Its body.
-        trials: To fit, with a recording each; those of the experiment if None.
-        discretization: Standard deviation of the twin's own error for each trial [M, A] m; none if None.
-        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does.
-        correction: By trial, what a finer twin then adds to motions [S, M, ...].
-        own: By effects, the same with them, where it is known.
+        ensemble: Of its twin.
+        trials: To fit, with a recording each; those of the experiment if none are given.
+        discretization: The twin's own error.
         tolerances: Of modulus and pressure.
         priors: Of measurement errors.
-        noise: [m]; that of the setup, or estimated, if None.
+        noise: [m]; that of the setup, or estimated, if 0 is given.
         lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
         slips: Markers that have slipped.
-        ensemble: Of the twin, if there is one already.
         fine: Of a finer twin, for :meth:`corrected`.
         report: Called with a line after each batch of simulations.
+        tally: Of all simulations of this and of what is derived from it.
     """
 
-    def __init__(
-        self,
-        experiment: Experiment,
-        twin: Twin,
-        *,
-        trials: Sequence[Trial] | None = None,
-        discretization: Sequence[np.ndarray] | None = None,
-        shift: Sequence[float] = (),
-        correction: Mapping[str, MarkerMotion] | None = None,
-        own: Mapping[Effects, Mapping[str, MarkerMotion]] | None = None,
-        tolerances: Tolerances | None = None,
-        priors: Priors | None = None,
-        noise: float | None = None,
-        lasting: float = LASTING,
-        slips: Sequence[MarkerSlip] = (),
-        ensemble: Ensemble | None = None,
-        fine: Ensemble | None = None,
-        report: Callable[[str], None] = lambda line: None,
-    ) -> None:
-        self.experiment, self.twin, self.report = experiment, twin, report
-        self.ensemble, self.fine = ensemble or Ensemble(twin), fine
-        self.trials = tuple(experiment.trials if trials is None else trials)
-        recordings = [t.recording for t in self.trials if t.recording is not None]
-        self.noise = noise or experiment.setup.noise or estimate_noise(recordings)
-        shape = recordings[0].place.shape[1:]
-        self.discretization = list(discretization or [np.zeros(shape)] * len(recordings))
-        self.correction, self.own = correction or {}, own or {}
-        self.priors, self.slips, self.lasting = priors, tuple(slips), lasting
-        self.observation = ObservationModel(experiment.setup, self.trials, priors, slips)
-        self.noise_models = [
-            NoiseModel(r, self.noise, n, lasting) for r, n in zip(recordings, self.discretization, strict=True)
-        ]
-        self.samples = sum(b.count for b in self.noise_models)
-        self.scenarios = [twin.scenario(t).replace(until=self.observation.until(i)) for i, t in enumerate(self.trials)]
-        self.tolerances = tolerances or Tolerances()
-        self.common: list[tuple[Hypothesis, float]] = [(Modulus(), self.tolerances.modulus)]
-        if experiment.setup.cavities:
-            self.common.append((PressureGain(), self.tolerances.pressure))
-        self.shift = np.array(shift if len(shift) else [0.0] * len(self.common))
-        self.tally = Tally()
+    experiment: Experiment
+    ensemble: Ensemble
+    _: KW_ONLY
+    trials: tuple[Trial, ...] = ()
+    discretization: DiscretizationError = field(default_factory=DiscretizationError)
+    tolerances: Tolerances = field(default_factory=Tolerances)
+    priors: Priors = field(default_factory=Priors)
+    noise: float = 0.0
+    lasting: float = LASTING
+    slips: tuple[MarkerSlip, ...] = ()
+    fine: Ensemble | None = None
+    report: Callable[[str], None] = _silent
+    tally: Tally = field(default_factory=Tally)
 
-    def only(
-        self,
-        trials: Sequence[Trial],
-        *,
-        slips: Sequence[MarkerSlip] | None = None,
-        discretization: Sequence[np.ndarray] | None = None,
-        correction: Mapping[str, MarkerMotion] | None = None,
-        own: Mapping[Effects, Mapping[str, MarkerMotion]] | None = None,
-    ) -> Self:
-        """The same of other trials, with other slips, or another error or correction of the twin."""
-        known = dict(zip((t.name for t in self.trials), self.discretization, strict=True))
-        common = np.asarray(np.mean(self.discretization, axis=0))
-        there = type(self)(
-            self.experiment,
-            self.twin,
-            trials=trials,
-            discretization=discretization or [known.get(t.name, common) for t in trials],
-            shift=tuple(self.shift),
-            correction=self.correction if correction is None else correction,
-            own=self.own if own is None else own,
-            tolerances=self.tolerances,
-            priors=self.priors,
-            noise=self.noise,
-            lasting=self.lasting,
-            slips=self.slips if slips is None else slips,
-            ensemble=self.ensemble,
-            fine=self.fine,
-            report=self.report,
+    def __post_init__(self) -> None:
+        """Put in what was not given."""
+        trials = tuple(self.trials) or self.experiment.trials
+        recordings = [t.recording for t in trials if t.recording is not None]
+        noise = self.noise or self.experiment.setup.noise or estimate_noise(recordings)
+        for name, value in (
+            ("trials", trials),
+            ("noise", noise),
+            ("discretization", self.discretization.among(trials)),
+        ):
+            object.__setattr__(self, name, value)
+
+    @property
+    def twin(self) -> Twin:
+        """The body."""
+        return self.ensemble.twin
+
+    @cached_property
+    def observation(self) -> ObservationModel:
+        """From motions to recordings."""
+        return ObservationModel(self.experiment.setup, self.trials, self.priors, self.slips)
+
+    @cached_property
+    def noise_models(self) -> tuple[NoiseModel, ...]:
+        """Of each trial."""
+        return tuple(
+            NoiseModel(t.recording, self.noise, self.discretization.of(t), self.lasting)
+            for t in self.trials
+            if t.recording is not None
         )
-        there.tally = self.tally
-        return there
+
+    @cached_property
+    def samples(self) -> int:
+        """Number of samples of all trials."""
+        return sum(b.count for b in self.noise_models)
+
+    @cached_property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """What is believed of each trial, until the end of its recording."""
+        return tuple(self.twin.scenario(t).replace(until=self.observation.until(i)) for i, t in enumerate(self.trials))
+
+    @cached_property
+    def common(self) -> tuple[tuple[Hypothesis, float], ...]:
+        """What is fitted always, modulus and where there is one pressure, with its tolerance."""
+        modulus = (Modulus(), self.tolerances.modulus)
+        if not self.experiment.setup.cavities:
+            return (modulus,)
+        return modulus, (PressureGain(), self.tolerances.pressure)
+
+    @cached_property
+    def shift(self) -> np.ndarray:
+        """Of ln of modulus and pressure, with which the twin moves as a finer one does."""
+        return np.array(self.discretization.shift or [0.0] * len(self.common))
+
+    def only(self, trials: Sequence[Trial], **changes: Any) -> Self:
+        """The same of other trials, with other slips, another ensemble, or another error of the twin."""
+        return dataclasses.replace(self, trials=tuple(trials), **changes)
 
     def corrected(self, at: np.ndarray) -> Self:
         """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales.
@@ -147,29 +155,32 @@ class Likelihood:
         A simulation of one's own is of what is believed, and stays what it is.
         """
         (found,) = self._finer(self.trials, [((), at[None])])
-        return self.only(self.trials, correction={**self.correction, **found})
+        correction = {**self.discretization.correction, **found}
+        return self.only(self.trials, discretization=self.discretization.replace(correction=correction))
 
     def corrected_each(self, points: Sequence[Request]) -> Self:
         """The same, but effects are corrected by the finer twin where each of them is now, at one point."""
         kept = [t for t in self.experiment.heldout if t.recording is not None]
         found = self._finer([*self.trials, *kept], points)
-        own = {e: {**self.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
-        return self.only(self.trials, own={**self.own, **own})
+        known = self.discretization
+        own = {e: {**known.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
+        return self.only(self.trials, discretization=known.replace(own={**known.own, **own}))
 
     def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, MarkerMotion]]:
         """What the finer twin adds at points, by trial; nothing to those with a simulation of one's own."""
         trials = [t for t in trials if t.name not in self.stated]
         if self.fine is None or not trials:
             return [{} for _ in points]
-        there = type(self)(self.experiment, self.fine.twin, trials=trials, noise=self.noise, ensemble=self.fine)
-        coarse = self.only(trials, correction={}, own={}).simulate(points)
+        there = type(self)(self.experiment, self.fine, trials=tuple(trials), noise=self.noise)
+        bare = self.only(trials, discretization=self.discretization.replace(correction={}, own={}))
+        coarse = bare.simulate(points)
         return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
 
     @property
     def stated(self) -> dict[str, MarkerMotion]:
         """Of the corrections, those by a simulation of one's own."""
-        trials = (*self.experiment.trials, *self.experiment.heldout)
-        return {t.name: self.correction[t.name] for t in trials if t.simulated and t.name in self.correction}
+        trials, known = (*self.experiment.trials, *self.experiment.heldout), self.discretization.correction
+        return {t.name: known[t.name] for t in trials if t.simulated and t.name in known}
 
     def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those of the effects that apply to a trial."""
@@ -236,11 +247,12 @@ class Likelihood:
         count = len(self.scenarios)
         found = []
         for k, motion in enumerate(self.ensemble(varied)):
-            known, name = self.own.get(requests[k // count][0], self.correction), self.trials[k % count].name
+            error, name = self.discretization, self.trials[k % count].name
+            known = error.own.get(requests[k // count][0], error.correction)
             found.append(motion.plus(known[name]) if name in known else motion)
         spent = time.perf_counter() - begin
         simulations = count * sum(len(points) for _, points in requests)
-        self.tally.simulations += simulations
+        self.tally.count(simulations)
         self.report(f"{simulations} simulations, {spent:.1f} s")
         return [found[k : k + count] for k in range(0, len(found), count)]
 

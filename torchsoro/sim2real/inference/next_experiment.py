@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,10 +12,11 @@ from torchsoro.sim2real.data.experiment import Load, Marker, Setup, Trial, Vecto
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
-from torchsoro.sim2real.inference.isolability import Even, changes, errors_of, prior_residual_of, shortened
+from torchsoro.sim2real.inference.isolability import changes, errors_of, prior_residual_of, shortened
 from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
 from torchsoro.simulation.actuation import Waveform
 
@@ -73,25 +73,23 @@ def next_experiment(problem: FitProblem, one: Explained, other: Explained) -> li
     """
     first, extra = problem.trials[0], far_marker(problem.twin)
     choices = menu(first, problem.twin, extra)
-    twin = copy.copy(problem.twin)
-    twin.setup = _marked(twin.setup, extra)
+    marked = _marked(problem.twin.setup, extra)
     # Entries that differ in what is recorded only are one simulation.
     numbers: dict[int, int] = {}
     for choice in choices:
         numbers.setdefault(id(choice.trial), len(numbers))
     trials = list({id(c.trial): c.trial for c in choices}.values())
     wide = FitProblem(
-        dataclasses.replace(problem.experiment, setup=twin.setup),
-        twin,
-        trials=[_timed(dataclasses.replace(t, setup=_marked(t.setup, extra)), t) for t in trials],
-        shift=tuple(problem.shift),
+        dataclasses.replace(problem.experiment, setup=marked),
+        dataclasses.replace(problem.ensemble, twin=dataclasses.replace(problem.twin, setup=marked), even=True),
+        trials=tuple(_timed(dataclasses.replace(t, setup=_marked(t.setup, extra)), t) for t in trials),
+        discretization=DiscretizationError(shift=problem.discretization.shift),
         tolerances=problem.tolerances,
         priors=problem.priors,
         noise=problem.noise,
-        ensemble=Even(twin, problem.ensemble.threads, problem.ensemble.device),
         report=problem.report,
+        tally=problem.tally,
     )
-    wide.tally = problem.tally
     n = len(problem.common)
     still = np.concatenate([np.zeros((1, n)), STEP * np.eye(n)])
     around = [_around(problem, effects, at) for effects, at in (one, other)]
@@ -207,7 +205,7 @@ def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerMotion], 
         motions = [_first(m, len(trial.setup.markers)) for m in motions]
     trial = _timed(trial, choice.trial)
     assert trial.recording is not None
-    discretization = np.mean(problem.discretization, axis=0)
+    discretization = problem.discretization.mean
     discretization = (
         np.concatenate([discretization, discretization.mean(0, keepdims=True)]) if choice.marker else discretization
     )

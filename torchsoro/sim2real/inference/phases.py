@@ -147,7 +147,7 @@ def mismatches(
                 phases=tuple(phases(trial, motion.alone())),
                 time=recording.time,
                 before=_before(there, i, motion, point),
-                after=_mean((recording.place - other.seen) / np.hypot(there.noise, there.discretization[i]), 2),
+                after=_mean((recording.place - other.seen) / np.hypot(there.noise, there.discretization.of(trial)), 2),
             )
         )
     return found
@@ -158,7 +158,7 @@ def _before(there: FitProblem, i: int, motion: MarkerMotion, point: np.ndarray) 
     recording, n = there.trials[i].recording, len(point)
     assert recording is not None
     time, prior = recording.time, np.concatenate([np.ones(n), 1 / there.observation.deviations])
-    wide = np.hypot(there.noise, there.discretization[i])
+    wide = np.hypot(there.noise, there.discretization.of(there.trials[i]))
     x, good = np.zeros(len(prior)), None
 
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -56,7 +56,8 @@ def search(
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
         # by the finer twin at the setup as stated does not hold for a motion that is so different.
-        problem = problem.only(problem.trials, correction=problem.stated)
+        stated = problem.discretization.replace(correction=problem.stated)
+        problem = problem.only(problem.trials, discretization=stated)
         carried = _from_the_beginning(problem, effects, most)
         problem, null_model = _fit_null_model(problem, [t for t in carried if not t[0]], report)
     else:
@@ -162,14 +163,14 @@ def inflate_discrepancy(
     for _ in range(4):
         if not fits or fits[0].chi2 < INFLATED * fits[0].samples:
             break
-        left = []
-        for trial, seen, discretization in zip(problem.trials, fits[0].seen, own, strict=True):
+        left = {}
+        for trial, seen in zip(problem.trials, fits[0].seen, strict=True):
             assert trial.recording is not None
             off = np.sqrt(np.nanmean((trial.recording.place - seen) ** 2))
-            left.append(np.sqrt(discretization**2 + (1.2 * off) ** 2))
-        sizes = ", ".join(f"{1e3 * float(n.mean()):.2f} mm" for n in left)
+            left[trial.name] = np.sqrt(own.of(trial) ** 2 + (1.2 * off) ** 2)
+        sizes = ", ".join(f"{1e3 * float(n.mean()):.2f} mm" for n in left.values())
         report(f"discrepancy inflated by the residual of the best: {sizes}")
-        problem = problem.only(problem.trials, discretization=left)
+        problem = problem.only(problem.trials, discretization=problem.discretization.replace(deviation=left))
         tasks: list[Task] = [((), null_model.point), *((f.effects, f.point) for f in fits)]
         again, *rest = problem.fit(tasks, rounds=ROUNDS)
         null_model = again or null_model
@@ -247,7 +248,7 @@ def _fit_null_model(
             return problem, null_model
         name = problem.experiment.setup.markers[slips[0].marker].name
         report(f"marker {name} slips in trials {', '.join(s.trial for s in slips)}")
-        problem = problem.only(problem.trials, slips=slips)
+        problem = problem.only(problem.trials, slips=tuple(slips))
 
 
 def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_model: Fit, most: int) -> list[Task]:

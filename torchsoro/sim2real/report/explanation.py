@@ -12,7 +12,6 @@ import numpy as np
 from scipy.stats import norm
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.inference.discretization import DiscretizationError
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import ForceMap
 from torchsoro.sim2real.inference.heldout import Prediction
@@ -20,6 +19,7 @@ from torchsoro.sim2real.inference.isolability import Isolability
 from torchsoro.sim2real.inference.next_experiment import Proposal
 from torchsoro.sim2real.inference.phases import Mismatch
 from torchsoro.sim2real.inference.ranking import correlation
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import Verdict
 
 LEVEL = 0.9  # probability that an interval is to hold the truth
@@ -156,10 +156,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         ],
         "noise": {
             "standard_deviation_m": problem.noise,
-            "numerics_m": {
-                t.name: float(np.sqrt((n**2).mean()))
-                for t, n in zip(problem.trials, problem.discretization, strict=True)
-            },
+            "numerics_m": {t.name: float(np.sqrt((problem.discretization.of(t) ** 2).mean())) for t in problem.trials},
             "edges_m": list(e.discretization.edges),
             "cells_through_thinnest_wall": list(e.discretization.walls),
             "excess": v.excess,

@@ -7,6 +7,8 @@ import math
 import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -35,37 +37,55 @@ def safety(grid: Grid) -> float:
     return CUT if grid.cut else SAFETY
 
 
+@dataclass(frozen=True, eq=False)
 class Ensemble:
     """Simulates variations of scenarios of one body.
 
-    Args:
+    Attributes:
         twin: The body.
         threads: Number of threads.
         device: "cpu", "cuda", or "auto" for a GPU where there is one.
-
-    Attributes:
-        room: Number of variations that take as long as one.
+        safety: Step over the bound of a stable one near rest; chosen by the body's cells if None.
+        even: Whether all variations of a call take the same time step, so that its error cancels in their differences.
 
     Raises:
         ValueError: for "cuda" without a GPU that Numba can use.
     """
 
-    def __init__(self, twin: Twin, threads: int = THREADS, device: str = "auto") -> None:
-        there = device != "cpu" and cuda_ensemble.available()
-        if device == "cuda" and not there:
+    twin: Twin
+    threads: int = THREADS
+    device: str = "auto"
+    safety: float | None = None
+    even: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the device."""
+        if self.device == "cuda" and not cuda_ensemble.available():
             raise ValueError("device = 'cuda': no GPU with CUDA that numba-cuda can use; wanted 'cpu', 'auto', or one")
         remove_stale_code()
-        self.twin, self.threads, self.device = twin, threads, device
-        self.mesh = mesh_of(twin)
-        self.body = cuda_ensemble.body_of(self.mesh) if there else None
-        self.room = cuda_ensemble.ROOM if there else LANES * threads
-        grid = twin.grid
-        _, _, places, axes, areas, chambers = grid.walls
-        shape = np.zeros(len(twin.setup.cavities))
-        np.add.at(shape, chambers, areas * places[np.arange(len(axes)), axes] / 3)
-        self.volumes = shape
-        self.steep = max(a.steep for a in grid.axes)
-        self.safety = safety(grid)
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The body for the kernels."""
+        return mesh_of(self.twin)
+
+    @cached_property
+    def body(self) -> cuda_ensemble.GpuMesh | None:
+        """The same on a GPU; None where simulations run on the CPU."""
+        return cuda_ensemble.body_of(self.mesh) if self.device != "cpu" and cuda_ensemble.available() else None
+
+    @property
+    def room(self) -> int:
+        """Number of variations that take as long as one."""
+        return LANES * self.threads if self.body is None else cuda_ensemble.ROOM
+
+    @cached_property
+    def chamber_volume(self) -> np.ndarray:
+        """Of the undeformed chambers [chambers] m3."""
+        _, _, places, axes, areas, chambers = self.twin.grid.walls
+        found = np.zeros(len(self.twin.setup.cavities))
+        np.add.at(found, chambers, areas * places[np.arange(len(axes)), axes] / 3)
+        return found
 
     def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerMotion]:
         """Simulate.
@@ -80,8 +100,11 @@ class Ensemble:
             ValueError: if one is so stiff that no step is short enough.
         """
         lanes = [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
-        steps = {i: self.stable(s) for i, s in enumerate(scenarios)}
-        if not (shortest := min(float(dt.min()) for dt in steps.values())) > SHORTEST:
+        steps = [self.stable(s) for s in scenarios]
+        if self.even:
+            least = min(float(dt.min()) for dt in steps)
+            steps = [np.full_like(dt, least) for dt in steps]
+        if not (shortest := min(float(dt.min()) for dt in steps)) > SHORTEST:
             raise ValueError(
                 f"stiffness: a step of {shortest:g} s is needed, wanted a body with at least {SHORTEST:g} s"
             )
@@ -142,7 +165,8 @@ class Ensemble:
         nu = s.poisson_ratio.unsqueeze(-1)
         bulk, shear = s.stiffness / (3 * (1 - 2 * nu)), s.stiffness / (2 * (1 + nu))
         bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch).numpy() for m in (bulk, shear))
-        dt = np.full(s.batch, 1.0)
+        dt, share = np.full(s.batch, 1.0), self.safety or safety(self.twin.grid)
+        steep = max(a.steep for a in self.twin.grid.axes)
         for _ in range(40):
             factor = np.ones(s.batch)
             if s.prony is not None:
@@ -151,7 +175,7 @@ class Ensemble:
                 a, b = np.exp(-ratio), -np.expm1(-ratio) / ratio
                 factor = 1 + (g * b * 2 / (1 + a)).sum(-1)
             speed = np.maximum(math.sqrt(3) * bulk, np.sqrt(2 * factor) * shear)
-            dt = np.sqrt(dt * self.safety * 2 / (speed * math.sqrt(self.steep)))
+            dt = np.sqrt(dt * share * 2 / (speed * math.sqrt(steep)))
         return np.minimum(dt, SAMPLE)
 
     def case(self, scenarios: Sequence[Scenario], group: list[Lane], dt: float, every: int, samples: int) -> Case:
@@ -218,7 +242,7 @@ class Ensemble:
             velocity=lanes(lambda s: s.velocity, 2),
             supply=supply,
             air=lanes(lambda s: s.air_stiffness, 1),
-            volume=self.volumes.astype(np.float32),
+            volume=self.chamber_volume.astype(np.float32),
             **pushes,
             spring_node=np.concatenate([empty, *where]),
             spring_share=np.concatenate(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -64,10 +65,11 @@ class MarkerMotion:
         return np.asarray((np.isfinite(self.place) & (np.abs(self.place) < 1e3)).all((-3, -2, -1)))
 
 
+@dataclass(frozen=True, eq=False)
 class Twin:
     """A body on a grid, clamped, with chambers, and markers that move with it.
 
-    Args:
+    Attributes:
         setup: What is believed.
         edge: Of a cell, about [m]; walls around chambers, and chambers, have more cells if they need them.
         walls: Cells through each wall around a chamber, at least.
@@ -78,7 +80,15 @@ class Twin:
             body, or a chamber that does not lie inside the body.
     """
 
-    def __init__(self, setup: Setup, *, edge: float, walls: int = 3, across: int = 3) -> None:
+    setup: Setup
+    _: KW_ONLY
+    edge: float
+    walls: int = 3
+    across: int = 3
+
+    def __post_init__(self) -> None:
+        """Check the numbers, and that the body can be laid on a grid and held."""
+        setup, edge, walls, across = self.setup, self.edge, self.walls, self.across
         if not (edge > 0 and walls > 0 and across > 0):
             raise ValueError(f"edge = {edge:g} m, walls = {walls}, across = {across}, wanted positive numbers")
         cells = math.prod(max(s / edge, across, walls * bool(setup.cavities)) for s in setup.size)
@@ -88,9 +98,15 @@ class Twin:
                 f"{' x '.join(f'{s:g}' for s in setup.size)} m, wanted at most {CELLS}: cells that are larger, or a "
                 "body that is less slender"
             )
-        surface = setup.surface
-        self.setup, self.edge, self.walls, self.across = setup, edge, walls, across
-        axes = []
+        if self.grid.open:
+            raise ValueError("chamber: opens to the outside of the mesh, wanted walls all around")
+        if self.held[self.nodal(self.volumes).numpy() > 0].all():
+            raise ValueError("clamp: the boxes hold the whole body, wanted a part of it that can move")
+
+    @cached_property
+    def grid(self) -> Grid:
+        """Cells that end where the body and its chambers do."""
+        setup, walls, surface, axes = self.setup, self.walls, self.setup.surface, []
         for axis in range(3):
             begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
             inner = sorted({c.box[side][axis] for c in setup.cavities for side in (0, 1)})
@@ -106,23 +122,27 @@ class Twin:
             least = [walls if setup.cavities else 1] * (len(breaks) - 1)
             # With one cell in every interval, motions quadratic along two axes have no strain at points (hourglassing).
             widest = int(np.diff(breaks).argmax())
-            least[widest] = max(least[widest], 2, 0 if setup.cavities else across - len(inner))
+            least[widest] = max(least[widest], 2, 0 if setup.cavities else self.across - len(inner))
             # Double knots at the faces of chambers: two walls that share a node would be coupled across the chamber.
-            axes.append(Axis(divide(breaks, least, edge), inner))
+            axes.append(Axis(divide(breaks, least, self.edge), inner))
         x, y, z = axes
-        self.grid = Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
-        if self.grid.open:
-            raise ValueError("chamber: opens to the outside of the mesh, wanted walls all around")
-        self.faces = [f for f in (_face(box, setup) for box in setup.clamps) if f is not None]
-        self.held = np.zeros(self.grid.nodes, bool)
-        tiny = 1e-9
-        for low, high in setup.clamps:
+        return Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
+
+    @cached_property
+    def held(self) -> np.ndarray:
+        """Which nodes the clamps hold, bool [n]."""
+        held, tiny = np.zeros(self.grid.nodes, bool), 1e-9
+        for low, high in self.setup.clamps:
             on = ((self.grid.places > np.array(low) - tiny) & (self.grid.places < np.array(high) + tiny)).all(-1)
-            self.held |= on
+            held |= on
             if not on.any():
                 raise ValueError(f"clamp: box {low}, {high}, wanted one that holds a part of the body, in metres")
-        if self.held[self.nodal(self.volumes).numpy() > 0].all():
-            raise ValueError("clamp: the boxes hold the whole body, wanted a part of it that can move")
+        return held
+
+    @cached_property
+    def faces(self) -> list[tuple[int, int]]:
+        """Axis and side of the faces of the body that clamps cover."""
+        return [f for f in (_face(box, self.setup) for box in self.setup.clamps) if f is not None]
 
     @property
     def count(self) -> int:

@@ -1,0 +1,56 @@
+"""What is known of the twin's own error: its size, and what corrects it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchsoro.sim2real.data.experiment import Trial
+from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.twin.twin import MarkerMotion
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DiscretizationError:
+    """Error of the twin by its discretization; without any argument, none.
+
+    Attributes:
+        deviation: By trial, standard deviation [M, A] m once it is corrected, and modulus, pressure and measurement
+            errors are fitted.
+        shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does; zero if empty.
+        correction: By trial, what the finer twin then adds to the motion that is believed [S, M, ...].
+        own: By effects, the same with them, where it is known.
+        edges: Of the cells of the twins that were compared [m], the one in use first.
+        walls: Cells through the thinnest wall, or edge, of each.
+    """
+
+    deviation: Mapping[str, np.ndarray] = field(default_factory=dict)
+    shift: tuple[float, ...] = ()
+    correction: Mapping[str, MarkerMotion] = field(default_factory=dict)
+    own: Mapping[tuple[Hypothesis, ...], Mapping[str, MarkerMotion]] = field(default_factory=dict)
+    edges: tuple[float, ...] = ()
+    walls: tuple[int, ...] = ()
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Deviation over the trials [M, A] m."""
+        return np.asarray(np.mean(list(self.deviation.values()), axis=0))
+
+    def of(self, trial: Trial) -> np.ndarray:
+        """Deviation for a trial with a recording [M, A] m: its own, else the mean of those that are known, else 0."""
+        if trial.name in self.deviation:
+            return self.deviation[trial.name]
+        assert trial.recording is not None
+        return self.mean if self.deviation else np.zeros(trial.recording.place.shape[1:])
+
+    def among(self, trials: Sequence[Trial]) -> DiscretizationError:
+        """The same with deviations for just these trials."""
+        return self.replace(deviation={t.name: self.of(t) for t in trials})
+
+    def replace(self, **changes: Any) -> DiscretizationError:
+        """The same with other values."""
+        return dataclasses.replace(self, **changes)
