@@ -67,7 +67,7 @@ def bar(folder: Path):
             seen = observation.observe(by([scenario])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             place[7, 0] = np.nan
-            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
+            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
         return dataclasses.replace(found, trials=tuple(trials))
 
     return twin, ensemble, record

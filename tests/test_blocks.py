@@ -15,7 +15,7 @@ import torch
 from test_experiment import experiment
 from test_twin import EDGE, hollow
 
-from torchsoro.sim2real.data.experiment import Boundary, Load, Trial, read_experiment
+from torchsoro.sim2real.data.experiment import ForceTable, PlaneTable, Trial, read_experiment
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.twin.ensemble import SAMPLE, Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
@@ -24,14 +24,14 @@ from torchsoro.sim2real.twin.twin import Twin
 
 def varied(trial: Trial, duration: float, edge: float, gap: float = 1e-4) -> list[tuple[Twin, list[Scenario]]]:
     """Bodies that are held, free, hollow, loaded, so far from planes; with every effect, and without any."""
-    load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1), start=duration / 3)
+    load = ForceTable(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1), start=duration / 3)
     found = []
     for clamped, friction in ((True, "stick"), (False, 0.4)):
         low = trial.setup.origin[2]
-        plane = Boundary(point=(0.0, 0.0, low - gap), normal=(0.0, 0.0, 1.0), friction=friction)
-        slope = Boundary(point=(-gap, 0.0, low), normal=(0.8, 0.0, 0.6), friction="stick")
+        plane = PlaneTable(point=(0.0, 0.0, low - gap), normal=(0.0, 0.0, 1.0), friction=friction)
+        slope = PlaneTable(point=(-gap, 0.0, low), normal=(0.8, 0.0, 0.6), friction="stick")
         held = {} if clamped else {"clamps": (), "velocity": (0.1, 0.0, -0.3)}
-        t = hollow(trial, loads=(load,), planes=(plane, slope), duration=duration, **held)
+        t = hollow(trial, forces=(load,), planes=(plane, slope), duration=duration, **held)
         twin = Twin(t.setup, edge=edge, walls=1)
         plain = twin.scenario(t)
         scenarios = [plain]
@@ -51,10 +51,10 @@ def check(bodies: list[tuple[Twin, list[Scenario]]], far: float) -> int:
         known, found = (Ensemble(twin, 1, there)(scenarios) for there in ("cpu", "cuda"))
         for one, other in zip(known, found, strict=True):
             assert one.dt == other.dt
-            np.testing.assert_allclose(other.place, one.place, atol=far / 100, rtol=0)
+            np.testing.assert_allclose(other.position, one.position, atol=far / 100, rtol=0)
             np.testing.assert_allclose(other.velocity, one.velocity, atol=far, rtol=0)
             np.testing.assert_allclose(other.gradient, one.gradient, atol=far / 10, rtol=0)
-            count += len(one.place)
+            count += len(one.position)
     return count
 
 

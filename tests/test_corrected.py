@@ -26,8 +26,8 @@ def test_a_finer_twin_corrects_where_one_is(made):
     there = FitProblem(record(None), fine)
     wanted = there.simulate([((), at[None])])[0]
     for motion, right in zip(problem.corrected(at).simulate([((), at[None])])[0], wanted, strict=True):
-        assert np.abs(motion.place - right.place).max() < 1e-7
-    assert np.abs(problem.simulate([((), at[None])])[0][0].place - wanted[0].place).max() > 1e-5
+        assert np.abs(motion.position - right.position).max() < 1e-7
+    assert np.abs(problem.simulate([((), at[None])])[0][0].position - wanted[0].position).max() > 1e-5
 
 
 def test_each_effect_is_corrected_where_it_is(made):
@@ -40,10 +40,10 @@ def test_each_effect_is_corrected_where_it_is(made):
     wanted = FitProblem(record(None), fine).simulate(points)
     for motions, right in zip(told.simulate(points), wanted, strict=True):
         for one, other in zip(motions, right, strict=True):
-            assert np.abs(one.place - other.place).max() < 1e-7
+            assert np.abs(one.position - other.position).max() < 1e-7
     others = [((tilt,), np.array([[0.5, 1.0, 1.0]]))]
     (found,), (bare,) = told.simulate(others), problem.simulate(others)
-    assert all(np.array_equal(a.place, b.place) for a, b in zip(found, bare, strict=True))
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(found, bare, strict=True))
 
 
 def test_correction_at_the_effect_recovers_drag_of_a_finer_twin_within_3_percent(made):
@@ -67,8 +67,8 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
     problem = FitProblem(experiment, ensemble)
     time, trials = np.arange(0.0, 0.2001, 0.0025), []
     for trial, motion in zip(experiment.trials, problem.simulate(still)[0], strict=True):
-        place = motion.alone().place[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
-        trials.append(dataclasses.replace(trial, simulated=Recording(time=time, place=place)))
+        place = motion.alone().position[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
+        trials.append(dataclasses.replace(trial, simulated=Recording(time=time, position=place)))
     fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
     assert not problem.stated
     experiment = dataclasses.replace(experiment, trials=(trials[0],), heldout=(trials[1],))
@@ -77,8 +77,8 @@ def test_a_simulation_of_ones_own_is_what_is_believed(made):
     problem = FitProblem(experiment, ensemble, trials=tuple(trials), fine=fine, discretization=told)
     assert problem.stated.keys() == {t.name for t in trials}
     for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
-        place = motion.alone().place
-        np.testing.assert_allclose(place[: len(time)], trial.simulated.place, atol=1e-9)
+        place = motion.alone().position
+        np.testing.assert_allclose(place[: len(time)], trial.simulated.position, atol=1e-9)
         # What a clock that is behind has seen after its end goes on.
         steps = np.abs(np.diff(place[len(time) - 2 :], axis=0)).max((1, 2))
         assert len(steps) > 8 and (steps > 5e-5).all() and (steps < 1e-3).all()

@@ -16,12 +16,12 @@ import pytest
 from torchsoro import cli
 from torchsoro.sim2real.data.schema import (
     BodyTable,
-    Boundary,
-    Cavity,
+    ChamberTable,
     Clamp,
-    Load,
+    ForceTable,
     Marker,
     Material,
+    PlaneTable,
     RecordingTable,
     SetupFile,
 )
@@ -155,8 +155,8 @@ def test_every_command_is_a_recipe_that_knows_its_flags(name, capsys, monkeypatc
 
 def test_every_field_of_an_experiment_is_described():
     page = (ROOT / "docs/pages/explain.md").read_text(encoding="utf-8")
-    tables = {"body": BodyTable, "material": Material, "clamp": Clamp, "chamber": Cavity, "plane": Boundary}
-    tables |= {"load": Load, "marker": Marker, "recording": RecordingTable}
+    tables = {"body": BodyTable, "material": Material, "clamp": Clamp, "chamber": ChamberTable, "plane": PlaneTable}
+    tables |= {"load": ForceTable, "marker": Marker, "recording": RecordingTable}
     for name, model in tables.items():
         text = re.split(r"^(?:`\[|#)", part_of(page, name), maxsplit=1, flags=re.M)[0]
         for field in model.model_fields:

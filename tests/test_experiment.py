@@ -45,7 +45,7 @@ def test_setup_values_defaults_and_marker_places_are_read(tmp_path):
     setup, (trial,) = found.setup, found.trials
     assert setup.size == (0.04, 0.02, 0.02) and setup.axes == (0, 2) and setup.prony == ((0.5, 0.01),)
     assert setup.gravity == (0.0, 0.0, -9.81) and setup.velocity == (0.0, 0.0, 0.0)
-    np.testing.assert_allclose(trial.recording.place[:, 0], [[0.04 + 1e-3 * k, 0.02 - 1e-3 * k] for k in range(5)])
+    np.testing.assert_allclose(trial.recording.position[:, 0], [[0.04 + 1e-3 * k, 0.02 - 1e-3 * k] for k in range(5)])
 
 
 def test_tables_of_trial_toml_replace_those_of_setup_toml(tmp_path):
@@ -54,8 +54,8 @@ def test_tables_of_trial_toml_replace_those_of_setup_toml(tmp_path):
         "[start]\nvelocity = [1.0, 0.0, 0.0]\n[[load]]\nbox = [[0,0,0],[0.01,0.01,0.01]]\nforce = [0.0, 0.0, -1.0]\n"
     )
     found = read_experiment(folder)
-    assert found.setup.loads == () and found.trials[0].setup.velocity == (1.0, 0.0, 0.0)
-    assert found.trials[0].setup.loads[0].force == (0.0, 0.0, -1.0)
+    assert found.setup.forces == () and found.trials[0].setup.velocity == (1.0, 0.0, 0.0)
+    assert found.trials[0].setup.forces[0].force == (0.0, 0.0, -1.0)
 
 
 def test_two_samples_are_refused(tmp_path):
@@ -152,7 +152,7 @@ def test_simulated_csv_is_read_along_three_axes(tmp_path):
     assert read_experiment(folder).trials[0].simulated is None
     table.write_text("time_s,tip_x_m,tip_y_m,tip_z_m\n0,0.04,0.01,0.02\n0.05,0.05,0.01,0.02\n0.1,0.06,0.01,0.02\n")
     simulated = read_experiment(folder).trials[0].simulated
-    assert simulated.place[:, 0, 0].tolist() == [0.04, 0.05, 0.06]
+    assert simulated.position[:, 0, 0].tolist() == [0.04, 0.05, 0.06]
 
 
 @pytest.mark.parametrize(
@@ -227,9 +227,9 @@ def test_a_chamber_without_pressure_csv_is_refused(tmp_path):
 def test_recordings_of_wrong_shape_or_infinite_places_are_refused():
     time = np.array([0.0, 0.1, 0.2])
     with pytest.raises(ValueError, match="wanted \\[T, M, 3\\]"):
-        Recording(time=time, place=np.zeros((3, 1, 2)))
+        Recording(time=time, position=np.zeros((3, 1, 2)))
     with pytest.raises(ValueError, match="infinite"):
-        Recording(time=time, place=np.full((3, 1, 3), math.inf))
+        Recording(time=time, position=np.full((3, 1, 3), math.inf))
 
 
 def test_columns_keep_their_order_and_empty_cells_are_nan(tmp_path):

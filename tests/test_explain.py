@@ -13,7 +13,7 @@ from ringing import EDGE, effect
 
 from torchsoro.sim2real import inputs, pipeline
 from torchsoro.sim2real.data.recording import Recording, read_table
-from torchsoro.sim2real.data.schema import Boundary
+from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
@@ -27,7 +27,7 @@ from torchsoro.sim2real.inference.search import _simpler
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
 from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 # Measurement ------------------------------------------------------------------------------------------------------
 
@@ -39,8 +39,8 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
     place = np.stack([np.sin(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     velocity = np.stack([7 * np.cos(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     gradient = np.broadcast_to(np.eye(3) + 0.1 * rng.normal(size=(1, markers, 3, 3)), (steps, markers, 3, 3))
-    motion = MarkerMotion(time=time, place=place, velocity=velocity, gradient=gradient, dt=1e-3)
-    recording = Recording(time=np.linspace(0.05, 0.25, 9), place=np.zeros((9, markers, 2)), axes=(0, 2))
+    motion = MarkerTrajectory(time=time, position=place, velocity=velocity, gradient=gradient, dt=1e-3)
+    recording = Recording(time=np.linspace(0.05, 0.25, 9), position=np.zeros((9, markers, 2)), axes=(0, 2))
 
     class Two:
         markers = (dataclasses.make_dataclass("M", ["name"])("a"), dataclasses.make_dataclass("M", ["name"])("b"))
@@ -67,7 +67,7 @@ def test_noise_model_whitens_noise_of_its_own_covariance():
     time = np.arange(60) * 0.01
     discretization = np.array([[2e-4, 0.0]])
     alike = np.exp(-np.abs(time[:, None] - time[None]) / 0.03)
-    noise_model = NoiseModel(Recording(time=time, place=np.zeros((60, 1, 2)), axes=(0, 2)), 1e-4, discretization)
+    noise_model = NoiseModel(Recording(time=time, position=np.zeros((60, 1, 2)), axes=(0, 2)), 1e-4, discretization)
     noise = 1e-8 * ((1 - LASTING) * np.eye(60) + LASTING * alike)
     root = [np.linalg.cholesky(noise + n**2 * alike) for n in discretization[0]]
     draws = rng.normal(size=(2, 60, 400))
@@ -81,14 +81,14 @@ def test_noise_is_found_beside_motion(noise):
     time = np.arange(300) * 0.01
     motion = 0.01 * np.exp(-time)[:, None, None] * np.sin(2 * np.pi * 5 * time)[:, None, None] * np.ones((1, 4, 3))
     place = motion + noise * rng.normal(size=motion.shape)
-    assert estimate_noise([Recording(time=time, place=place)]) == pytest.approx(noise, rel=0.3)
+    assert estimate_noise([Recording(time=time, position=place)]) == pytest.approx(noise, rel=0.3)
 
 
 def test_a_marker_that_slips_is_found_and_a_motion_of_all_is_not(made):
     _, _, record = made
     trials = record(None).trials
     rng = np.random.default_rng(4)
-    still = [5e-5 * rng.normal(size=t.recording.place.shape) for t in trials]
+    still = [5e-5 * rng.normal(size=t.recording.position.shape) for t in trials]
     noise_models = [NoiseModel(t.recording, 5e-5, np.zeros((2, 3))) for t in trials]
     assert not find_slips(trials, noise_models, still)
     slipped = [r.copy() for r in still]
@@ -105,13 +105,13 @@ def test_confused_columns_are_put_right(made):
     swapped = dataclasses.replace(
         recorded,
         trials=tuple(
-            dataclasses.replace(t, recording=dataclasses.replace(t.recording, place=t.recording.place[:, ::-1]))
+            dataclasses.replace(t, recording=dataclasses.replace(t.recording, position=t.recording.position[:, ::-1]))
             for t in recorded.trials
         ),
     )
     right, told = reordered(swapped)
     assert told == "columns of tip, side were confused"
-    np.testing.assert_array_equal(right.trials[0].recording.place, recorded.trials[0].recording.place)
+    np.testing.assert_array_equal(right.trials[0].recording.position, recorded.trials[0].recording.position)
     same, told = reordered(recorded)
     assert same is recorded and not told
 
@@ -165,7 +165,7 @@ def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
     for trial in recorded.trials:
         held = trial.recording.time > 0.5 * trial.setup.duration
         recording = dataclasses.replace(
-            trial.recording, time=trial.recording.time[held], place=trial.recording.place[held]
+            trial.recording, time=trial.recording.time[held], position=trial.recording.position[held]
         )
         late.append(dataclasses.replace(trial, recording=recording))
     early = FitProblem(recorded, ensemble, trials=tuple(late)).early(0.4)
@@ -184,7 +184,7 @@ def test_a_clock_that_is_behind_has_seen_what_comes_after_the_end(made):
         place = observation.observe(
             motion.alone(), 0, np.where(np.arange(len(observation.deviations)) == 0, -behind, 0.0)
         )
-        recording = dataclasses.replace(trial.recording, place=place)
+        recording = dataclasses.replace(trial.recording, position=place)
         trials.append(dataclasses.replace(trial, recording=recording))
     problem = FitProblem(experiment, ensemble, trials=tuple(trials))
     for part, end in ((problem, 0.2), (problem.early(0.5), 0.1)):
@@ -288,7 +288,7 @@ def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
     # Where a body slides, a finer one is worth more of the time.
     fine, coarse = (Twin(setup, edge=0.02 / n, across=n) for n in (3, 2))
     enough = 30 * cost(fine, 2)
-    ground = Boundary(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction="stick")
+    ground = PlaneTable(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction="stick")
     chosen = [choose_twin(s, 2, enough).count for s in (setup, dataclasses.replace(setup, planes=(ground,)))]
     assert chosen == [coarse.count, fine.count]
     with pytest.raises(ValueError, match=r"budget: .* minutes, wanted"):
@@ -324,7 +324,7 @@ def test_a_beginning_without_samples_is_none(made):
 def test_planes_of_one_trial_alone_are_touched(made):
     twin, ensemble, record = made
     experiment = record(None)
-    ground = Boundary(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
+    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
     one, other = experiment.trials
     other = dataclasses.replace(other, setup=dataclasses.replace(other.setup, planes=(ground,)))
     experiment = dataclasses.replace(experiment, trials=(one, other))
@@ -409,7 +409,7 @@ def test_two_effects_are_found_where_one_does_not_do(made):
         s = effect("drag")(s, torch.tensor([[600.0]], dtype=torch.float64), twin)
         seen = ObservationModel(one.setup, [trial]).observe(ensemble([s])[0].alone(), 0, np.zeros(12))
         noise = 5e-5 * np.random.default_rng(5).normal(size=seen.shape)
-        trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=seen + noise)))
+        trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=seen + noise)))
     both = dataclasses.replace(one, trials=tuple(trials))
     effects = [effect(name) for name in ("drag", "initial_motion", "gravity_tilt")]
     told = judge(FitProblem(both, ensemble), effects, report=lambda line: None)

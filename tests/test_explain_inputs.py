@@ -251,7 +251,7 @@ def test_binary_files_are_refused(folder):
         ("\n".join(",".join([*r.split(",")[:4], "", "", ""]) if k else r for k, r in enumerate(markers().split("\n"))
                    if r), "marker side has no sample"),
         (markers().replace("\n0.25,", "\n0.25,1e9,0,0,0,0,0\n0.2501,", 1), "tip is at .* at 0.25 s, wanted within 8 m"),
-        (markers().replace("\n0.25,", "\n0.25,inf,0,0,0,0,0\n0.2501,", 1), "place: an infinite number"),
+        (markers().replace("\n0.25,", "\n0.25,inf,0,0,0,0,0\n0.2501,", 1), "position: an infinite number"),
         (markers().replace("\n0.25,", "\nx0.25,"), "line 27: 'time_s' = 'x0.25', wanted a number"),
         ("", "0 lines, wanted names of columns"),
     ],

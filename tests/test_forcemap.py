@@ -20,8 +20,8 @@ from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.phases import mismatches, phases
 from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.scenario import Push
-from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
+from torchsoro.sim2real.twin.scenario import NodalForce
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 COUNT = 3  # patches
 
@@ -40,14 +40,14 @@ def made(tmp_path_factory):
         for trial in (found.trials[0], thrown):
             s = twin.scenario(trial)
             if trial is thrown:
-                pushes = tuple(Push(share=share, force=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
-                s = s.replace(pushes=pushes)
+                forces = tuple(NodalForce(share=share, value=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
+                s = s.replace(forces=forces)
             observation = ObservationModel(found.setup, [trial])
             errors = np.zeros(len(observation.deviations))
             errors[0], errors[6:] = 0.002, 2e-4
             seen = observation.observe(ensemble([s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
-            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, place=place)))
+            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
         return FitProblem(dataclasses.replace(found, trials=tuple(trials)), ensemble)
 
     return record
@@ -101,7 +101,9 @@ def motion_of(z):
     at = np.array([[0.06, 0.01, 0.02], [0.04, 0.0, 0.01]])
     place = at + z[:, None, None] * np.array([0, 0, 1.0])
     gradient = np.broadcast_to(np.eye(3), (len(z), 2, 3, 3))
-    return MarkerMotion(time=np.linspace(0, 1, len(z)), place=place, velocity=0 * place, gradient=gradient, dt=1e-3)
+    return MarkerTrajectory(
+        time=np.linspace(0, 1, len(z)), position=place, velocity=0 * place, gradient=gradient, dt=1e-3
+    )
 
 
 STILL = np.zeros(401)

@@ -31,12 +31,12 @@ def hide(recipes, straight, tmp_path_factory):
 
 
 def track(found):
-    return np.stack([t.recording.place for t in found.trials])
+    return np.stack([t.recording.position for t in found.trials])
 
 
 def simulated(found):
     """At the times of the recordings."""
-    return np.stack([t.simulated.place[:: round(0.005 / 0.001)] for t in found.trials])
+    return np.stack([t.simulated.position[:: round(0.005 / 0.001)] for t in found.trials])
 
 
 @pytest.mark.slow
@@ -54,7 +54,7 @@ def test_hidden_effects_are_in_the_recording_and_not_in_the_setup(hide):
         # All is believed that is true without it.
         assert found.setup == dataclasses.replace(plain.setup, surface=found.setup.surface)
     found, truth = hide("air")
-    twice, once = (e.setup.cavities[0].air_stiffness for e in (found, plain))
+    twice, once = (e.setup.chambers[0].air_stiffness for e in (found, plain))
     assert truth == {"name": "air_stiffness", "parameters": {"air_stiffness_pa": -once}}
     assert twice == 2 * once > 0
     np.testing.assert_allclose(track(found), track(plain), atol=1e-7)
@@ -67,11 +67,11 @@ def test_hidden_effects_are_in_the_recording_and_not_in_the_setup(hide):
     assert all(t.simulated is None for t in hide("nothing", simulated=False)[0].trials)
 
 
-def test_twin_of_a_walker_stays_within_5_mm_of_its_ground(hide):
+def test_twin_of_a_walker_stays_within_5_mm_of_its_plane(hide):
     found, _ = hide("nothing")
     twin = Twin(found.setup, edge=0.01, walls=1)
     assert twin.grid.cut
     moved = Ensemble(twin)([twin.scenario(found.trials[0])])[0]
     assert moved.sound.all()
     # Neither falls through the ground, nor jumps off it.
-    assert np.abs(moved.place[..., 2] - moved.place[..., :1, :, 2]).max() < 5e-3
+    assert np.abs(moved.position[..., 2] - moved.position[..., :1, :, 2]).max() < 5e-3

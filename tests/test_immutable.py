@@ -117,4 +117,4 @@ def test_a_problem_of_one_trial_leaves_that_of_all_trials_as_it_was(made):
     assert other.tally is problem.tally
     still = [((), np.zeros((1, len(problem.common))))]
     (one,), (both, _) = other.simulate(still)[0], problem.simulate(still)[0]
-    np.testing.assert_array_equal(one.place, both.place)
+    np.testing.assert_array_equal(one.position, both.position)

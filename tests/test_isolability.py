@@ -227,8 +227,8 @@ def test_effect_without_response_or_whose_simulation_breaks_down_is_never_detect
 
 def test_recorded_places_do_not_count(problem, screened):
     trial = problem.trials[0]
-    place = trial.recording.place + 0.1 * np.random.default_rng(0).normal(size=trial.recording.place.shape)
-    other = dataclasses.replace(trial, recording=dataclasses.replace(trial.recording, place=place))
+    place = trial.recording.position + 0.1 * np.random.default_rng(0).normal(size=trial.recording.position.shape)
+    other = dataclasses.replace(trial, recording=dataclasses.replace(trial.recording, position=place))
     again = isolability(problem.only([other]), [effect("drag"), effect("density")])
     drag = screened.effects.index("drag")
     assert again.detectable[0] == pytest.approx(screened.detectable[drag], rel=0.02)

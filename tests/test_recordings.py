@@ -18,7 +18,7 @@ def recipe():
 
 def places(trial):
     assert trial.recording is not None
-    return trial.recording.place
+    return trial.recording.position
 
 
 def made(recipe, name, out, **options):
@@ -33,7 +33,7 @@ def test_sag_of_the_published_bar_with_and_without_its_load(recipe, tmp_path):
     assert [t.name for t in found.heldout] == ["load_b", "weight_b"]
     fell = {}
     for trial in (*found.trials, *found.heldout):
-        assert len(trial.setup.loads) == trial.name.startswith("load")
+        assert len(trial.setup.forces) == trial.name.startswith("load")
         place = places(trial)
         assert np.nanmax(np.abs(place[0] - np.array([m.at for m in found.setup.markers]))) < 5e-4
         fell[trial.name] = -float(np.nanmin(place[:, :, 2] - place[0, :, 2]))
@@ -47,7 +47,7 @@ def test_sag_of_the_published_bar_with_and_without_its_load(recipe, tmp_path):
 def test_the_arm_bends_away_from_the_chamber_that_is_inflated(recipe, tmp_path):
     found = made(recipe, "pneumatic-arm-segment", tmp_path)
     twin = Twin(found.setup, edge=0.02, walls=1)
-    assert len(found.setup.cavities) == 4 and twin.held.any()
+    assert len(found.setup.chambers) == 4 and twin.held.any()
     reach = {}
     for trial in (*found.trials, *found.heldout):
         assert trial.pressure is not None
@@ -76,7 +76,7 @@ def test_a_folder_without_recordings_is_refused(recipe, tmp_path, name, message)
 def test_bellows_begin_on_an_arc_of_16_9_degrees_held_by_a_force_that_ends(recipe, tmp_path):
     found = made(recipe, "bellows-actuator", tmp_path)
     (trial,) = found.trials
-    (load,) = trial.setup.loads
+    (load,) = trial.setup.forces
     assert trial.recording is not None and trial.recording.time[0] == load.end
     place = places(trial)[:, 0]
     # An arc of 16.9 degrees whose length is the body's.

@@ -88,8 +88,8 @@ def test_a_box_of_triangles_moves_as_a_box(tmp_path):
     one, other = (Twin(e.setup, edge=0.01, across=2) for e in (box, mesh))
     assert one.setup.size == pytest.approx(other.setup.size)
     moved, same = (Ensemble(t)([t.scenario(e.trials[0])])[0] for t, e in ((one, box), (other, mesh)))
-    assert np.abs(moved.place[-1] - np.array([0.08, 0.01, 0.01])).max() > 1e-4
-    np.testing.assert_allclose(moved.place, same.place, atol=1e-7)
+    assert np.abs(moved.position[-1] - np.array([0.08, 0.01, 0.01])).max() > 1e-4
+    np.testing.assert_allclose(moved.position, same.position, atol=1e-7)
 
 
 def test_a_box_of_triangles_lands_as_a_box(tmp_path):
@@ -103,8 +103,8 @@ def test_a_box_of_triangles_lands_as_a_box(tmp_path):
         for s in (dataclasses.replace(e.setup, gravity=(0.0, 0.0, -9.81)),)
         for t in (Twin(s, edge=0.01, across=2),)
     )
-    assert moved.place[0, -1, 0, 2] < 0.0099
-    np.testing.assert_allclose(moved.place, same.place, atol=2e-6)
+    assert moved.position[0, -1, 0, 2] < 0.0099
+    np.testing.assert_allclose(moved.position, same.position, atol=2e-6)
 
 
 def test_a_plane_faces_what_there_is_of_a_body(tmp_path):
@@ -148,7 +148,7 @@ def test_a_round_bar_has_the_frequency_of_its_radius(tmp_path):
     for edge in (0.008, 0.004):
         twin = Twin(found.setup, edge=edge, across=round(0.02 / edge))
         motion = Ensemble(twin)([twin.scenario(found.trials[0])])[0].alone()
-        height = motion.place[:, 0, 2] - 0.01
+        height = motion.position[:, 0, 2] - 0.01
         errors.append(abs(-height.mean() / sag / 1.04 - 1))
     assert errors[0] < 0.2 and errors[1] < 0.1
 

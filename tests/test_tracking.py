@@ -67,7 +67,7 @@ def test_a_mass_of_tracker(tmp_path):
     np.testing.assert_allclose(found.recording.time, [0, 0.01, 0.02], atol=1e-12)
     # y was not seen in the second frame: the sample is lost.
     lost = np.nan
-    np.testing.assert_allclose(found.recording.place[:, 0], [[0.01, 0.02], [lost, lost], [0.012, 0.022]])
+    np.testing.assert_allclose(found.recording.position[:, 0], [[0.01, 0.02], [lost, lost], [0.012, 0.022]])
 
 
 @pytest.mark.parametrize("delimiter", [";", ","])
@@ -75,13 +75,13 @@ def test_other_delimiters_and_no_name(tmp_path, delimiter):
     text = ONE.split("\n", 1)[1].replace("\t", delimiter)
     found = read_tracker([file(tmp_path, text, "tip.csv")])
     assert found.names == ("tip",)
-    np.testing.assert_allclose(found.recording.place[2, 0], [0.012, 0.022])
+    np.testing.assert_allclose(found.recording.position[2, 0], [0.012, 0.022])
 
 
 def test_masses_beside_each_other_with_decimal_commas(tmp_path):
     found = read([file(tmp_path, BESIDE)])
     assert found.names == ("tip", "base 1")
-    np.testing.assert_allclose(found.recording.place[2], [[0.012, 0.022], [0.032, 0.042]])
+    np.testing.assert_allclose(found.recording.position[2], [[0.012, 0.022], [0.032, 0.042]])
     assert found.recording.seen[:, 1, 0].tolist() == [True, False, True]
 
 
@@ -96,7 +96,7 @@ def test_a_file_for_each_mass(tmp_path):
     other = ONE.replace("mass A", "mass B").replace("1.0E-2", "3.0E-2")
     found = read([file(tmp_path, ONE, "a.txt"), file(tmp_path, other, "b.txt")])
     assert found.names == ("mass A", "mass B")
-    np.testing.assert_allclose(found.recording.place[0], [[0.01, 0.02], [0.03, 0.02]])
+    np.testing.assert_allclose(found.recording.position[0], [[0.01, 0.02], [0.03, 0.02]])
 
 
 def test_axes_scale_origin_and_start(tmp_path):
@@ -106,7 +106,7 @@ def test_axes_scale_origin_and_start(tmp_path):
     found = read([file(tmp_path, ONE + "0.13\t0.013\t0.023\n")], frame)
     assert found.recording.axes == (0, 1)
     np.testing.assert_allclose(found.recording.time, [0, 0.01, 0.02], atol=1e-12)
-    np.testing.assert_allclose(found.recording.place[1:, 0], [[0.12, -0.02], [0.13, -0.03]])
+    np.testing.assert_allclose(found.recording.position[1:, 0], [[0.12, -0.02], [0.13, -0.03]])
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_axes_scale_origin_and_start(tmp_path):
         ("frame\tx\ty\n1\t2\t3\n", r"'frame\\tx\\ty', wanted columns t, x, y"),
         (ONE.replace("x\ty", "x\tr"), r"line 2: columns t, x, r, wanted t, and x and y of each mass"),
         (ONE.replace("1.1E-2", "far"), r"line 4: x = 'far', wanted a number or nothing"),
-        (ONE.replace("1.2E-2", "inf"), r"marks\.txt: place: an infinite number"),
+        (ONE.replace("1.2E-2", "inf"), r"marks\.txt: position: an infinite number"),
         (ONE.replace("1.200E-1", "0.105"), r"mass A: t = 0\.105 after 0\.11, wanted times that increase"),
         (ONE + ONE, r"mass A: t = 0\.1 after 0\.12"),
         (ONE + "lost\t\t\n", r"'lost', wanted columns t, x, y"),
@@ -152,17 +152,17 @@ def test_deeplabcut_in_metres_with_z_up(tmp_path):
     found = read([path], Frame(scale=1e-3, origin=(10, 80)), fps=100.0)
     assert found.names == ("tip", "base") and found.recording.axes == (0, 2)
     np.testing.assert_allclose(found.recording.time, [0, 0.01, 0.03])  # a frame is missing
-    np.testing.assert_allclose(found.recording.place[:, 0], [[0.09, 0.03], [0.092, 0.032], [0.094, 0.034]])
+    np.testing.assert_allclose(found.recording.position[:, 0], [[0.09, 0.03], [0.092, 0.032], [0.094, 0.034]])
     assert found.recording.seen[:, 1, 0].tolist() == [True, False, False]
     sure = read_deeplabcut(path, Frame(scale=1e-3), fps=100.0, likelihood=0.3)
     assert sure.recording.seen[:, 1, 0].tolist() == [True, True, False]
-    np.testing.assert_allclose(sure.recording.place[0, 0], [0.1, -0.05])
+    np.testing.assert_allclose(sure.recording.position[0, 0], [0.1, -0.05])
 
 
 def test_deeplabcut_of_several_individuals(tmp_path):
     found = read([file(tmp_path, ANIMALS)], Frame(scale=1.0), fps=1.0)
     assert found.names == ("arm_tip", "frame")
-    np.testing.assert_allclose(found.recording.place[0], [[1, -2], [3, -4]])
+    np.testing.assert_allclose(found.recording.position[0], [[1, -2], [3, -4]])
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_c3d_in_its_own_unit(tmp_path):
     found = read([captured(tmp_path / "walk.c3d")])
     assert found.names == ("tip", "base") and found.recording.axes == (0, 1, 2)
     np.testing.assert_allclose(found.recording.time, np.arange(5) / 200)
-    np.testing.assert_allclose(found.recording.place[:, 0], 1e-3 * np.array([[k, 10 + k, 20 + k] for k in range(5)]))
+    np.testing.assert_allclose(found.recording.position[:, 0], 1e-3 * np.array([[k, 10 + k, 20 + k] for k in range(5)]))
     assert found.recording.seen[:, 1, 0].tolist() == [True, True, False, True, True]
 
 
@@ -236,7 +236,7 @@ def test_c3d_with_y_up(tmp_path):
     found = read([path], Frame(axes=("x", "z", "-y"), scale=1.0, origin=(0, 0, 20)))
     assert found.recording.axes == (0, 1, 2)
     # tip is at (1, 11, 21) of the file, with ours at z = 20 of it
-    np.testing.assert_allclose(found.recording.place[1, 0], [1, -1, 11])
+    np.testing.assert_allclose(found.recording.position[1, 0], [1, -1, 11])
 
 
 def test_c3d_of_many_points(tmp_path):
@@ -276,8 +276,8 @@ def test_the_recipe_writes_what_an_experiment_reads(tmp_path, capsys):
     main(Options(files=(path,), out=out, fps=100.0, scale=1e-3, origin=(10, 80), axes="-x, z", rename=("tip=end, 1",)))
     found = Recording.read(out, ["base", "end, 1"], (0, 2))
     np.testing.assert_allclose(found.time, [0, 0.01, 0.03])
-    np.testing.assert_allclose(found.place[:, 1], [[-0.09, 0.03], [-0.092, 0.032], [-0.094, 0.034]])
-    np.testing.assert_allclose(found.place[0, 0], [0, 0], atol=1e-12)
+    np.testing.assert_allclose(found.position[:, 1], [[-0.09, 0.03], [-0.092, 0.032], [-0.094, 0.034]])
+    np.testing.assert_allclose(found.position[0, 0], [0, 0], atol=1e-12)
     assert found.seen[:, 0, 0].tolist() == [True, False, False]
     told = capsys.readouterr().out
     assert "base: 1 of 3 samples" in told and 'kind = "video", axes = ["x", "z"]' in told
@@ -296,7 +296,7 @@ def test_the_recipe_converts_motion_capture(tmp_path):
     main(Options(files=(path,), out=out))
     found = Recording.read(out, ["tip", "base"])
     written = read([path]).recording
-    np.testing.assert_allclose(found.place, written.place, rtol=1e-8)
+    np.testing.assert_allclose(found.position, written.position, rtol=1e-8)
     np.testing.assert_allclose(found.time, written.time)
 
 

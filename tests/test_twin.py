@@ -17,7 +17,7 @@ from test_experiment import experiment
 
 from torchsoro import Body, Solid
 from torchsoro.sim2real.data.experiment import read_experiment
-from torchsoro.sim2real.data.schema import Boundary, Cavity, Load, Marker
+from torchsoro.sim2real.data.schema import ChamberTable, ForceTable, Marker, PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.grid import Axis, divide
@@ -46,7 +46,7 @@ def hollow(trial, pascal=2e3, **changes):
         time=torch.tensor([0.0, 0.01, 1.0], dtype=torch.float64),
         pressure=torch.tensor([[0.0, pascal, pascal]], dtype=torch.float64),
     )
-    return changed(trial, wave, cavities=(Cavity(name="c", box=CHAMBER),), **changes)
+    return changed(trial, wave, chambers=(ChamberTable(name="c", box=CHAMBER),), **changes)
 
 
 # The grid ---------------------------------------------------------------------------------------------------------
@@ -117,9 +117,9 @@ def test_shares_of_an_attached_mass_have_its_place_as_centroid(trial, place):
 
 def test_centroid_of_a_load_is_the_middle_of_its_box(trial):
     box = ((0.03, 0.006, 0.012), (0.04, 0.013, 0.02))
-    t = changed(trial, loads=(Load(box=box, force=(0.0, 0.0, -0.1)),))
+    t = changed(trial, forces=(ForceTable(box=box, force=(0.0, 0.0, -0.1)),))
     push = Twin(t.setup, edge=EDGE)
-    push = push.scenario(t).pushes[0].share @ push.places
+    push = push.scenario(t).forces[0].share @ push.places
     torch.testing.assert_close(push, torch.tensor([0.035, 0.0095, 0.016], dtype=torch.float64))
 
 
@@ -127,8 +127,8 @@ def test_centroid_of_a_load_is_the_middle_of_its_box(trial):
     ("changes", "message"),
     [
         ({"clamps": (((0.5, 0.5, 0.5), (0.6, 0.6, 0.6)),)}, "wanted one that holds a part of the body"),
-        ({"cavities": (Cavity(name="c", box=((0.01, 0.0, 0.01), (0.02, 0.01, 0.015))),)}, "within the body"),
-        ({"loads": (Load(box=((0.1, 0, 0), (0.2, 0.1, 0.1)), force=(0, 0, 1)),)}, "wanted a box that meets it"),
+        ({"chambers": (ChamberTable(name="c", box=((0.01, 0.0, 0.01), (0.02, 0.01, 0.015))),)}, "within the body"),
+        ({"forces": (ForceTable(box=((0.1, 0, 0), (0.2, 0.1, 0.1)), force=(0, 0, 1)),)}, "wanted a box that meets it"),
     ],
 )
 def test_clamps_chambers_and_loads_that_miss_the_body_are_refused(trial, changes, message):
@@ -171,7 +171,7 @@ def test_cantilever_frequency_matches_beam_theory(trial, across):
         duration=0.5,
     )
     motion = run(t, edge=width / across)
-    z = motion.place[:, 0, 2] - motion.place[0, 0, 2]
+    z = motion.position[:, 0, 2] - motion.position[0, 0, 2]
     exact = timoshenko(length, width, Solid(youngs_modulus=1e5, poisson_ratio=0.0, density=1000.0))
     fitted, _ = curve_fit(
         lambda t, c, a, w, p: c + a * np.cos(w * t + p),
@@ -195,11 +195,11 @@ def test_a_bar_rings_once_a_load_that_held_it_ends(trial):
         length,
         width,
         gravity=(0.0, 0.0, 0.0),
-        loads=(Load(box=box, force=(0.0, 0.0, -force), ramp=pulled, end=let_go),),
+        forces=(ForceTable(box=box, force=(0.0, 0.0, -force), ramp=pulled, end=let_go),),
         duration=let_go + 1.5 / exact,
     )
     motion = run(t, edge=width / 3)
-    z = motion.place[:, 0, 2] - motion.place[0, 0, 2]
+    z = motion.position[:, 0, 2] - motion.position[0, 0, 2]
     inertia = width**4 / 12
     # A cantilever with a force at its end, shear included.
     sag = force * ((length - 0.0025) ** 3 / (3 * 1e5 * inertia) + 1.2 * length / (0.5e5 * width**2))
@@ -242,7 +242,7 @@ def test_motion_of_a_loaded_bar_matches_the_material_point_simulator(trial, stif
             probes=torch.tensor([tip]),
         )
     other = seen.position[:, 0, 2].numpy() - float(x[tip, 2])
-    mine = motion.place[:, 0, 2] - motion.place[0, 0, 2]
+    mine = motion.position[:, 0, 2] - motion.position[0, 0, 2]
     # Holding more of it makes the simulator's bar shorter by 0.29 cells of 40 mm / 2.5 mm.
     assert np.abs(mine - other).max() < 0.08 * np.abs(mine).max()
     assert np.abs(mine).max() > 0.003
@@ -255,7 +255,7 @@ def test_centre_and_spin_of_a_free_body_match_rigid_free_fall(trial):
         for i, c in enumerate(np.ndindex(2, 2, 2))
     )
     motion = run(changed(t, markers=markers))
-    middle = motion.place.mean(1)
+    middle = motion.position.mean(1)
     fall = (
         np.array(t.setup.center)
         + motion.time[:, None] * [0.3, 0, 0.5]
@@ -263,16 +263,16 @@ def test_centre_and_spin_of_a_free_body_match_rigid_free_fall(trial):
     )
     np.testing.assert_allclose(middle, fall, atol=3e-4)
     # It has turned by two rad, and stays as large as it was.
-    edge = motion.place[:, 4] - motion.place[:, 0]
+    edge = motion.position[:, 4] - motion.position[:, 0]
     assert math.atan2(-edge[-1, 2], edge[-1, 0]) == pytest.approx(2.0, abs=0.02)
     np.testing.assert_allclose(np.linalg.norm(edge, axis=-1), t.setup.size[0], rtol=0.01)
 
 
 def test_velocity_of_a_free_body_in_a_fluid_matches_quadratic_drag(trial):
-    t = changed(trial, clamps=(), loads=(), gravity=(0.0, 0.0, 0.0), velocity=(0.5, 0.0, 0.0), duration=0.1)
+    t = changed(trial, clamps=(), forces=(), gravity=(0.0, 0.0, 0.0), velocity=(0.5, 0.0, 0.0), duration=0.1)
     twin, drag = Twin(t.setup, edge=EDGE), next(e for e in library() if e.name == "drag")
     through = drag(twin.scenario(t), torch.tensor([[1600.0]], dtype=torch.float64), twin)
-    way = Ensemble(twin)([through])[0].place[0, -1, :, 0].mean() - np.mean([m.at[0] for m in t.setup.markers])
+    way = Ensemble(twin)([through])[0].position[0, -1, :, 0].mean() - np.mean([m.at[0] for m in t.setup.markers])
     # m dv/dt = - density drag A v^2 / 2, with the area of the front.
     length, *front = t.setup.size
     rate = 1600.0 * math.prod(front) / 2 / (t.setup.density * length * math.prod(front))
@@ -286,7 +286,7 @@ def test_initial_motion_effect_equals_a_spin_stated_in_the_setup(trial):
     twin = Twin(t.setup, edge=EDGE)
     spun = effect(twin.scenario(t), torch.tensor([[0.0, 20.0, 5.0]], dtype=torch.float64), twin)
     found = Ensemble(twin)([spun])[0].alone()
-    np.testing.assert_allclose(found.place, run(changed(t, angular_velocity=(0.0, 20.0, 5.0))).place, atol=1e-6)
+    np.testing.assert_allclose(found.position, run(changed(t, angular_velocity=(0.0, 20.0, 5.0))).position, atol=1e-6)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
@@ -301,17 +301,19 @@ def test_sliding_distance_on_a_slope_matches_coulomb_friction(trial, tilt):
         velocity=(0.5, 0.0, 0.0),
         youngs_modulus=1e6,
         prony=((1.0, 0.001),),
-        planes=(Boundary(point=tuple(low), normal=(0.0, 0.0, 1.0), friction=0.3),),
+        planes=(PlaneTable(point=tuple(low), normal=(0.0, 0.0, 1.0), friction=0.3),),
         duration=0.3,
     )
     motion = run(t)
-    way = motion.place[-1, 0, 0] - motion.place[0, 0, 0]
+    way = motion.position[-1, 0, 0] - motion.position[0, 0, 0]
     assert way == pytest.approx(0.5**2 / (2 * 0.3 * 9.81), rel=0.05)
     if tilt:
         # A plane through the body's lowest edge that it is pushed on from above at an angle.
         normal = turn @ [0, 0, 1]
-        steep = changed(t, planes=(Boundary(point=tuple(low), normal=tuple(normal), friction=0.3),), velocity=(0, 0, 0))
-        seen = run(steep).place
+        steep = changed(
+            t, planes=(PlaneTable(point=tuple(low), normal=tuple(normal), friction=0.3),), velocity=(0, 0, 0)
+        )
+        seen = run(steep).position
         offset = normal @ low
         assert (seen[:, 0] @ normal - offset).min() > -1e-4
 
@@ -326,7 +328,7 @@ def test_adhesion_acts_within_its_reach_only(trial, gap, speed, expected):
         gravity=(0.0, 0.0, 0.0),
         velocity=(0.0, 0.0, speed),
         youngs_modulus=1e6,
-        planes=(Boundary(point=tuple(low - [0.0, 0.0, gap]), normal=(0.0, 0.0, 1.0), friction=0.3),),
+        planes=(PlaneTable(point=tuple(low - [0.0, 0.0, gap]), normal=(0.0, 0.0, 1.0), friction=0.3),),
         duration=0.01,
     )
     height, density = t.setup.size[2], t.setup.density
@@ -342,7 +344,7 @@ def test_adhesion_acts_within_its_reach_only(trial, gap, speed, expected):
 
 def test_chamber_volume_grows_with_pressure_and_less_with_air_stiffness(trial):
     t = hollow(trial, duration=0.2, gravity=(0.0, 0.0, 0.0))
-    grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).place for k in (0.0, 2e4)]
+    grown = [run(t, air_stiffness=torch.tensor([k], dtype=torch.float64)).position for k in (0.0, 2e4)]
     moved = [np.abs(p[-1] - p[0]).max() for p in grown]
     assert moved[0] > 1.2 * moved[1] > 1e-5
     # Air that was believed to be there and is not.
@@ -355,12 +357,12 @@ def test_chamber_volume_grows_with_pressure_and_less_with_air_stiffness(trial):
     assert twice.reported(np.array([-1.0]), believed)["air_stiffness_pa"][0] == -2e4
     # Pressure acts from inside: the forces on the whole body add up to nothing.
     free = run(changed(t, t.pressure, clamps=(), duration=0.05))
-    assert abs((free.place[-1] - free.place[0]).mean(0)[0]) < 2e-4
+    assert abs((free.position[-1] - free.position[0]).mean(0)[0]) < 2e-4
 
 
 def test_variations_in_a_batch_equal_single_simulations(trial):
     twin = Twin(trial.setup, edge=EDGE)
-    loaded = changed(trial, loads=(Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.05)),))
+    loaded = changed(trial, forces=(ForceTable(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.05)),))
     tether = next(e for e in library() if e.name == "tether")
     rows = [[0.0, 0.0, 0.0, 0.04, 0.01, 0.02], [3.0, 0.1, 0.001, 0.04, 0.01, 0.02]]
     values = torch.tensor(rows * 10, dtype=torch.float64)  # more than one group of lanes
@@ -369,8 +371,8 @@ def test_variations_in_a_batch_equal_single_simulations(trial):
     for part, scenario in zip(ensemble(varied), (trial, loaded), strict=True):
         for row in range(2):
             alone = ensemble([tether(twin.scenario(scenario), values[row : row + 1], twin)])[0]
-            np.testing.assert_allclose(part.place[row], alone.place[0], atol=2e-6)
-            np.testing.assert_allclose(part.place[18 + row], part.place[row], atol=1e-6)
+            np.testing.assert_allclose(part.position[row], alone.position[0], atol=2e-6)
+            np.testing.assert_allclose(part.position[18 + row], part.position[row], atol=1e-6)
 
 
 def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
@@ -386,12 +388,12 @@ def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
 @pytest.mark.parametrize("effect", library(), ids=lambda e: type(e).__name__)
 def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwise(trial, effect):
     free = type(effect).__name__ in ("InitialTilt", "InitialSpin")
-    load = Load(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
+    load = ForceTable(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
     stick = "stick" if type(effect).__name__ == "Sliding" else 0.4
     t = hollow(
         trial,
-        loads=(load,),
-        planes=(Boundary(point=(0.0, 0.0, trial.setup.origin[2] - 1e-4), normal=(0.0, 0.0, 1.0), friction=stick),),
+        forces=(load,),
+        planes=(PlaneTable(point=(0.0, 0.0, trial.setup.origin[2] - 1e-4), normal=(0.0, 0.0, 1.0), friction=stick),),
         duration=0.05,
         **({"clamps": ()} if free else {}),
     )
@@ -409,7 +411,7 @@ def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwi
     if effect.name == "softening":  # a range has no zero
         zero[:, 1] = -5.0
     still, same, other = (
-        m.place for m in Ensemble(twin)([scenario, effect(scenario, zero, twin), effect(scenario, some, twin)])
+        m.position for m in Ensemble(twin)([scenario, effect(scenario, zero, twin), effect(scenario, some, twin)])
     )
     np.testing.assert_allclose(same, still, atol=1e-8)
     if effect.name != "adhesion":  # nothing lifts off

@@ -12,7 +12,7 @@ import trimesh
 from test_experiment import SETUP, experiment
 
 from torchsoro.sim2real.data.experiment import read_experiment
-from torchsoro.sim2real.data.schema import Boundary, Load
+from torchsoro.sim2real.data.schema import ForceTable, PlaneTable
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -36,7 +36,9 @@ def test_force_over_time_follows_start_ramp_and_end_of_a_load(updated):
         (0.1, 0.2, float("inf"), [0, 0, 0.5, 1, 1, 1, 1]),
         (0.25, 0.0, 0.45, [0, 0, 0, 1, 1, 0, 0]),
     ):
-        force = updated.force_of(Load(box=box, force=(0.0, 2.0, -1.0), start=start, ramp=ramp, end=end), x, 0.01, 0.6)
+        force = updated.force_of(
+            ForceTable(box=box, force=(0.0, 2.0, -1.0), start=start, ramp=ramp, end=end), x, 0.01, 0.6
+        )
         assert force.particles.tolist() == [1, 2]
         expected = np.array(share)[:, None] * np.array([0.0, 2.0, -1.0])
         np.testing.assert_allclose(force.at(t).numpy(), expected, atol=1e-12)
@@ -58,8 +60,8 @@ def test_path_of_a_free_body_matches_free_fall(updated, tmp_path):
     t = trial.simulated.time[:, None]
     path = np.array([0.04, 0.01, 0.02]) + t * np.array([0.2, 0.0, 0.1]) - t**2 / 2 * np.array([0.0, 0.0, 9.81])
     # A symplectic step is ahead by half a step of gravity.
-    np.testing.assert_allclose(trial.simulated.place[:, 0, :2], path[:, :2], atol=1e-6)
-    np.testing.assert_allclose(trial.simulated.place[:, 0, 2], path[:, 2], atol=9.81 * 0.1 * updated.FINE / 2)
+    np.testing.assert_allclose(trial.simulated.position[:, 0, :2], path[:, :2], atol=1e-6)
+    np.testing.assert_allclose(trial.simulated.position[:, 0, 2], path[:, 2], atol=9.81 * 0.1 * updated.FINE / 2)
 
 
 def off(folder):
@@ -67,8 +69,8 @@ def off(folder):
     (trial,) = read_experiment(folder).trials
     twin = Twin(trial.setup, edge=0.004)
     (motion,) = Ensemble(twin, 1, "cpu")([twin.scenario(trial)])
-    course, own = motion.alone().place[:, 0], trial.simulated
-    same = np.stack([np.interp(motion.time, own.time, own.place[:, 0, k]) for k in range(3)], 1)
+    course, own = motion.alone().position[:, 0], trial.simulated
+    same = np.stack([np.interp(motion.time, own.time, own.position[:, 0, k]) for k in range(3)], 1)
     moved = np.sqrt(((course - course[:1]) ** 2).mean(0))[1:]
     assert (moved > 1e-4).all()
     return np.sqrt(((course - same) ** 2).mean(0))[1:] / moved
@@ -88,12 +90,12 @@ def test_half_clamped_faces_oblique_planes_and_uneven_edges_are_refused(updated,
     (trial,) = read_experiment(experiment(tmp_path)).trials
     options = updated.Options(experiments=())
     half = ((-0.001, -0.001, -0.001), (0.0001, 0.011, 0.021))
-    slope = Boundary(point=(0.0, 0.0, 0.0), normal=(0.6, 0.0, 0.8))
+    slope = PlaneTable(point=(0.0, 0.0, 0.0), normal=(0.6, 0.0, 0.8))
     for change, message in (
         ({"clamps": (half,)}, "wanted whole faces"),
         ({"planes": (slope,)}, "wanted one along x, y or z"),
         ({"size": (0.04, 0.02, 0.0199)}, "wanted edges that a lattice"),
-        ({"loads": (Load(box=((1.0, 0.0, 0.0), (2.0, 1.0, 1.0)), force=(0.0, 0.0, 1.0)),)}, "holds a part"),
+        ({"forces": (ForceTable(box=((1.0, 0.0, 0.0), (2.0, 1.0, 1.0)), force=(0.0, 0.0, 1.0)),)}, "holds a part"),
     ):
         with pytest.raises(ValueError, match=message):
             updated.simulate(dataclasses.replace(trial.setup, **change), options)

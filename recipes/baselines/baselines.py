@@ -184,7 +184,7 @@ def features(problem: FitProblem, fit: Fit) -> torch.Tensor:
     for motion, scenario in zip(fit.end.motions, problem.scenarios, strict=True):
         middle = (np.arange(WINDOWS) + 0.5) / WINDOWS * scenario.duration
         at = np.minimum(np.searchsorted(motion.time, middle), len(motion.time) - 1)
-        moved.append((motion.place - motion.place[:1])[at][:, nearest])
+        moved.append((motion.position - motion.position[:1])[at][:, nearest])
         speeds.append(motion.velocity[at][:, nearest])
         if scenario.pressure is not None:
             p = scenario.pressure.at(torch.from_numpy(middle)).reshape(-1, WINDOWS).T.numpy()
@@ -298,7 +298,7 @@ def candidate_terms(problem: FitProblem, fit: Fit) -> tuple[list[str], list[np.n
         rate = np.gradient(p, even)
         rows, accelerations = [], []
         for m, a in np.ndindex(*seen.shape[1:]):
-            left = trial.recording.place[:, m, a] - seen[:, m, a]
+            left = trial.recording.position[:, m, a] - seen[:, m, a]
             if np.isfinite(left).sum() < FILTER_SAMPLES:
                 continue
             u = smooth_derivative(t, seen[:, m, a] - seen[0, m, a], 0)

@@ -25,7 +25,7 @@ from torchsoro import Body, Domain, Force, Plane, Prony, Simulator, Solid, fill
 from torchsoro.command_line import plain_errors
 from torchsoro.sim2real.data.experiment import Setup, read_experiment
 from torchsoro.sim2real.data.recording import write_table
-from torchsoro.sim2real.data.schema import Load
+from torchsoro.sim2real.data.schema import ForceTable
 from torchsoro.sim2real.twin.twin import Twin
 
 FINE = 1e-3  # s, between samples
@@ -79,7 +79,7 @@ def body_of(setup: Setup, spacing: float, faces: list[tuple[int, int]], device: 
     return domain, dataclasses.replace(body, velocity=velocity)
 
 
-def force_of(load: Load, x: torch.Tensor, spacing: float, lasts: float) -> Force:
+def force_of(load: ForceTable, x: torch.Tensor, spacing: float, lasts: float) -> Force:
     """A dead force on the particles of its box, or next to it.
 
     Raises:
@@ -156,7 +156,7 @@ def simulate(setup: Setup, options: Options) -> dict[str, np.ndarray]:
             prony=Prony(moduli=pairs[:, 0], times=pairs[:, 1]),
             gravity=setup.gravity,
             planes=planes_of(setup, domain.cell, twin.faces),
-            loads=[force_of(load, x, spacing, setup.duration) for load in setup.loads],
+            loads=[force_of(load, x, spacing, setup.duration) for load in setup.forces],
             sample_every=FINE,
             probes=near.reshape(-1),
         )
@@ -179,7 +179,7 @@ def main(options: Options) -> int:
     asked: dict[Path, Setup] = {}
     for folder in options.experiments:
         for trial in read_experiment(folder).trials:
-            if trial.setup.cavities or trial.setup.surface is not None:
+            if trial.setup.chambers or trial.setup.surface is not None:
                 raise ValueError(f"{folder}: wanted a box without chambers")
             # How it was recorded does not matter.
             setup = dataclasses.replace(trial.setup, title="", kind="mocap", axes=(), noise=None)

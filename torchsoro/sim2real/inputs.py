@@ -166,7 +166,7 @@ def _check_noise(experiment: Experiment, recordings: list[Recording]) -> None:
     if experiment.setup.noise is not None:
         return
     wanted = "wanted noise = ..., its standard deviation in metres, under [recording] in setup.toml"
-    third = [np.diff(r.place, 3, axis=0) for r in recordings]
+    third = [np.diff(r.position, 3, axis=0) for r in recordings]
     if not any(np.isfinite(t).any() for t in third):
         raise ValueError(f"{experiment.folder}: no marker has four samples in a row to estimate noise from, {wanted}")
     if not estimate_noise(recordings) > 0:

@@ -26,11 +26,11 @@ from torchsoro.design.mesh import Surface, read_surface
 from torchsoro.sim2real.data.recording import Recording, brief, read_table
 from torchsoro.sim2real.data.schema import (
     LENGTH,
-    Boundary,
     Box,
-    Cavity,
-    Load,
+    ChamberTable,
+    ForceTable,
     Marker,
+    PlaneTable,
     SetupFile,
     Vector,
     read_tables,
@@ -66,9 +66,9 @@ class Setup:
         poisson_ratio: Below 0.5.
         prony: Maxwell elements: modulus relative to equilibrium, relaxation time [s].
         clamps: Boxes whose body points are held still.
-        cavities: Chambers.
+        chambers: Chambers.
         planes: Ground and walls.
-        loads: Dead forces.
+        forces: Dead forces.
         markers: What is tracked.
         kind: "mocap" (metres) or "video" (two axes, scale not exact).
         axes: Recorded axes.
@@ -88,9 +88,9 @@ class Setup:
     poisson_ratio: float
     prony: tuple[tuple[float, float], ...]
     clamps: tuple[Box, ...]
-    cavities: tuple[Cavity, ...]
-    planes: tuple[Boundary, ...]
-    loads: tuple[Load, ...]
+    chambers: tuple[ChamberTable, ...]
+    planes: tuple[PlaneTable, ...]
+    forces: tuple[ForceTable, ...]
     markers: tuple[Marker, ...]
     kind: Literal["mocap", "video"]
     axes: tuple[int, ...]
@@ -186,7 +186,7 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
         recording = recording.until(setup.duration)
         _check_places(recording, setup, markers)
     pressure = None
-    if setup.cavities:
+    if setup.chambers:
         if not supply.is_file():
             raise ValueError(f"{folder}: no pressure.csv, wanted one, as the body has a chamber")
         pressure = _pressure(supply, setup)
@@ -235,19 +235,19 @@ def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
                 f"{path}: marker {marker.name} has no sample, wanted some, or no such marker in setup.toml"
             )
         stated, first = np.array(marker.at)[list(setup.axes)], int(there.argmax())
-        seen = recording.place[first, m]
+        seen = recording.position[first, m]
         if np.abs(seen - stated).max() > (FAR if recording.time[first] < SHORTEST else LOST) * reach:
             scaled = np.abs(seen).max() > 100 * reach > 100 * np.abs(seen / 1000 - stated).max()
             raise ValueError(
                 f"{path}: marker {marker.name} begins at {seen.tolist()}, wanted about {stated.tolist()} m: "
                 f"is it in {'millimetres' if scaled else 'metres, and in the frame of setup.toml'}?"
             )
-        away = np.nan_to_num(np.abs(recording.place[:, m] - stated).max(-1))
+        away = np.nan_to_num(np.abs(recording.position[:, m] - stated).max(-1))
         if away.max() > LOST * reach:
             at = int(away.argmax())
             raise ValueError(
-                f"{path}: marker {marker.name} is at {recording.place[at, m].tolist()} m at {recording.time[at]:g} s, "
-                f"wanted within {LOST * reach:g} m, or an empty cell where it was lost"
+                f"{path}: marker {marker.name} is at {recording.position[at, m].tolist()} m at "
+                f"{recording.time[at]:g} s, wanted within {LOST * reach:g} m, or an empty cell where it was lost"
             )
 
 
@@ -259,7 +259,7 @@ def _folders(parent: Path) -> list[Path]:
 
 
 def _pressure(path: Path, setup: Setup) -> Waveform:
-    names: Sequence[str] = [c.name for c in setup.cavities]
+    names: Sequence[str] = [c.name for c in setup.chambers]
     columns = read_table(path)
     wanted = ["time_s", *(f"{name}_pa" for name in names)]
     if missing := [name for name in wanted if name not in columns]:
@@ -317,9 +317,9 @@ def setup_of(tables: Mapping[str, Any], file: Path, folder: Path | None = None) 
         poisson_ratio=material.poisson_ratio,
         prony=material.prony,
         clamps=tuple(clamp.box for clamp in parsed.clamp),
-        cavities=parsed.chamber,
+        chambers=parsed.chamber,
         planes=parsed.plane,
-        loads=parsed.load,
+        forces=parsed.load,
         markers=parsed.marker,
         kind=recording.kind,
         axes=tuple("xyz".index(axis) for axis in recording.axes),
@@ -344,7 +344,7 @@ def _check(setup: Setup, file: Path) -> None:
                 f"{file}: [[marker]] {marker.name} at {marker.at} m is {1e3 * max(away):.0f} mm outside of the body, "
                 f"wanted one on it or within {1e3 * most / 2:.0f} mm"
             )
-    for what, names in (("marker", [m.name for m in setup.markers]), ("chamber", [c.name for c in setup.cavities])):
+    for what, names in (("marker", [m.name for m in setup.markers]), ("chamber", [c.name for c in setup.chambers])):
         if len(set(names)) != len(names):
             raise ValueError(f"{file}: [[{what}]] names {', '.join(names)}, wanted each once")
     if setup.noise is not None and setup.noise > NOISE * most:
@@ -355,7 +355,7 @@ def _check(setup: Setup, file: Path) -> None:
     for low, high in setup.clamps:
         if all(low[a] <= setup.origin[a] and high[a] >= setup.origin[a] + setup.size[a] for a in range(3)):
             raise ValueError(f"{file}: [[clamp]] box {low}, {high} holds the whole body, wanted a part that can move")
-    for one, other in itertools.combinations(setup.cavities, 2):
+    for one, other in itertools.combinations(setup.chambers, 2):
         if all(max(one.box[0][a], other.box[0][a]) < min(one.box[1][a], other.box[1][a]) for a in range(3)):
             raise ValueError(
                 f"{file}: [[chamber]] {one.name} and {other.name} overlap, wanted chambers with a wall between them"

@@ -30,7 +30,7 @@ class Recording:
 
     Attributes:
         time: [T] s, increasing, by the recording's own clock.
-        place: [T, M, A] m; NaN where a sample was lost. A is the number of recorded axes.
+        position: [T, M, A] m; NaN where a sample was lost. A is the number of recorded axes.
         axes: Which axes those are, 0 to 2.
 
     Raises:
@@ -38,17 +38,21 @@ class Recording:
     """
 
     time: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     axes: tuple[int, ...] = (0, 1, 2)
 
     def __post_init__(self) -> None:
         """Check the table."""
-        if self.time.ndim != 1 or self.place.shape[:1] != self.time.shape:
-            raise ValueError(f"time, place: shapes {self.time.shape} and {self.place.shape}, wanted [T], [T, M, A]")
+        if self.time.ndim != 1 or self.position.shape[:1] != self.time.shape:
+            raise ValueError(
+                f"time, position: shapes {self.time.shape} and {self.position.shape}, wanted [T], [T, M, A]"
+            )
         if len(self.time) < 3:
             raise ValueError(f"{len(self.time)} samples, wanted three or more")
-        if self.place.ndim != 3 or self.place.shape[2] != len(self.axes):
-            raise ValueError(f"place: shape {self.place.shape}, wanted [T, M, {len(self.axes)}] as axes = {self.axes}")
+        if self.position.ndim != 3 or self.position.shape[2] != len(self.axes):
+            raise ValueError(
+                f"position: shape {self.position.shape}, wanted [T, M, {len(self.axes)}] as axes = {self.axes}"
+            )
         late = np.flatnonzero(~(np.diff(self.time) > 0))
         if len(late):
             before, after = self.time[late[0] : late[0] + 2]
@@ -57,22 +61,22 @@ class Recording:
             )
         if not np.isfinite(self.time).all():
             raise ValueError("time: an infinite number, wanted finite times")
-        if np.isinf(self.place).any():
-            raise ValueError("place: an infinite number, wanted finite ones, or NaN for a lost sample")
+        if np.isinf(self.position).any():
+            raise ValueError("position: an infinite number, wanted finite ones, or NaN for a lost sample")
 
     @property
     def seen(self) -> np.ndarray:
         """Where a sample was not lost, bool [T, M, A]."""
-        return np.isfinite(self.place)
+        return np.isfinite(self.position)
 
     def until(self, end: float) -> Recording:
         """What was recorded up to a time [s], the first three samples in any case."""
         count = max(int(np.searchsorted(self.time, end, side="right")), 3)
-        return dataclasses.replace(self, time=self.time[:count], place=self.place[:count])
+        return dataclasses.replace(self, time=self.time[:count], position=self.position[:count])
 
     def every(self, step: int) -> Recording:
         """Every ``step``-th sample, from the first on."""
-        return dataclasses.replace(self, time=self.time[::step], place=self.place[::step])
+        return dataclasses.replace(self, time=self.time[::step], position=self.position[::step])
 
     def columns(self, markers: Sequence[str]) -> dict[str, np.ndarray]:
         """Columns [T] of a markers.csv by name; NaN where a sample was lost.
@@ -83,7 +87,7 @@ class Recording:
         columns = {"time_s": self.time}
         for m, name in enumerate(markers):
             for a, axis in enumerate(self.axes):
-                columns[f"{name}_{AXES[axis]}_m"] = self.place[:, m, a]
+                columns[f"{name}_{AXES[axis]}_m"] = self.position[:, m, a]
         return columns
 
     @classmethod
@@ -104,7 +108,7 @@ class Recording:
             raise ValueError(f"{path}: columns {brief(', '.join(columns), 300)}, wanted also {', '.join(missing)}")
         place = np.array([[columns[name] for name in row] for row in wanted]).transpose(2, 0, 1)
         try:
-            return cls(time=np.array(columns["time_s"]), place=place, axes=tuple(axes))
+            return cls(time=np.array(columns["time_s"]), position=place, axes=tuple(axes))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 

@@ -188,7 +188,7 @@ class Clamp(Table):
     box: CheckedBox = Field(description=_BOX)
 
 
-class Cavity(Table):
+class ChamberTable(Table):
     """A void inside the body, pressed on all its walls.
 
     Attributes:
@@ -204,7 +204,7 @@ class Cavity(Table):
     )
 
 
-class Boundary(Table):
+class PlaneTable(Table):
     """Ground or wall; the body stays on the side that ``normal`` points to.
 
     Attributes:
@@ -220,7 +220,7 @@ class Boundary(Table):
     )
 
 
-class Load(Table):
+class ForceTable(Table):
     """Dead force on the body points in a box.
 
     Attributes:
@@ -240,7 +240,7 @@ class Load(Table):
     )
 
     @model_validator(mode="after")
-    def _ends_after_it_has_grown(self) -> Load:
+    def _ends_after_it_has_grown(self) -> ForceTable:
         if not self.end > self.start + self.ramp:
             raise ValueError(f"end = {self.end:g}, wanted one after it has grown, at {self.start + self.ramp:g} s")
         return self
@@ -291,9 +291,9 @@ class SetupFile(Table):
     material: Material = Field(description="a table [material]")
     recording: RecordingTable = Field(default=RecordingTable(), description="a table [recording]")
     clamp: tuple[Clamp, ...] = Field(default=(), description="[[clamp]] tables")
-    chamber: tuple[Cavity, ...] = Field(default=(), description="[[chamber]] tables")
-    plane: tuple[Boundary, ...] = Field(default=(), description="[[plane]] tables")
-    load: tuple[Load, ...] = Field(default=(), description="[[load]] tables")
+    chamber: tuple[ChamberTable, ...] = Field(default=(), description="[[chamber]] tables")
+    plane: tuple[PlaneTable, ...] = Field(default=(), description="[[plane]] tables")
+    load: tuple[ForceTable, ...] = Field(default=(), description="[[load]] tables")
     marker: tuple[Marker, ...] = Field(min_length=1, description="[[marker]] tables, at least one")
 
 

@@ -111,7 +111,7 @@ def _finished(path: Path, names: Sequence[str], time: np.ndarray, place: np.ndar
     if not all(names) or len(set(names)) != len(names):
         raise ValueError(f"{path}: markers {', '.join(map(repr, names))}, wanted names that differ")
     try:
-        recording = Recording(time=time[used] - begin, place=metres[..., order], axes=tuple(ours[order].tolist()))
+        recording = Recording(time=time[used] - begin, position=metres[..., order], axes=tuple(ours[order].tolist()))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return Tracked(names=tuple(names), recording=recording)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
-from torchsoro.sim2real.twin.scenario import Scenario, Tie
+from torchsoro.sim2real.twin.scenario import NodalSpring, Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.material import Prony
 
@@ -29,7 +29,7 @@ class Modulus(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """E exp(a)."""
-        return scenario.replace(stiffness=scenario.stiffness * values[:, :1].exp())
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * values[:, :1].exp())
 
 
 class Viscoelastic(Hypothesis):
@@ -47,7 +47,7 @@ class Viscoelastic(Hypothesis):
         """The element, and its viscosity."""
         g, tau = float(values[0]), math.exp(values[1])
         nu = float(scenario.poisson_ratio.reshape(-1)[0])
-        mu = float(scenario.stiffness.max()) / (2 * (1 + nu))
+        mu = float(scenario.youngs_modulus.max()) / (2 * (1 + nu))
         return {"modulus_over_equilibrium": (g, "1"), "time_s": (tau, "s"), "viscosity_pa_s": (mu * g * tau, "Pa s")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
@@ -134,7 +134,7 @@ class SoftSide(Hypothesis):
         """E exp(a . xi), xi from -1/2 to 1/2 over the body's box."""
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
         xi = (twin.positions - low) / size - 0.5
-        return scenario.replace(stiffness=scenario.stiffness * (values @ xi.T).exp())
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * (values @ xi.T).exp())
 
 
 class PrintOffset(Hypothesis):
@@ -150,13 +150,13 @@ class PrintOffset(Hypothesis):
         longest = int(np.argmax(s.size))
         factor = torch.ones(len(values), twin.count, dtype=torch.float64)
         for k, axis in enumerate(a for a in range(3) if a != longest):
-            low = min(c.box[0][axis] for c in s.cavities)
-            high = max(c.box[1][axis] for c in s.cavities)
+            low = min(c.box[0][axis] for c in s.chambers)
+            high = max(c.box[1][axis] for c in s.chambers)
             begin, end = low - s.origin[axis], s.origin[axis] + s.size[axis] - high
             shift = values[:, k : k + 1]
             below, above = (x[:, axis] < low).double(), (x[:, axis] > high).double()
             factor = factor * (1 + below * shift / begin - above * shift / end).clamp(min=0.1)
-        return scenario.replace(stiffness=scenario.stiffness * factor, density=scenario.density * factor)
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * factor, density=scenario.density * factor)
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a chamber."""
@@ -172,7 +172,7 @@ class AttachedMass(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Mass at the place."""
-        return scenario.replace(mass=scenario.mass + values[:, :1] * twin.at(values[:, 1:]))
+        return scenario.replace(point_mass=scenario.point_mass + values[:, :1] * twin.at(values[:, 1:]))
 
 
 class LoadInertia(Hypothesis):
@@ -184,18 +184,18 @@ class LoadInertia(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """A share of the force becomes the weight of a mass."""
-        mass, pushes = scenario.mass, []
+        mass, forces = scenario.point_mass, []
         size = scenario.gravity.norm(dim=-1).amax()
-        for push in scenario.pushes:
-            mass = mass + values * push.force.norm(dim=-1).amax() / size * push.share
-            pushes.append(dataclasses.replace(push, force=push.force * (1 - values)))
-        return scenario.replace(mass=mass, pushes=tuple(pushes))
+        for force in scenario.forces:
+            mass = mass + values * force.value.norm(dim=-1).amax() / size * force.share
+            forces.append(dataclasses.replace(force, value=force.value * (1 - values)))
+        return scenario.replace(point_mass=mass, forces=tuple(forces))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With loads that are there from the start and point down, as weights do."""
         g = scenario.gravity.reshape(-1, 3)[0]
-        down = [float(p.force @ g) > 0.99 * float(p.force.norm() * g.norm()) for p in scenario.pushes]
-        return bool(down) and all(down) and all(p.start == 0 for p in scenario.pushes)
+        down = [float(p.value @ g) > 0.99 * float(p.value.norm() * g.norm()) for p in scenario.forces]
+        return bool(down) and all(down) and all(p.start == 0 for p in scenario.forces)
 
 
 class Tether(Hypothesis):
@@ -223,7 +223,7 @@ class Tether(Hypothesis):
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The spring is at rest in the undeformed body."""
         share = twin.at(values[:, 3:])
-        spring = Tie(share=share, stiffness=values[:, 0])
+        spring = NodalSpring(share=share, stiffness=values[:, 0])
         drag = scenario.drag + values[:, 1:2] * share
-        mass = scenario.mass + values[:, 2:3] * share
-        return scenario.replace(springs=(*scenario.springs, spring), drag=drag, mass=mass)
+        mass = scenario.point_mass + values[:, 2:3] * share
+        return scenario.replace(springs=(*scenario.springs, spring), drag=drag, point_mass=mass)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
-from torchsoro.sim2real.twin.scenario import Ground, Scenario
+from torchsoro.sim2real.twin.scenario import ObliquePlane, Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
 
@@ -149,7 +149,7 @@ class FluidDrag(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Force rho c_d / 2 A v |v| along each axis."""
-        return scenario.replace(fluid=scenario.fluid + values[:, 0])
+        return scenario.replace(quadratic_drag=scenario.quadratic_drag + values[:, 0])
 
 
 class Sliding(Hypothesis):
@@ -169,11 +169,11 @@ class Sliding(Hypothesis):
         if not bool(values.any()):
             return scenario
         most = 1 / values[:, 0].clamp(min=1e-3)
-        return _planes(scenario, lambda g: {"friction": most if g.friction is None else g.friction})
+        return _planes(scenario, lambda g: {"friction": most if g.sticks else g.friction})
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane that sticks."""
-        return any(g.friction is None for g in scenario.grounds)
+        return any(g.sticks for g in scenario.planes)
 
 
 class Friction(Hypothesis):
@@ -186,17 +186,19 @@ class Friction(Hypothesis):
 
     def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
         """The coefficient."""
-        believed = next(float(g.friction.reshape(-1)[0]) for g in scenario.grounds if g.friction is not None)
+        believed = next(float(g.friction.reshape(-1)[0]) for g in scenario.planes if isinstance(g.friction, Tensor))
         return {"coefficient": (believed * math.exp(values[0]), "1")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Coefficient times exp(a)."""
         factor = values[:, 0].exp()
-        return _planes(scenario, lambda g: {"friction": None if g.friction is None else g.friction * factor})
+        return _planes(
+            scenario, lambda g: {"friction": g.friction * factor if isinstance(g.friction, Tensor) else g.friction}
+        )
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane that has a coefficient."""
-        return any(g.friction is not None for g in scenario.grounds)
+        return any(not g.sticks for g in scenario.planes)
 
 
 class Adhesion(Hypothesis):
@@ -223,7 +225,7 @@ class Adhesion(Hypothesis):
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane."""
-        return bool(scenario.grounds)
+        return bool(scenario.planes)
 
 
 class WallOffset(Hypothesis):
@@ -239,12 +241,12 @@ class WallOffset(Hypothesis):
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a plane."""
-        return bool(scenario.grounds)
+        return bool(scenario.planes)
 
 
-def _planes(scenario: Scenario, change: Callable[[Ground], dict[str, Tensor | None]]) -> Scenario:
+def _planes(scenario: Scenario, change: Callable[[ObliquePlane], Mapping[str, Tensor | str]]) -> Scenario:
     """A scenario with other numbers for its planes."""
-    return scenario.replace(grounds=tuple(dataclasses.replace(g, **change(g)) for g in scenario.grounds))
+    return scenario.replace(planes=tuple(dataclasses.replace(g, **change(g)) for g in scenario.planes))
 
 
 class GravityTilt(Hypothesis):

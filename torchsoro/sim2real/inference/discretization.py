@@ -16,7 +16,7 @@ from torchsoro.sim2real.inference.likelihood import BREAKS, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
 GAP = 2e-5  # distance by which planes are moved to see how much the moment of contact matters [m]
@@ -61,7 +61,7 @@ def measure(
     # two; impacts on planes do not converge at that order, so that there the whole difference counts.
     ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
     smooth = 1 / (ratio**2 - 1)
-    shares = [OWN if t.simulated else 1.0 if s.grounds else smooth for t, s in zip(trials, here.scenarios, strict=True)]
+    shares = [OWN if t.simulated else 1.0 if s.planes else smooth for t, s in zip(trials, here.scenarios, strict=True)]
     deviations = [_apart(here, other[: len(trials)], shares)]
     deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
     found = {}
@@ -72,7 +72,7 @@ def measure(
         shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
         found[trial.name] = np.maximum(left, max(shared / 2, FLOOR * moved))
-    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.cavities else t.walls for t in (twin, fine.twin))
+    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.chambers else t.walls for t in (twin, fine.twin))
     return DiscretizationError(
         deviation=found,
         shift=shift,
@@ -82,41 +82,41 @@ def measure(
     )
 
 
-def _touching(here: FitProblem) -> list[list[MarkerMotion]]:
+def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
-    if not any(s.grounds for s in here.scenarios):
+    if not any(s.planes for s in here.scenarios):
         return []
     moved = [
         s.replace(
-            grounds=tuple(
+            planes=tuple(
                 dataclasses.replace(g, offset=g.offset + GAP * torch.tensor([-1.0, 1.0], dtype=torch.float64))
-                for g in s.grounds
+                for g in s.planes
             )
         )
         for s in here.scenarios
     ]
     motions = here.ensemble(moved)
     # A trial without planes moves in one way only.
-    return [[m.alone(min(k, len(m.place) - 1)) for m in motions] for k in range(2)]
+    return [[m.alone(min(k, len(m.position) - 1)) for m in motions] for k in range(2)]
 
 
-def _as_simulated(motion: MarkerMotion, trial: Trial) -> MarkerMotion:
+def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:
     """A motion with the places of the trial's own simulation, where there is one; it goes on by itself after that."""
     own = trial.simulated
     if own is None:
         return motion
-    course = Akima1DInterpolator(own.time, own.place)
+    course = Akima1DInterpolator(own.time, own.position)
     last = np.searchsorted(motion.time, own.time[-1], side="right") - 1
     at = np.minimum(np.arange(len(motion.time)), last)
     time = motion.time[at]
     return dataclasses.replace(
         motion,
-        place=course(time) + (motion.place - motion.place[at]),
+        position=course(time) + (motion.position - motion.position[at]),
         velocity=course(time, 1) + (motion.velocity - motion.velocity[at]),
     )
 
 
-def _apart(here: FitProblem, other: Sequence[MarkerMotion], shares: Sequence[float]) -> list[np.ndarray]:
+def _apart(here: FitProblem, other: Sequence[MarkerTrajectory], shares: Sequence[float]) -> list[np.ndarray]:
     """Shares of how far other motions are off, once modulus, pressure and measurement errors are fitted.
 
     Returns:
@@ -127,24 +127,24 @@ def _apart(here: FitProblem, other: Sequence[MarkerMotion], shares: Sequence[flo
     if fit is None:
         return [np.zeros_like(here.discretization.of(t)) for t in here.trials]
     return [
-        share * np.sqrt(((t.recording.place - seen) ** 2).mean(0))
+        share * np.sqrt(((t.recording.position - seen) ** 2).mean(0))
         for t, seen, share in zip(recorded, fit.seen, shares, strict=True)
         if t.recording is not None
     ]
 
 
-def _recordings_of(here: FitProblem, motions: Sequence[MarkerMotion]) -> list[Trial]:
+def _recordings_of(here: FitProblem, motions: Sequence[MarkerTrajectory]) -> list[Trial]:
     """The trials with recordings of just these motions, free of errors."""
     recorded = []
     for i, (trial, motion) in enumerate(zip(here.trials, motions, strict=False)):
         assert trial.recording is not None
         place = here.observation.observe(motion.alone(), i, np.zeros(len(here.observation.deviations)))
-        recording = dataclasses.replace(trial.recording, place=place)
+        recording = dataclasses.replace(trial.recording, position=place)
         recorded.append(dataclasses.replace(trial, recording=recording))
     return recorded
 
 
-def _believed(problem: FitProblem) -> list[MarkerMotion]:
+def _believed(problem: FitProblem) -> list[MarkerTrajectory]:
     """Motion of the setup as stated, for each trial.
 
     Raises:

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.histories import Solution, chi2_of, simulate, solve
-from torchsoro.sim2real.twin.scenario import Push, Scenario
+from torchsoro.sim2real.twin.scenario import NodalForce, Scenario
 from torchsoro.sim2real.twin.twin import Twin
 
 SMALL = 1e-3  # of the body's length, by which a force bends it for its response to be measured
@@ -50,9 +50,9 @@ class StepForce(Hypothesis):
         self.starts = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """One more push."""
-        push = Push(share=self.share, force=values, start=self.start * scenario.duration)
-        return scenario.replace(pushes=(*scenario.pushes, push))
+        """One more force."""
+        force = NodalForce(share=self.share, value=values, start=self.start * scenario.duration)
+        return scenario.replace(forces=(*scenario.forces, force))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.likelihood import Effects, Likelihood, Request
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 STEP = 0.05  # of an unknown, in its scale, for difference quotients
 LONGEST_STEP = 0.5  # of a search, over the unknown's size plus four scales
@@ -32,7 +32,7 @@ class Answer:
         eager: Whether derivatives may be asked for with every step, as where there is room for their simulations.
     """
 
-    motions: list[MarkerMotion]
+    motions: list[MarkerTrajectory]
     eager: bool = False
 
 
@@ -60,7 +60,7 @@ class Point:
     r: np.ndarray
     J: np.ndarray
     columns: np.ndarray
-    motions: list[MarkerMotion]
+    motions: list[MarkerTrajectory]
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +162,7 @@ class GaussNewton:
         return self._point(at, errors, moving, steps, answer.motions), answer.eager
 
     def _point(
-        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, steps: np.ndarray, motions: list[MarkerMotion]
+        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, steps: np.ndarray, motions: list[MarkerTrajectory]
     ) -> Point | None:
         """A point from the motions there and beside it."""
         likelihood = self.likelihood

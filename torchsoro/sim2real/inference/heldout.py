@@ -11,7 +11,7 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 ROUNDS = 10  # Gauss-Newton steps in which the clock of one trial is fitted
 
@@ -34,7 +34,7 @@ class Prediction:
     error: np.ndarray
     total: float
     clock: float
-    motion: MarkerMotion
+    motion: MarkerTrajectory
 
 
 def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
@@ -89,7 +89,9 @@ def _errors(problem: FitProblem, there: FitProblem, fit: Fit) -> np.ndarray:
     return np.concatenate([np.zeros(count), known])
 
 
-def _predicted(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerMotion]) -> list[Prediction]:
+def _predicted(
+    problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerTrajectory]
+) -> list[Prediction]:
     found = []
     for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
         assert trial.recording is not None
@@ -100,7 +102,7 @@ def _predicted(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequen
         clock, least, step = 0.0, math.inf, 0.0
         for _ in range(ROUNDS):
             seen, by = there.observation.linearise(one, i, errors)
-            left, slope = trial.recording.place - seen, by[..., i]
+            left, slope = trial.recording.position - seen, by[..., i]
             good = np.isfinite(left)
             now = float((left[good] ** 2).sum()) + weight * errors[i] ** 2
             if now < least:
@@ -114,7 +116,7 @@ def _predicted(problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequen
             errors[i] = np.clip(clock + step, -most, most)
         errors[i] = clock
         seen = there.observation.observe(one, i, errors)
-        square = (trial.recording.place - seen) ** 2
+        square = (trial.recording.position - seen) ** 2
         error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
         total = float(np.sqrt(np.nanmean(square.sum(-1))))
         found.append(Prediction(trial=trial.name, seen=seen, error=error, total=total, clock=clock, motion=one))

@@ -12,7 +12,7 @@ import numpy as np
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.likelihood import Effects
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows
 ROUNDS = 3  # of straight lines, each at the measurement errors of the one before
@@ -126,7 +126,7 @@ class Lines:
         problem: FitProblem,
         errors: np.ndarray,
         at: np.ndarray,
-        motions: Sequence[MarkerMotion],
+        motions: Sequence[MarkerTrajectory],
         forces: np.ndarray,
     ) -> None:
         self.errors, self.n = errors, len(problem.common)
@@ -156,7 +156,7 @@ class Lines:
         return x[: self.n], self.errors + x[self.n :]
 
 
-def row(motions: Sequence[MarkerMotion], number: int) -> list[MarkerMotion]:
+def row(motions: Sequence[MarkerTrajectory], number: int) -> list[MarkerTrajectory]:
     """One of a batch for each trial."""
     return [m.alone(number) for m in motions]
 
@@ -165,7 +165,7 @@ def solve(
     problem: FitProblem,
     errors: np.ndarray,
     at: np.ndarray,
-    motions: Sequence[MarkerMotion],
+    motions: Sequence[MarkerTrajectory],
     forces: np.ndarray,
     before: float,
 ) -> tuple[Solution, np.ndarray, np.ndarray]:
@@ -189,7 +189,7 @@ def solve(
 
 
 def chi2_of(
-    problem: FitProblem, motions: Sequence[MarkerMotion], number: int, errors: np.ndarray, at: np.ndarray
+    problem: FitProblem, motions: Sequence[MarkerTrajectory], number: int, errors: np.ndarray, at: np.ndarray
 ) -> float:
     """Of one of a batch with its best measurement errors, and of what is believed; infinite if it broke down."""
     if not all(m.sound[number] for m in motions):
@@ -200,7 +200,7 @@ def chi2_of(
 
 def simulate(
     problem: FitProblem, effects: Effects, at: np.ndarray, forces: np.ndarray, *, slopes: bool = False
-) -> list[MarkerMotion]:
+) -> list[MarkerTrajectory]:
     """Each trial at points [R, K] with its own forces [R, T, P, W, 3], in steps; the first also with more steps."""
     found = []
     for t, trial in enumerate(problem.trials):

@@ -21,7 +21,7 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SAME = 0.97  # cosine above which one effect passes for another
 SMALL = 0.1  # strength of a weak response, over that of the weakest probe point: it is linear there
@@ -125,8 +125,8 @@ def prior_residual_of(problem: FitProblem) -> PriorResidual:
 def changes(
     observation: ObservationModel,
     noise_models: Sequence[NoiseModel],
-    believed: Sequence[MarkerMotion],
-    motions: Sequence[MarkerMotion],
+    believed: Sequence[MarkerTrajectory],
+    motions: Sequence[MarkerTrajectory],
 ) -> np.ndarray:
     """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]; 0 for broken ones."""
     sound = np.all([m.sound for m in motions], axis=0)
@@ -142,7 +142,7 @@ def changes(
 
 
 def errors_of(
-    observation: ObservationModel, noise_models: Sequence[NoiseModel], believed: Sequence[MarkerMotion]
+    observation: ObservationModel, noise_models: Sequence[NoiseModel], believed: Sequence[MarkerTrajectory]
 ) -> np.ndarray:
     """Whitened change by each measurement error [N, L]."""
     still = np.zeros(len(observation.deviations))
@@ -165,7 +165,7 @@ def _probe_points(effect: Hypothesis, problem: FitProblem) -> list[np.ndarray]:
     weak = effect.weak_probe_points(problem.twin, SMALL)
     if effect.joint:  # of many places, every other
         return weak[:: -2 if effect.local else 1]
-    if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].grounds:
+    if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].planes:
         return weak
     known = sorted(effect.probe_points(problem.twin), key=lambda d: abs(d[0, 0]))
     return [*weak, known[0], known[-1]]

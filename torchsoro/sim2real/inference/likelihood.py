@@ -22,7 +22,7 @@ from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationMode
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.scenario import Scenario
-from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
@@ -136,7 +136,7 @@ class Likelihood:
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:
         """What is fitted always, modulus and where there is one pressure, with its tolerance."""
         modulus = (Modulus(), self.tolerances.modulus)
-        if not self.experiment.setup.cavities:
+        if not self.experiment.setup.chambers:
             return (modulus,)
         return modulus, (PressureGain(), self.tolerances.pressure)
 
@@ -166,7 +166,7 @@ class Likelihood:
         own = {e: {**known.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
         return self.only(self.trials, discretization=known.replace(own={**known.own, **own}))
 
-    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, MarkerMotion]]:
+    def _finer(self, trials: Sequence[Trial], points: Sequence[Request]) -> list[dict[str, MarkerTrajectory]]:
         """What the finer twin adds at points, by trial; nothing to those with a simulation of one's own."""
         trials = [t for t in trials if t.name not in self.stated]
         if self.fine is None or not trials:
@@ -177,7 +177,7 @@ class Likelihood:
         return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
 
     @property
-    def stated(self) -> dict[str, MarkerMotion]:
+    def stated(self) -> dict[str, MarkerTrajectory]:
         """Of the corrections, those by a simulation of one's own."""
         trials, known = (*self.experiment.trials, *self.experiment.heldout), self.discretization.correction
         return {t.name: known[t.name] for t in trials if t.simulated and t.name in known}
@@ -240,7 +240,7 @@ class Likelihood:
                 scenario = effect(scenario, part, self.twin)
         return scenario
 
-    def simulate(self, requests: Sequence[Request]) -> list[list[MarkerMotion]]:
+    def simulate(self, requests: Sequence[Request]) -> list[list[MarkerTrajectory]]:
         """For each request, the motions of all trials, each with a leading batch; all at once."""
         begin = time.perf_counter()
         varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
@@ -258,26 +258,26 @@ class Likelihood:
 
     # Residuals --------------------------------------------------------------------------------------------------
 
-    def residual(self, motions: Sequence[MarkerMotion], errors: np.ndarray) -> np.ndarray:
+    def residual(self, motions: Sequence[MarkerTrajectory], errors: np.ndarray) -> np.ndarray:
         """Whitened residual of all trials."""
         left = []
         for i, (motion, trial, noise_model) in enumerate(zip(motions, self.trials, self.noise_models, strict=True)):
             assert trial.recording is not None
-            left.append(noise_model.whiten(trial.recording.place - self.observation.observe(motion, i, errors)))
+            left.append(noise_model.whiten(trial.recording.position - self.observation.observe(motion, i, errors)))
         return np.concatenate(left)
 
-    def linear(self, motions: Sequence[MarkerMotion], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linear(self, motions: Sequence[MarkerTrajectory], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`residual`, and its slopes by the measurement errors."""
         left, slopes = [], []
         for i, (motion, trial, noise_model) in enumerate(zip(motions, self.trials, self.noise_models, strict=True)):
             assert trial.recording is not None
             seen, by = self.observation.linearise(motion, i, errors)
-            left.append(noise_model.whiten(trial.recording.place - seen))
+            left.append(noise_model.whiten(trial.recording.position - seen))
             slopes.append(noise_model.whiten(by))
         return np.concatenate(left), np.concatenate(slopes)
 
     def measure(
-        self, motions: Sequence[MarkerMotion], errors: np.ndarray
+        self, motions: Sequence[MarkerTrajectory], errors: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
         """The best measurement errors for motions: chi-squared with their priors, errors, residual, slopes."""
         weight = 1 / self.observation.deviations
@@ -311,8 +311,8 @@ class Likelihood:
 
 
 def added(
-    trials: Sequence[Trial], coarse: Sequence[MarkerMotion], fine: Sequence[MarkerMotion]
-) -> dict[str, MarkerMotion]:
+    trials: Sequence[Trial], coarse: Sequence[MarkerTrajectory], fine: Sequence[MarkerTrajectory]
+) -> dict[str, MarkerTrajectory]:
     """By trial, what a finer twin adds to motions [S, M, ...]; nothing where one of them broke down."""
     return {
         t.name: b.alone().plus(a.alone(), -1.0)

@@ -159,6 +159,6 @@ def predict_trial(
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
     axes = told.setup.axes
-    return Recording(time=motion.time, place=motion.place[..., list(axes)], axes=axes).columns(
+    return Recording(time=motion.time, position=motion.position[..., list(axes)], axes=axes).columns(
         [m.name for m in told.setup.markers]
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchsoro.sim2real.data.experiment import Load, Marker, Setup, Trial, Vector
+from torchsoro.sim2real.data.experiment import ForceTable, Marker, Setup, Trial, Vector
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
@@ -17,7 +17,7 @@ from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.actuation import Waveform
 
 LONGER = 1.5  # times as long; every simulation of the menu takes as long as its longest
@@ -159,14 +159,14 @@ def menu(trial: Trial, twin: Twin, extra: Marker) -> list[Choice]:
         force = pull / weight if pull.any() else np.eye(3)[int(np.argmin(s.size))]
     force = PULL * weight * s.density * float(twin.grid.volumes.sum()) * force
     start = round(s.duration / 3, 3)
-    load = Load(box=(_vector(low - 1e-6), _vector(high + 1e-6)), force=_vector(force), start=start)
+    load = ForceTable(box=(_vector(low - 1e-6), _vector(high + 1e-6)), force=_vector(force), start=start)
     try:
         twin.grid.within(load.box)
     except ValueError:
         pass  # a body that tapers may have nothing there
     else:
         newtons = ", ".join(f"{f:.3g}" for f in force)
-        add(f"the same with a pull of ({newtons}) N at the free end from {start:g} s on", loads=(*s.loads, load))
+        add(f"the same with a pull of ({newtons}) N at the free end from {start:g} s on", forces=(*s.forces, load))
     if trial.pressure is not None:
         p = trial.pressure
         add("the same at 0.6 times the pressure", pressure=Waveform(time=p.time, pressure=0.6 * p.pressure))
@@ -196,7 +196,7 @@ def _around(problem: FitProblem, effects: Effects, at: np.ndarray) -> np.ndarray
     return np.concatenate([middle[None], middle + (np.eye(len(at)) * steps)[n:]])
 
 
-def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerMotion], extra: Marker) -> Proposal:
+def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerTrajectory], extra: Marker) -> Proposal:
     """What a trial would tell, from simulations of what is believed, and of both explanations with their steps."""
     trial = choice.trial
     if choice.marker:
@@ -235,18 +235,18 @@ def _timed(trial: Trial, of: Trial) -> Trial:
     late = np.arange(time[-1] + step, setup.duration, step) if setup.duration > time[-1] + step else time[:0]
     time = np.concatenate([time, late]) if trial.name.startswith("next") else time
     place = np.zeros((len(time), len(setup.markers), len(setup.axes)))
-    return dataclasses.replace(trial, recording=dataclasses.replace(of.recording, time=time, place=place))
+    return dataclasses.replace(trial, recording=dataclasses.replace(of.recording, time=time, position=place))
 
 
 def _marked(setup: Setup, extra: Marker) -> Setup:
     return dataclasses.replace(setup, markers=(*setup.markers, extra))
 
 
-def _first(motion: MarkerMotion, markers: int) -> MarkerMotion:
+def _first(motion: MarkerTrajectory, markers: int) -> MarkerTrajectory:
     """A motion of the first markers only."""
     return dataclasses.replace(
         motion,
-        place=motion.place[..., :markers, :],
+        position=motion.position[..., :markers, :],
         velocity=motion.velocity[..., :markers, :],
         gradient=motion.gradient[..., :markers, :, :],
     )

@@ -64,7 +64,7 @@ def estimate_noise(recordings: Sequence[Recording]) -> float:
     """
     found = []
     for r in recordings:
-        third = np.diff(r.place, 3, axis=0)
+        third = np.diff(r.position, 3, axis=0)
         third = third[np.isfinite(third)]
         if len(third):
             found.append(np.abs(third))

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 CLOCK_LIMIT = 3.0  # standard deviations of a clock offset, beyond which it is not looked for
 
@@ -98,7 +98,7 @@ class ObservationModel:
         last = float(trial.recording.time[-1])
         return max(trial.setup.duration, (last + CLOCK_LIMIT * clock) * (1 + CLOCK_LIMIT * rate))
 
-    def observe(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> np.ndarray:
+    def observe(self, motion: MarkerTrajectory, number: int, errors: np.ndarray) -> np.ndarray:
         """The recording of trial ``number``.
 
         Args:
@@ -112,7 +112,7 @@ class ObservationModel:
         own, place, frame = self._view(motion, number, errors)
         return self._recorded(_at(motion, own, place)[0] @ frame.T, number, errors)
 
-    def linearise(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearise(self, motion: MarkerTrajectory, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As :meth:`see`, and the derivatives of the places by the errors [T, M, A, K]."""
         count, rate = len(self.trials), errors[len(self.trials)]
         own, place, frame = self._view(motion, number, errors)
@@ -134,7 +134,9 @@ class ObservationModel:
                 by[:, marker, axis, first + axis] = course
         return self._recorded(seen, number, errors), by[:, :, list(self.setup.axes)]
 
-    def _view(self, motion: MarkerMotion, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _view(
+        self, motion: MarkerTrajectory, number: int, errors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times by the body's clock [T] s, places of markers [M, 3] m, and scale times rotation [3, 3]."""
         recording, count = self.trials[number].recording, len(self.trials)
         assert recording is not None
@@ -161,12 +163,12 @@ class ObservationModel:
         return seen[:, :, list(self.setup.axes)]
 
 
-def _at(motion: MarkerMotion, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _at(motion: MarkerTrajectory, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Places [T, M, 3] m and velocities [T, M, 3] m/s at times, and deformation gradients [T, M, 3, 3].
 
     The places are of points at a distance ``beside`` [M, 3] m from the motion's own in the undeformed body.
     """
-    course = CubicHermiteSpline(motion.time, motion.place, motion.velocity)
+    course = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     last = np.clip(np.searchsorted(motion.time, time, side="right") - 1, 0, len(motion.time) - 2)
     s = ((time - motion.time[last]) / (motion.time[last + 1] - motion.time[last]))[:, None, None, None]
     gradient = (1 - s) * motion.gradient[last] + s * motion.gradient[last + 1]

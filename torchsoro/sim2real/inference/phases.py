@@ -14,7 +14,7 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.heldout import Prediction
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SHORT = 0.02  # of a trial: no phase is shorter
 SLOPE = 0.5  # of the range of a pressure in a trial's duration, above which it rises or falls
@@ -147,13 +147,15 @@ def mismatches(
                 phases=tuple(phases(trial, motion.alone())),
                 time=recording.time,
                 before=_before(there, i, motion, point),
-                after=_mean((recording.place - other.seen) / np.hypot(there.noise, there.discretization.of(trial)), 2),
+                after=_mean(
+                    (recording.position - other.seen) / np.hypot(there.noise, there.discretization.of(trial)), 2
+                ),
             )
         )
     return found
 
 
-def _before(there: FitProblem, i: int, motion: MarkerMotion, point: np.ndarray) -> np.ndarray:
+def _before(there: FitProblem, i: int, motion: MarkerTrajectory, point: np.ndarray) -> np.ndarray:
     """Mismatch of trial ``i`` [T, M] with what is fitted along found from more and more of it, until they part."""
     recording, n = there.trials[i].recording, len(point)
     assert recording is not None
@@ -165,7 +167,7 @@ def _before(there: FitProblem, i: int, motion: MarkerMotion, point: np.ndarray) 
         seen, by = there.observation.linearise(motion.alone(0), i, x[n:])
         rise = [(there.observation.observe(motion.alone(k + 1), i, x[n:]) - seen) / STEP for k in range(n)]
         slopes = np.concatenate([np.stack(rise, -1), by], -1) / wide[..., None]
-        return (recording.place - seen) / wide - slopes[..., :n] @ x[:n], slopes
+        return (recording.position - seen) / wide - slopes[..., :n] @ x[:n], slopes
 
     for cut in np.linspace(time[0], time[-1], CUTS + 1)[1:]:
         for _ in range(2):
@@ -190,7 +192,7 @@ def _parting(time: np.ndarray, values: np.ndarray) -> float | None:
     return float(time[int(run.argmax())]) if run.any() else None
 
 
-def phases(trial: Trial, motion: MarkerMotion) -> list[Phase]:
+def phases(trial: Trial, motion: MarkerTrajectory) -> list[Phase]:
     """Phases of a trial: of its pressure, of contact with planes, of loads; of swings where there are none.
 
     Args:
@@ -238,11 +240,11 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
         return []
     course = trial.pressure.at(torch.from_numpy(time).to(trial.pressure.time)).numpy().reshape(-1, len(time))
     found = []
-    for cavity, p in zip(trial.setup.cavities, course, strict=True):
+    for chamber, p in zip(trial.setup.chambers, course, strict=True):
         reach, most = float(np.ptp(p)), float(np.abs(p).max())
         slope = np.asarray(savgol_filter(p, WIDE, 1, deriv=1, delta=float(time[1]), mode="nearest"))
         steep = SLOPE * reach / float(time[-1])
-        of = f" of {cavity.name}" if len(course) > 1 else ""
+        of = f" of {chamber.name}" if len(course) > 1 else ""
         names = []
         for s, value in zip(slope, p, strict=True):
             if abs(s) > steep > 0:
@@ -253,7 +255,7 @@ def _pressures(trial: Trial, time: np.ndarray) -> list[list[str]]:
     return found
 
 
-def _contacts(trial: Trial, motion: MarkerMotion, time: np.ndarray) -> list[str]:
+def _contacts(trial: Trial, motion: MarkerTrajectory, time: np.ndarray) -> list[str]:
     """Whether a corner of the body, which moves as the marker nearest to it does, is at a plane."""
     s = trial.setup
     if not s.planes:
@@ -261,7 +263,7 @@ def _contacts(trial: Trial, motion: MarkerMotion, time: np.ndarray) -> list[str]
     corners = np.array(s.origin) + np.array(list(itertools.product((0, 1), repeat=3))) * np.array(s.size)
     at = np.array([m.at for m in s.markers])
     near = np.linalg.norm(corners[:, None] - at, axis=-1).argmin(1)
-    moved = motion.place[:, near] + np.einsum("scij,cj->sci", motion.gradient[:, near], corners - at[near])
+    moved = motion.position[:, near] + np.einsum("scij,cj->sci", motion.gradient[:, near], corners - at[near])
     above = np.full(len(motion.time), np.inf)
     for plane in s.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
@@ -277,7 +279,7 @@ def _contacts(trial: Trial, motion: MarkerMotion, time: np.ndarray) -> list[str]
 
 def _loads(trial: Trial, time: np.ndarray) -> list[str]:
     """Which of the loads that begin later has begun, and whether all have ended that do."""
-    loads = trial.setup.loads
+    loads = trial.setup.forces
     starts = sorted({load.start for load in loads if 0 < load.start < time[-1]})
     ends = [load.end for load in loads if load.end < time[-1]]
     if not starts and not ends:
@@ -289,9 +291,9 @@ def _loads(trial: Trial, time: np.ndarray) -> list[str]:
     return ["time after the load" if ends and t >= max(ends) else name for t, name in zip(time, names, strict=True)]
 
 
-def _swings(motion: MarkerMotion, time: np.ndarray) -> list[str]:
+def _swings(motion: MarkerTrajectory, time: np.ndarray) -> list[str]:
     """From one turning point to the next, of the marker that moves most, along which it does."""
-    moved = motion.place - motion.place.mean(0)
+    moved = motion.position - motion.position.mean(0)
     most = int((moved**2).sum((0, 2)).argmax())
     _, _, axes = np.linalg.svd(moved[:, most], full_matrices=False)
     x = np.interp(time, motion.time, moved[:, most] @ axes[0])

@@ -8,7 +8,7 @@ from scipy.optimize import lsq_linear
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Point
 from torchsoro.sim2real.inference.likelihood import Likelihood
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 EXTRAPOLATED = 8.0  # times a probe point whose directions add up, up to which strength its response is taken as linear
 WEAK_REACH = 0.6  # of a probe point's strength, up to which the response at a weaker one is taken as linear
@@ -21,7 +21,7 @@ def ranked_starts(
     points: list[np.ndarray],
     linear: int,
     weak: float,
-    motions: list[MarkerMotion],
+    motions: list[MarkerTrajectory],
     base: Point,
 ) -> list[tuple[float, np.ndarray]]:
     """Starts of searches for one effect, best first.

@@ -62,7 +62,7 @@ def reordered(experiment: Experiment) -> tuple[Experiment, str]:
     setup = experiment.setup
     recordings = [t.recording for t in experiment.trials if t.recording is not None]
     stated = np.array([m.at for m in setup.markers])[:, list(setup.axes)]
-    first = [np.nanmean(r.place[:5], axis=0) for r in recordings if np.isfinite(r.place[:5]).any(0).all()]
+    first = [np.nanmean(r.position[:5], axis=0) for r in recordings if np.isfinite(r.position[:5]).any(0).all()]
     if not first:
         return experiment, ""
     away = np.linalg.norm(stated[:, None] - np.mean(first, axis=0)[None], axis=-1)
@@ -75,7 +75,7 @@ def reordered(experiment: Experiment) -> tuple[Experiment, str]:
         if trial.recording is None:
             return trial
         return dataclasses.replace(
-            trial, recording=dataclasses.replace(trial.recording, place=trial.recording.place[:, order])
+            trial, recording=dataclasses.replace(trial.recording, position=trial.recording.position[:, order])
         )
 
     names = ", ".join(setup.markers[i].name for i in moved)

@@ -41,7 +41,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
         ValueError: if the coarsest takes more than three times the budget.
     """
     thin, long = min(setup.size), max(setup.size)
-    chambers = bool(setup.cavities)
+    chambers = bool(setup.chambers)
     edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
     twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
     for twin in twins:

@@ -166,7 +166,7 @@ def inflate_discrepancy(
         left = {}
         for trial, seen in zip(problem.trials, fits[0].seen, strict=True):
             assert trial.recording is not None
-            off = np.sqrt(np.nanmean((trial.recording.place - seen) ** 2))
+            off = np.sqrt(np.nanmean((trial.recording.position - seen) ** 2))
             left[trial.name] = np.sqrt(own.of(trial) ** 2 + (1.2 * off) ** 2)
         sizes = ", ".join(f"{1e3 * float(n.mean()):.2f} mm" for n in left.values())
         report(f"discrepancy inflated by the residual of the best: {sizes}")
@@ -241,7 +241,7 @@ def _fit_null_model(
         null_model = min(ends, key=lambda fit: fit.chi2)
         report(f"without an effect: chi-squared {null_model.chi2:.0f} of {null_model.samples} samples")
         left = [
-            t.recording.place - seen for t, seen in zip(problem.trials, null_model.seen, strict=True) if t.recording
+            t.recording.position - seen for t, seen in zip(problem.trials, null_model.seen, strict=True) if t.recording
         ]
         slips = [] if problem.slips else find_slips(problem.trials, problem.noise_models, left)
         if not slips:

@@ -11,7 +11,7 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.twin.twin import MarkerMotion
+from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -30,8 +30,8 @@ class DiscretizationError:
 
     deviation: Mapping[str, np.ndarray] = field(default_factory=dict)
     shift: tuple[float, ...] = ()
-    correction: Mapping[str, MarkerMotion] = field(default_factory=dict)
-    own: Mapping[tuple[Hypothesis, ...], Mapping[str, MarkerMotion]] = field(default_factory=dict)
+    correction: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
+    own: Mapping[tuple[Hypothesis, ...], Mapping[str, MarkerTrajectory]] = field(default_factory=dict)
     edges: tuple[float, ...] = ()
     walls: tuple[int, ...] = ()
 
@@ -45,7 +45,7 @@ class DiscretizationError:
         if trial.name in self.deviation:
             return self.deviation[trial.name]
         assert trial.recording is not None
-        return self.mean if self.deviation else np.zeros(trial.recording.place.shape[1:])
+        return self.mean if self.deviation else np.zeros(trial.recording.position.shape[1:])
 
     def among(self, trials: Sequence[Trial]) -> DiscretizationError:
         """The same with deviations for just these trials."""

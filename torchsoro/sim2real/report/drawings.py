@@ -38,7 +38,7 @@ def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray) -> Fig
     panels: Any = figure.subplots(count, len(axes), sharex=True, squeeze=False)
     # By hand: the layout engine takes longer for dozens of panels than to draw them.
     figure.subplots_adjust(left=0.085, right=0.985, bottom=0.5 / high, top=1 - 0.65 / high, wspace=0.2, hspace=0.14)
-    curves = 1e3 * np.stack([recording.place, believed, explained])
+    curves = 1e3 * np.stack([recording.position, believed, explained])
     low, top = np.nanmin(curves, axis=(0, 1)), np.nanmax(curves, axis=(0, 1))
     half = 0.54 * np.maximum(top - low, LEAST_RANGE * float((top - low).max()))
     for m, a in np.ndindex(count, len(axes)):

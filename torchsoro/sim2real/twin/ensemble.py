@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsoro.sim2real.twin.grid import Grid
 from torchsoro.sim2real.twin.scenario import Scenario
-from torchsoro.sim2real.twin.twin import MarkerMotion, Twin
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.simd_cells import remove_stale_code
@@ -83,11 +83,11 @@ class Ensemble:
     def chamber_volume(self) -> np.ndarray:
         """Of the undeformed chambers [chambers] m3."""
         _, _, places, axes, areas, chambers = self.twin.grid.walls
-        found = np.zeros(len(self.twin.setup.cavities))
+        found = np.zeros(len(self.twin.setup.chambers))
         np.add.at(found, chambers, areas * places[np.arange(len(axes)), axes] / 3)
         return found
 
-    def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerMotion]:
+    def __call__(self, scenarios: Sequence[Scenario]) -> list[MarkerTrajectory]:
         """Simulate.
 
         Args:
@@ -150,9 +150,9 @@ class Ensemble:
         at = np.array([m.at for m in self.twin.setup.markers], float)
         time = np.arange(samples) * SAMPLE
         return [
-            MarkerMotion(
+            MarkerTrajectory(
                 time=time,
-                place=at + x[:, :, :, 0],
+                position=at + x[:, :, :, 0],
                 velocity=x[:, :, :, 1],
                 gradient=np.eye(3) + np.swapaxes(x[:, :, :, 2:], -1, -2),
                 dt=largest,
@@ -163,7 +163,7 @@ class Ensemble:
     def stable(self, s: Scenario) -> np.ndarray:
         """Largest stable step of each variation [B] s; a Maxwell element counts by its stiffness within one step."""
         nu = s.poisson_ratio.unsqueeze(-1)
-        bulk, shear = s.stiffness / (3 * (1 - 2 * nu)), s.stiffness / (2 * (1 + nu))
+        bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
         bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch).numpy() for m in (bulk, shear))
         dt, share = np.full(s.batch, 1.0), self.safety or safety(self.twin.grid)
         steep = max(a.steep for a in self.twin.grid.axes)
@@ -195,13 +195,13 @@ class Ensemble:
 
         def modulus(s: Scenario, kind: str) -> Tensor:
             nu = s.poisson_ratio.unsqueeze(-1)
-            return volume * s.stiffness / (3 * (1 - 2 * nu) if kind == "bulk" else 2 * (1 + nu))
+            return volume * s.youngs_modulus / (3 * (1 - 2 * nu) if kind == "bulk" else 2 * (1 + nu))
 
         known: dict[int, Tensor] = {}
 
         def mass(s: Scenario) -> Tensor:
             if id(s) not in known:
-                known[id(s)] = self.twin.nodal(s.density * volume) + s.mass
+                known[id(s)] = self.twin.nodal(s.density * volume) + s.point_mass
             return known[id(s)]
 
         weight = lanes(lambda s: torch.where(mass(s) > 0, 1 / mass(s).clamp(min=1e-30), 0.0), 1)
@@ -211,20 +211,20 @@ class Ensemble:
         maxwell = np.zeros((elements, 4, LANES), np.float32)
         for e in range(elements):
             maxwell[e] = lanes(lambda s, e=e: _series(s.prony, dt, e), 1)
-        chambers = len(self.twin.setup.cavities)
+        chambers = len(self.twin.setup.chambers)
         supply = np.zeros((steps if chambers else 1, chambers, LANES), np.float32)
         if chambers:
             times = torch.arange(steps, dtype=torch.float64) * dt
             for k, ((_, b), s) in enumerate(zip(full, varied, strict=True)):
                 supply[:, :, k] = _pressure(s.pressure, b).at(times).T.numpy()
-        pushes = _pushes(full, varied, dt)
+        forces = _forces(full, varied, dt)
         springs = [lanes(lambda s, i=i: s.springs[i].share, 1) for i in range(len(first.springs))]
         where = [np.flatnonzero(share.any(-1)) for share in springs]
         empty = np.zeros(0, np.int64)
-        grounds = range(len(first.grounds))
+        planes = range(len(first.planes))
         law = lanes(lambda s: torch.cat(torch.broadcast_tensors(s.stiffening, s.softening), -1), 1)
         moduli = np.stack([lanes(lambda s, k=k: modulus(s, k), 1) for k in ("shear", "bulk")], 1)
-        normals = np.array([g.normal.numpy() for g in first.grounds]).reshape(-1, 3)
+        normals = np.array([g.normal.numpy() for g in first.planes]).reshape(-1, 3)
         return Case(
             dt=dt,
             steps=steps,
@@ -237,13 +237,13 @@ class Ensemble:
             weight=weight,
             left=left,
             gravity=lanes(lambda s: s.gravity, 1),
-            fluid=lanes(lambda s: s.fluid / 2, 0),
+            fluid=lanes(lambda s: s.quadratic_drag / 2, 0),
             place=lanes(lambda s: s.displacement, 2),
             velocity=lanes(lambda s: s.velocity, 2),
             supply=supply,
             air=lanes(lambda s: s.air_stiffness, 1),
             volume=self.chamber_volume.astype(np.float32),
-            **pushes,
+            **forces,
             spring_node=np.concatenate([empty, *where]),
             spring_share=np.concatenate(
                 [np.zeros((0, LANES), np.float32), *(w[n] for w, n in zip(springs, where, strict=True))]
@@ -256,11 +256,11 @@ class Ensemble:
                 ]
             )[1:],
             normals=normals.astype(np.float32),
-            stick=np.array([g.friction is None for g in first.grounds], bool),
-            offset=_rows(lanes, grounds, "offset"),
-            friction=_rows(lanes, grounds, "friction"),
-            adhesion=_rows(lanes, grounds, "adhesion"),
-            reach=_rows(lanes, grounds, "reach"),
+            stick=np.array([g.sticks for g in first.planes], bool),
+            offset=_rows(lanes, planes, "offset"),
+            friction=_rows(lanes, planes, "friction"),
+            adhesion=_rows(lanes, planes, "adhesion"),
+            reach=_rows(lanes, planes, "reach"),
             area=np.array([self.twin.grid.facing(n) for n in normals], np.float32).reshape(
                 len(normals), self.twin.grid.nodes
             ),
@@ -270,18 +270,18 @@ class Ensemble:
 def _common(s: Scenario) -> object:
     """What the variations of a group must have in common: numbers of elements, planes and springs."""
     elements = 0 if s.prony is None else s.prony.elements
-    planes = tuple((tuple(g.normal.tolist()), g.friction is None) for g in s.grounds)
+    planes = tuple((tuple(g.normal.tolist()), g.sticks) for g in s.planes)
     return elements, planes, len(s.springs)
 
 
-def _rows(lanes, grounds: range, name: str) -> np.ndarray:
+def _rows(lanes, planes: range, name: str) -> np.ndarray:
     """A number of each plane [A, 16]."""
 
     def get(s: Scenario, i: int):
-        value = getattr(s.grounds[i], name)
-        return torch.zeros(()) if value is None else value
+        value = getattr(s.planes[i], name)
+        return torch.zeros(()) if isinstance(value, str) else value  # a plane that sticks has no coefficient
 
-    rows = [lanes(lambda s, i=i: get(s, i), 0) for i in grounds]
+    rows = [lanes(lambda s, i=i: get(s, i), 0) for i in planes]
     return np.array(rows, np.float32).reshape(len(rows), LANES)
 
 
@@ -301,29 +301,29 @@ def _pressure(supply: Waveform | None, number: int) -> Waveform:
     return Waveform(time=supply.time.double(), pressure=p.double())
 
 
-def _pushes(full: Sequence[Lane], varied: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
+def _forces(full: Sequence[Lane], varied: Sequence[Scenario], dt: float) -> dict[str, np.ndarray]:
     """Forces of each scenario in its own lanes."""
-    begin, nodes, shares, forces, starts = [0], [], [], [], []
+    begin, nodes, shares, values, starts = [0], [], [], [], []
     for number in dict.fromkeys(i for i, _ in full):
         mine = [k for k, (i, _) in enumerate(full) if i == number]
-        for push in varied[mine[0]].pushes:
-            on = np.flatnonzero(push.share.numpy())
+        for force in varied[mine[0]].forces:
+            on = np.flatnonzero(force.share.numpy())
             nodes.append(on)
-            shares.append(push.share.numpy()[on])
+            shares.append(force.share.numpy()[on])
             begin.append(begin[-1] + len(on))
-            force = np.zeros((3, LANES), np.float32)
+            value, given = np.zeros((3, LANES), np.float32), force.value
             for k in mine:
-                f = push.force
-                force[:, k] = f[full[k][1] if f.shape[0] > 1 else 0].numpy() if f.ndim > 1 else f.numpy()
-            forces.append(force)
+                one = given[full[k][1] if given.shape[0] > 1 else 0] if given.ndim > 1 else given
+                value[:, k] = one.numpy()
+            values.append(value)
             # One that begins at a step does, however that is rounded.
-            starts.append(math.ceil(push.start / dt - 1e-3))
+            starts.append(math.ceil(force.start / dt - 1e-3))
     none = np.zeros(0)
     return {
         "push_begin": np.array(begin),
         "push_node": np.concatenate([none, *nodes]).astype(np.int64),
         "push_share": np.concatenate([none, *shares]).astype(np.float32),
-        "push": np.array(forces, np.float32).reshape(-1, 3, LANES),
+        "push": np.array(values, np.float32).reshape(-1, 3, LANES),
         "push_start": np.array(starts, np.int64),
     }
 

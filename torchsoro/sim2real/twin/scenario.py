@@ -14,41 +14,46 @@ from torchsoro.simulation.material import Prony
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Ground:
+class ObliquePlane:
     """A plane that the body does not penetrate.
 
     Attributes:
         normal: Unit normal to the body's side [3].
         offset: Of the plane along it [...] m.
-        friction: Coulomb coefficient [...]; None for no slip under compression.
+        friction: Coulomb coefficient [...]; "stick" for no slip under compression.
         adhesion: Traction towards the plane, which also counts as normal traction for friction [...] Pa.
         reach: Distance up to which adhesion acts [...] m.
     """
 
     normal: Tensor
     offset: Tensor
-    friction: Tensor | None
+    friction: Tensor | str
     adhesion: Tensor
     reach: Tensor
 
+    @property
+    def sticks(self) -> bool:
+        """Whether the plane holds what is pressed on it."""
+        return isinstance(self.friction, str)
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Push:
-    """A dead force.
+class NodalForce:
+    """A dead force on nodes, from a time on.
 
     Attributes:
         share: Of each node [n], sum 1.
-        force: [..., 3] N.
+        value: [..., 3] N.
         start: When it begins [s].
     """
 
     share: Tensor
-    force: Tensor
+    value: Tensor
     start: float
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Tie:
+class NodalSpring:
     """A spring from the mean place of some nodes to where that was in the undeformed body.
 
     Attributes:
@@ -65,7 +70,7 @@ class Scenario:
     """All input of a simulation; leading axes [...] are a batch of variations; float64.
 
     Attributes:
-        stiffness: Young's modulus at each point of the body [..., P] Pa.
+        youngs_modulus: Young's modulus at each point of the body [..., P] Pa.
         poisson_ratio: [...].
         density: At each point [..., P] kg/m3.
         prony: Maxwell elements.
@@ -76,17 +81,17 @@ class Scenario:
         gravity: [..., 3] m/s2.
         displacement: Of the nodes at the start [..., n, 3] m.
         velocity: The same [..., n, 3] m/s.
-        mass: Attached to nodes [..., n] kg.
+        point_mass: Attached to nodes [..., n] kg.
         drag: Of nodes [..., n] N s/m.
-        fluid: Density of what surrounds the body times its drag coefficient [...] kg/m3.
-        grounds: Planes.
-        pushes: Dead forces.
+        quadratic_drag: Density of what surrounds the body times its drag coefficient [...] kg/m3.
+        planes: Planes.
+        forces: Dead forces.
         springs: Springs to the ground.
         duration: Of the trial [s].
         until: End of the simulation [s]; after that of the trial where the clock of a recording may be late.
     """
 
-    stiffness: Tensor
+    youngs_modulus: Tensor
     poisson_ratio: Tensor
     density: Tensor
     prony: Prony | None
@@ -97,12 +102,12 @@ class Scenario:
     gravity: Tensor
     displacement: Tensor
     velocity: Tensor
-    mass: Tensor
+    point_mass: Tensor
     drag: Tensor
-    fluid: Tensor
-    grounds: tuple[Ground, ...]
-    pushes: tuple[Push, ...]
-    springs: tuple[Tie, ...]
+    quadratic_drag: Tensor
+    planes: tuple[ObliquePlane, ...]
+    forces: tuple[NodalForce, ...]
+    springs: tuple[NodalSpring, ...]
     duration: float
     until: float
 
@@ -113,11 +118,13 @@ class Scenario:
     @cached_property
     def batch(self) -> int:
         """Number of variations."""
-        ranks = [(self.stiffness, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
-        ranks += [(self.air_stiffness, 1), (self.gravity, 1), (self.mass, 1), (self.drag, 1)]
-        ranks += [(self.softening, 1), (self.fluid, 0), (self.displacement, 2), (self.velocity, 2)]
-        ranks += [(t, 0) for g in self.grounds for t in (g.offset, g.adhesion, g.reach, g.friction) if t is not None]
-        ranks += [(p.force, 1) for p in self.pushes] + [(s.stiffness, 0) for s in self.springs]
+        ranks = [(self.youngs_modulus, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
+        ranks += [(self.air_stiffness, 1), (self.gravity, 1), (self.point_mass, 1), (self.drag, 1)]
+        ranks += [(self.softening, 1), (self.quadratic_drag, 0), (self.displacement, 2), (self.velocity, 2)]
+        ranks += [
+            (t, 0) for g in self.planes for t in (g.offset, g.adhesion, g.reach, g.friction) if isinstance(t, Tensor)
+        ]
+        ranks += [(p.value, 1) for p in self.forces] + [(s.stiffness, 0) for s in self.springs]
         if self.prony is not None:
             ranks.append((self.prony.moduli, 1))
         if self.pressure is not None:

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
-from torchsoro.sim2real.data.schema import Boundary, Box, Load
+from torchsoro.sim2real.data.schema import Box, ForceTable, PlaneTable
 from torchsoro.sim2real.twin.grid import Axis, Grid, divide
-from torchsoro.sim2real.twin.scenario import Ground, Push, Scenario
+from torchsoro.sim2real.twin.scenario import NodalForce, ObliquePlane, Scenario
 from torchsoro.simulation.material import Prony
 
 STEPS = 16  # of equal size, in which a force ramps up
@@ -24,37 +24,37 @@ CELLS = 200_000  # of a grid, with which a simulation takes hours
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class MarkerMotion:
+class MarkerTrajectory:
     """How markers moved; float64.
 
     Attributes:
         time: [S] s, evenly spaced.
-        place: [..., S, M, 3] m.
+        position: [..., S, M, 3] m.
         velocity: [..., S, M, 3] m/s.
         gradient: Deformation gradient at the markers [..., S, M, 3, 3].
         dt: Largest substep [s].
     """
 
     time: np.ndarray
-    place: np.ndarray
+    position: np.ndarray
     velocity: np.ndarray
     gradient: np.ndarray
     dt: float
 
-    def alone(self, number: int = 0) -> MarkerMotion:
+    def alone(self, number: int = 0) -> MarkerTrajectory:
         """One of a batch."""
-        if self.place.ndim == 3:
+        if self.position.ndim == 3:
             return self
         return dataclasses.replace(
-            self, place=self.place[number], velocity=self.velocity[number], gradient=self.gradient[number]
+            self, position=self.position[number], velocity=self.velocity[number], gradient=self.gradient[number]
         )
 
-    def plus(self, other: MarkerMotion, share: float = 1.0) -> MarkerMotion:
+    def plus(self, other: MarkerTrajectory, share: float = 1.0) -> MarkerTrajectory:
         """With a share of another motion [S', M, ...] added, which is constant after its last sample."""
         at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
         return dataclasses.replace(
             self,
-            place=self.place + share * other.place[at],
+            position=self.position + share * other.position[at],
             velocity=self.velocity + share * other.velocity[at],
             gradient=self.gradient + share * other.gradient[at],
         )
@@ -62,7 +62,7 @@ class MarkerMotion:
     @property
     def sound(self) -> np.ndarray:
         """Which of a batch did not diverge, bool [...]."""
-        return np.asarray((np.isfinite(self.place) & (np.abs(self.place) < 1e3)).all((-3, -2, -1)))
+        return np.asarray((np.isfinite(self.position) & (np.abs(self.position) < 1e3)).all((-3, -2, -1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +91,7 @@ class Twin:
         setup, edge, walls, across = self.setup, self.edge, self.walls, self.across
         if not (edge > 0 and walls > 0 and across > 0):
             raise ValueError(f"edge = {edge:g} m, walls = {walls}, across = {across}, wanted positive numbers")
-        cells = math.prod(max(s / edge, across, walls * bool(setup.cavities)) for s in setup.size)
+        cells = math.prod(max(s / edge, across, walls * bool(setup.chambers)) for s in setup.size)
         if not cells <= CELLS:
             raise ValueError(
                 f"edge = {edge:g} m, walls = {walls}: {cells:.2g} cells in a body of "
@@ -109,7 +109,7 @@ class Twin:
         setup, walls, surface, axes = self.setup, self.walls, self.setup.surface, []
         for axis in range(3):
             begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
-            inner = sorted({c.box[side][axis] for c in setup.cavities for side in (0, 1)})
+            inner = sorted({c.box[side][axis] for c in setup.chambers for side in (0, 1)})
             if inner and not begin < inner[0] < inner[-1] < end:
                 raise ValueError(
                     f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
@@ -119,14 +119,14 @@ class Twin:
             near = NEAR * setup.size[axis]
             inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
             breaks = [begin, *inner, end]
-            least = [walls if setup.cavities else 1] * (len(breaks) - 1)
+            least = [walls if setup.chambers else 1] * (len(breaks) - 1)
             # With one cell in every interval, motions quadratic along two axes have no strain at points (hourglassing).
             widest = int(np.diff(breaks).argmax())
-            least[widest] = max(least[widest], 2, 0 if setup.cavities else self.across - len(inner))
+            least[widest] = max(least[widest], 2, 0 if setup.chambers else self.across - len(inner))
             # Double knots at the faces of chambers: two walls that share a node would be coupled across the chamber.
             axes.append(Axis(divide(breaks, least, self.edge), inner))
         x, y, z = axes
-        return Grid((x, y, z), [c.box for c in setup.cavities], None if surface is None else surface.filled)
+        return Grid((x, y, z), [c.box for c in setup.chambers], None if surface is None else surface.filled)
 
     @cached_property
     def held(self) -> np.ndarray:
@@ -197,23 +197,23 @@ class Twin:
         spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.grid.nodes, 3)
         nodes = self.grid.nodes
         return Scenario(
-            stiffness=torch.full((self.count,), s.youngs_modulus, dtype=torch.float64),
+            youngs_modulus=torch.full((self.count,), s.youngs_modulus, dtype=torch.float64),
             poisson_ratio=torch.tensor(s.poisson_ratio, dtype=torch.float64),
             density=torch.full((self.count,), s.density, dtype=torch.float64),
             prony=prony,
             stiffening=torch.zeros(2, dtype=torch.float64),
             softening=torch.tensor([0.0, 1.0], dtype=torch.float64),
-            air_stiffness=torch.tensor([c.air_stiffness for c in s.cavities], dtype=torch.float64),
+            air_stiffness=torch.tensor([c.air_stiffness for c in s.chambers], dtype=torch.float64),
             pressure=trial.pressure,
             gravity=torch.tensor(s.gravity, dtype=torch.float64),
             displacement=torch.zeros(nodes, 3, dtype=torch.float64),
             velocity=torch.tensor(s.velocity, dtype=torch.float64) + torch.cross(spin, self.places - center, dim=-1),
-            mass=torch.zeros(nodes, dtype=torch.float64),
+            point_mass=torch.zeros(nodes, dtype=torch.float64),
             drag=torch.zeros(nodes, dtype=torch.float64),
-            fluid=torch.zeros((), dtype=torch.float64),
-            grounds=tuple(_ground(p) for p in s.planes),
-            pushes=tuple(
-                push for load in s.loads for push in _pushes(load, torch.from_numpy(self.grid.within(load.box)))
+            quadratic_drag=torch.zeros((), dtype=torch.float64),
+            planes=tuple(_plane(p) for p in s.planes),
+            forces=tuple(
+                step for force in s.forces for step in _steps(force, torch.from_numpy(self.grid.within(force.box)))
             ),
             springs=(),
             duration=s.duration,
@@ -221,12 +221,12 @@ class Twin:
         )
 
 
-def _pushes(load: Load, share: Tensor) -> list[Push]:
+def _steps(table: ForceTable, share: Tensor) -> list[NodalForce]:
     """A ramp is a sum of steps; the end of a force is an opposite force that begins then."""
-    force, steps = torch.tensor(load.force, dtype=torch.float64), STEPS if load.ramp > 0 else 1
-    starts = [load.start + load.ramp * (k + 0.5) / steps for k in range(steps)]
-    pushes = [Push(share=share, force=force / steps, start=start) for start in starts]
-    return [*pushes, Push(share=share, force=-force, start=load.end)] if load.end < math.inf else pushes
+    value, steps = torch.tensor(table.force, dtype=torch.float64), STEPS if table.ramp > 0 else 1
+    starts = [table.start + table.ramp * (k + 0.5) / steps for k in range(steps)]
+    forces = [NodalForce(share=share, value=value / steps, start=start) for start in starts]
+    return [*forces, NodalForce(share=share, value=-value, start=table.end)] if table.end < math.inf else forces
 
 
 def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
@@ -245,14 +245,14 @@ def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
     return None
 
 
-def _ground(plane: Boundary) -> Ground:
+def _plane(plane: PlaneTable) -> ObliquePlane:
     normal = torch.tensor(plane.normal, dtype=torch.float64)
     unit = normal / normal.norm()
     zero = torch.zeros((), dtype=torch.float64)
-    return Ground(
+    return ObliquePlane(
         normal=unit,
         offset=unit @ torch.tensor(plane.point, dtype=torch.float64),
-        friction=None if isinstance(plane.friction, str) else zero + plane.friction,
+        friction=plane.friction if isinstance(plane.friction, str) else zero + plane.friction,
         adhesion=zero,
         reach=zero,
     )
