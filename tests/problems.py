@@ -74,7 +74,7 @@ def momenta(body: Body, state: Tensor, cell: float) -> tuple[Tensor, Tensor]:
     if state.ndim == 2:
         lattice = Lattice.around(body.position, cell)
         d, v = state[0, : 6 * lattice.nodes].view(2, 3, -1).transpose(1, 2)
-        m = lattice.to_nodes(lattice.spread(body.mass)).unsqueeze(-1)
+        m = lattice.nodal_mass(lattice.spread(body.mass).unsqueeze(0))[0].unsqueeze(-1)
         return (m * v).sum(0), (m * torch.linalg.cross(lattice.node_places + d, v)).sum(0)
     s = state[0]
     x, v = s[:3].T, s[3:6].T

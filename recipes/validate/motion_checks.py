@@ -219,5 +219,5 @@ def _angular_momentum(state: torch.Tensor) -> torch.Tensor:
 def _nodal_angular_momentum(lattice: Lattice, mass: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
     """About the centre of gravity, of the nodes of the total form."""
     moved, v = state[0, : 6 * lattice.nodes].view(2, 3, -1).transpose(1, 2)
-    x, m = lattice.node_places + moved, lattice.to_nodes(mass).unsqueeze(-1)
+    x, m = lattice.node_places + moved, lattice.nodal_mass(mass.unsqueeze(0))[0].unsqueeze(-1)
     return torch.linalg.cross(x - (m * x).sum(0) / m.sum(), m * v).sum(0)

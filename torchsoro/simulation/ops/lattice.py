@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.inertia import Matching
 
 # Places of a cell's two points per axis: the two of Gauss, for which the pressure of a uniformly deformed chamber does
 # no work inside it; and those of the particles, where motion is recorded.
@@ -176,29 +177,42 @@ class Lattice:
             [B, 5, nodes], differentiable: mass in kg; the way from the node to the surface of the matter that it
             carries, along x, y, z in cells; what drag, taken implicitly, leaves of its velocity in a substep.
         """
-        total = self.to_nodes(mass)
-        there = total > 0
-        safe = torch.where(there, total, torch.ones_like(total))
+        lumped = self.to_nodes(mass)
+        there = lumped > 0
+        safe = torch.where(there, lumped, torch.ones_like(lumped))
         ways = []
         for axis in range(3):
             center = self.to_nodes(mass, along=(axis, "moment")) / safe
             way = torch.sign(center) * torch.relu(center.abs() - _DEPTH - 1e-6)
             ways.append(torch.where(there, way, torch.zeros_like(way)))
         factor = safe / (safe + dt * self.to_nodes(drag))
-        return torch.stack([total, *ways, factor], 1)
+        return torch.stack([self._matching(lumped).matched.to(mass), *ways, factor], 1)
+
+    def _matching(self, lumped: Tensor) -> Matching:
+        """Lumped masses of the nodes [B, nodes], with the body's moments of inertia."""
+        return Matching.of(lumped, self.node_places, torch.full((self.nodes, 3), self.cell**2 / 4))
+
+    def nodal_mass(self, mass: Tensor) -> Tensor:
+        """Masses of the nodes [B, nodes] kg, from those of the points [B, points]: the first of :meth:`nodal`."""
+        return self._matching(self.to_nodes(mass)).matched.to(mass)
+
+    def nodal_mass_adjoint(self, mass: Tensor, bar: Tensor) -> Tensor:
+        """Gradient by the masses of the points, from that by :meth:`nodal_mass`."""
+        return self.to_points(self._matching(self.to_nodes(mass)).adjoint(bar).to(mass))
 
     def nodal_adjoint(self, mass: Tensor, drag: Tensor, dt: float, bar: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients by mass and drag [B, points], from that by :meth:`nodal` [B, 5, nodes]."""
-        total, resistance = self.to_nodes(mass), dt * self.to_nodes(drag)
-        there = total > 0
-        safe = torch.where(there, total, torch.ones_like(total))
+        lumped, resistance = self.to_nodes(mass), dt * self.to_nodes(drag)
+        there = lumped > 0
+        safe = torch.where(there, lumped, torch.ones_like(lumped))
         by_factor = bar[:, 4] / (safe + resistance) ** 2
-        total_bar = bar[:, 0] + torch.where(there, by_factor * resistance, torch.zeros_like(total))
+        total_bar = self._matching(lumped).adjoint(bar[:, 0]).to(mass)
+        total_bar = total_bar + torch.where(there, by_factor * resistance, torch.zeros_like(lumped))
         mass_bar = torch.zeros_like(mass)
         for axis in range(3):
             center = self.to_nodes(mass, along=(axis, "moment")) / safe
             moved = there & (center.abs() > _DEPTH + 1e-6)
-            moment_bar = torch.where(moved, bar[:, 1 + axis] / safe, torch.zeros_like(total))
+            moment_bar = torch.where(moved, bar[:, 1 + axis] / safe, torch.zeros_like(lumped))
             total_bar = total_bar - moment_bar * center
             mass_bar += self.to_points(moment_bar, along=(axis, "moment"))
         return mass_bar + self.to_points(total_bar), -dt * self.to_points(by_factor * safe)

@@ -99,7 +99,7 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     share = weight / weight.sum(-1, keepdim=True)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
-    nodal = lattice.to_nodes(share).unsqueeze(1)
+    nodal = lattice.nodal_mass(share).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
     for c in range(pressure.shape[1]):
         gas, _, _, F = _chamber(d, c, scene)
@@ -125,7 +125,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence
     motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     share = weight / weight.sum(-1, keepdim=True)
-    nodal = lattice.to_nodes(share).unsqueeze(1)
+    nodal = lattice.nodal_mass(share).unsqueeze(1)
     nodal_bar = torch.zeros_like(nodal[:, 0])
     for field, field_bar, at_probes, at_center in zip(
         motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
@@ -133,7 +133,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence
         field_bar += nodal * at_center.unsqueeze(-1)
         nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
         _add_at(field_bar, at, at_probes.transpose(1, 2).unsqueeze(-1) * how)
-    share_bar = lattice.to_points(nodal_bar) + center_bar @ lattice.places.to(state).T
+    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.places.to(state).T
     for c in range(pressure.shape[1]):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
