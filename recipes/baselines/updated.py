@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -63,7 +64,7 @@ def lattice(setup: Setup, cells: int) -> float:
     raise ValueError(f"[body]: size = {setup.size}, wanted edges that a lattice of at most {MOST} particles divides")
 
 
-def body_of(setup: Setup, spacing: float, faces: list[tuple[int, int]], device: str) -> tuple[Domain, Body]:
+def body_of(setup: Setup, spacing: float, faces: Sequence[tuple[int, int]], device: str) -> tuple[Domain, Body]:
     """Particles, also behind clamped faces, and their lattice."""
     before, after = ([float(BEHIND * 2 * ((a, side) in faces)) for a in range(3)] for side in (-1, 1))
     counts = [round(n / spacing + b + c) for n, b, c in zip(setup.size, before, after, strict=True)]
@@ -98,7 +99,7 @@ def force_of(load: ForceTable, x: torch.Tensor, spacing: float, lasts: float) ->
     return Force(particles=on, value=value, time=torch.tensor(time, dtype=torch.float64))
 
 
-def planes_of(setup: Setup, cell: float, faces: list[tuple[int, int]]) -> list[Plane]:
+def planes_of(setup: Setup, cell: float, faces: Sequence[tuple[int, int]]) -> list[Plane]:
     """Ground, walls, and what holds the nodes behind clamped faces.
 
     Raises:

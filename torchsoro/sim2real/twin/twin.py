@@ -140,9 +140,9 @@ class Twin:
         return held
 
     @cached_property
-    def faces(self) -> list[tuple[int, int]]:
+    def faces(self) -> tuple[tuple[int, int], ...]:
         """Axis and side of the faces of the body that clamps cover."""
-        return [f for f in (_face(box, self.setup) for box in self.setup.clamps) if f is not None]
+        return tuple(f for f in (_face(box, self.setup) for box in self.setup.clamps) if f is not None)
 
     @property
     def count(self) -> int:
