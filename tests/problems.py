@@ -190,7 +190,7 @@ def problem(
     }
     lattice = None
     if total:
-        lattice = Lattice(points=particles, low=(5.0, 5.0, 5.0), cell=1.0)
+        lattice = Lattice.uniform(particles, (5.0, 5.0, 5.0), 1.0)
         motion = torch.cat([0.02 * randn(batch, 3 * lattice.nodes), 0.3 * randn(batch, 3 * lattice.nodes)], 1)
         history = 0.1 * randn(batch, 6 * elements, count) * (kind != layout.ABSENT)
         tensors["state"] = torch.cat([motion, history.flatten(1)], 1)

@@ -64,8 +64,8 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
     if _started == kind and threads is None:
         return
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}
-    # On a CPU, code of LLVM's passes alone is as fast; Taichi's take ten times as long on the large adjoint kernels.
-    options["advanced_optimization"] = kind == "cuda"
+    # Code of LLVM's passes alone is as fast; Taichi's take ten times as long on the large adjoint kernels.
+    options["advanced_optimization"] = False
     # Tensors are allocated by torch, so that Taichi needs little memory of its own on the GPU.
     if kind == "cuda":
         options["device_memory_GB"] = 0.3

@@ -9,7 +9,8 @@ from functools import cached_property
 
 import numpy as np
 
-GAUSS = 0.5 / math.sqrt(3.0)
+from torchsoro.simulation.axis import Axis
+
 BODY, OUTSIDE = -1, -2  # kinds of cells that belong to no chamber
 PARTS = 4  # subdivisions of a cell along each axis, by which its filled share is sampled
 LEAST = 0.05  # filled share of a cell, below which the cell is left out
@@ -36,55 +37,6 @@ def divide(breaks: Sequence[float], least: Sequence[int], edge: float) -> np.nda
         width[-1] *= OUTER if i == last else 1.0
         planes += list(low + (high - low) * np.cumsum(width) / width.sum())
     return np.array(planes)
-
-
-class Axis:
-    """Quadratic B-splines along an axis, which end with the body.
-
-    Args:
-        planes: Of the cells [cells + 1] m.
-        creases: Planes where slopes may jump (double knots), so that two walls do not share a node.
-    """
-
-    def __init__(self, planes: np.ndarray, creases: Sequence[float] = ()) -> None:
-        self.planes = planes
-        self.cells = len(planes) - 1
-        twice = np.isin(planes[1:-1], creases)
-        self.nodes = self.cells + 2 + int(twice.sum())
-        self.first = np.arange(self.cells) + np.concatenate([[0], np.cumsum(twice)])
-        """Lowest node of each cell, which has three."""
-        inner = np.repeat(planes[1:-1], 1 + twice)
-        self.knots = np.concatenate([[planes[0]] * 3, inner, [planes[-1]] * 3])
-        self.places = (self.knots[1:-2] + self.knots[2:-1]) / 2
-
-    def cell(self, x: np.ndarray) -> np.ndarray:
-        """Cell of each coordinate; the nearest if it is outside."""
-        return np.clip(np.searchsorted(self.planes, x, side="right") - 1, 0, self.cells - 1)
-
-    def at(self, x: np.ndarray, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Weights [..., 3] of the nodes of a cell, lowest first, and their derivatives [1/m]."""
-        k1, k2, k3, k4 = (self.knots[self.first[cell] + i] for i in range(1, 5))
-        one, two = (k3 - x) / (k3 - k2), (x - k2) / (k3 - k2)
-        first, last = one * (k3 - x) / (k3 - k1), two * (x - k2) / (k4 - k2)
-        down, up = -2 * one / (k3 - k1), 2 * two / (k4 - k2)
-        return np.stack([first, 1 - first - last, last], -1), np.stack([down, -down - up, up], -1)
-
-    @cached_property
-    def points(self) -> np.ndarray:
-        """The two points of each cell [cells, 2] m."""
-        middle, width = (self.planes[1:] + self.planes[:-1]) / 2, np.diff(self.planes)
-        return middle[:, None] + width[:, None] * np.array([-GAUSS, GAUSS])
-
-    @cached_property
-    def table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weights and derivatives at the points of the cells, each [cells, 2, 3]."""
-        return self.at(self.points, np.arange(self.cells)[:, None])
-
-    @cached_property
-    def steep(self) -> float:
-        """The largest sum of N'^2 / N [1/m2] at a point, proportional to the square of the highest frequency."""
-        weight, slope = self.table
-        return float((slope**2 / weight).sum(-1).max())
 
 
 class Grid:

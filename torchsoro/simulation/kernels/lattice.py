@@ -1,54 +1,69 @@
 """Sums over the fixed stencil of the total-Lagrangian lattice: from nodes to points, and from points to nodes.
 
 A cell has 2 x 2 x 2 points and touches 3 x 3 x 3 nodes, its own lowest and two more along each axis, with the weights
-of a quadratic B-spline that is a polynomial within the cell. Every sum is taken by whoever needs it, in a fixed order,
-so that nothing is added by two threads at once. Points to nodes goes axis by axis: over lines along z, over the sheets
-of such lines along y, and along x to the node.
+of a quadratic B-spline that is a polynomial within the cell. The cells are dealt out in tiles of 256 points. A block of
+threads on a GPU, or a loop on a CPU, takes a tile at a time: it copies the tile's nodes to a ``pad`` of its own, finds
+what each point hands to the nodes, and sums that within the pad, axis by axis: over lines along z, over the sheets of
+such lines along y, and along x to the nodes. Each node then adds up the shares of the tiles that it belongs to. Every
+sum is taken in a fixed order, and nothing is added by two threads at once.
 
-``ints`` and ``fixed`` are the buffers of ``layout``; ``n`` is (nx, ny, nz), points per axis.
+``head`` is the beginning of ``ints``, which a block keeps at hand; ``ints`` and ``fixed`` are the buffers of
+``layout``. On a GPU the pad is the block's shared memory and begins at 0, on a CPU a part of a buffer. What the threads
+of a block do is written as a loop over those from ``q0`` to ``q1``: one on a GPU, all on a CPU.
 """
 
 import taichi as ti
 
 from torchsoro.simulation.kernels.layout import (
-    AREA,
-    AREA_LINES,
-    AREA_SHEETS,
-    BATCH,
-    BUNDLE,
-    CHAMBER_GROUPS,
-    CHAMBER_PARTS,
+    ARRIVED,
+    AXES,
+    AXIS,
+    CHAMBER_START,
     CHAMBERS,
-    FILLED,
-    GROUP_SUM,
-    LINE,
-    LINE_SUM,
-    NEAR_LINES,
-    NEAR_SHEETS,
+    FIRSTS,
+    MX,
+    MY,
+    MZ,
     NX,
     NY,
     NZ,
-    PART_SUM,
-    POINT_CORNER,
-    POINT_SUM,
-    SHEET,
-    SHEET_SUM,
-    SLOPE,
+    PAD_LINES,
+    PAD_NODES,
+    PASSED,
+    SHARED,
+    SLOT,
     SWEPT,
-    WEIGHT,
+    TILE,
+    TILE_CELLS,
+    TILE_LINES,
+    TILE_NODES,
+    TILE_SHEETS,
+    TILE_Y,
+    TILE_Z,
+    TILES,
+    TX,
+    TY,
+    TZ,
 )
 
+# Points of a tile along x, y, z.
+WIDE, DEEP, HIGH = (2 * n for n in TILE_CELLS)
+# Where parts of a chamber's sum lie in the pad: after the bundles that go with slopes; likewise of one over tiles.
+ALONE = 9 * TILE
+PARTS = 16
+TOTALS = TILE + PARTS
+
 
 @ti.func
-def points_per_axis(ints: ti.template()):
+def points_per_axis(head: ti.template()):
     """(nx, ny, nz)."""
-    return ti.Vector([ints[NX], ints[NY], ints[NZ]])
+    return ti.Vector([head[NX], head[NY], head[NZ]])
 
 
 @ti.func
-def nodes_per_axis(n):
+def nodes_per_axis(head: ti.template()):
     """Nodes along x, y, z."""
-    return ti.Vector([n[0] // 2 + 2, n[1] // 2 + 2, n[2] // 2 + 2])
+    return ti.Vector([head[MX], head[MY], head[MZ]])
 
 
 @ti.func
@@ -58,222 +73,369 @@ def product(v):
 
 
 @ti.func
-def line_count(n):
-    """Sums along z."""
-    return n[0] * n[1] * (n[2] // 2 + 2)
+def axis_starts(head: ti.template()):
+    """Where the numbers of the axes begin."""
+    y = AXES + (AXIS + 1) * head[NX] + head[MX]
+    return ti.Vector([AXES, y, y + (AXIS + 1) * head[NY] + head[MY]])
 
 
 @ti.func
-def sheet_count(n):
-    """Sums along z and y."""
-    return n[0] * (n[1] // 2 + 2) * (n[2] // 2 + 2)
+def node_place(head: ti.template(), fixed: ti.template(), axis, index):
+    """Reference coordinate of the nodes with an index along an axis."""
+    starts = axis_starts(head)
+    at, n = starts[0], head[NX]
+    if axis == 1:
+        at, n = starts[1], head[NY]
+    elif axis == 2:
+        at, n = starts[2], head[NZ]
+    return fixed[at + (AXIS + 1) * n + index]
 
 
 @ti.func
-def corner_of(ints: ti.template(), at, p):
-    """Lowest node of the cell of point p in a field at ``at``, and where the weights of this point begin along x, y, z.
-
-    Both are looked up: divisions are slow.
-    """
-    code = ints[ints[POINT_CORNER] + p]
-    return at + code // 8, 3 * (code // 4 % 2), 3 * (code // 2 % 2), 3 * (code % 2)
+def particle_place(head: ti.template(), fixed: ti.template(), p):
+    """Reference place of the particle of point p."""
+    starts, n = axis_starts(head), points_per_axis(head)
+    x = fixed[starts[0] + AXIS * n[0] + p // (n[1] * n[2])]
+    y = fixed[starts[1] + AXIS * n[1] + (p // n[2]) % n[1]]
+    z = fixed[starts[2] + AXIS * n[2] + p % n[2]]
+    return ti.Vector([x, y, z])
 
 
 @ti.func
-def gather_gradient(ints: ti.template(), fixed: ti.template(), a: ti.template(), at, p, n):
-    """Gradient of a nodal vector field by the reference place at point p; component c of node i is at + c I + i."""
-    m = nodes_per_axis(n)
+def gather_value(head: ti.template(), ints: ti.template(), fixed: ti.template(), a: ti.template(), at, p):
+    """A nodal vector field, component c of node i at ``at + c I + i``, at point p."""
+    n, m, starts = points_per_axis(head), nodes_per_axis(head), axis_starts(head)
     nodes = product(m)
-    corner, ox, oy, oz = corner_of(ints, at, p)
-    w = ti.Vector([fixed[WEIGHT + oz + k] for k in ti.static(range(3))])
-    s = ti.Vector([fixed[SLOPE + oz + k] for k in ti.static(range(3))])
-    zero = w[0] * 0
-    G = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
-    for i in range(3):
-        wx, sx = fixed[WEIGHT + ox + i], fixed[SLOPE + ox + i]
-        for j in ti.static(range(3)):
-            wy, sy = fixed[WEIGHT + oy + j], fixed[SLOPE + oy + j]
-            line = corner + (i * m[1] + j) * m[2]
-            for c in ti.static(range(3)):
-                a0, a1, a2 = a[line + c * nodes], a[line + c * nodes + 1], a[line + c * nodes + 2]
-                value = w[0] * a0 + w[1] * a1 + w[2] * a2
-                G[c, 0] += sx * wy * value
-                G[c, 1] += wx * sy * value
-                G[c, 2] += wx * wy * (s[0] * a0 + s[1] * a1 + s[2] * a2)
-    return G
-
-
-@ti.func
-def gather_value(ints: ti.template(), fixed: ti.template(), a: ti.template(), at, p, n):
-    """A nodal vector field at point p."""
-    m = nodes_per_axis(n)
-    nodes = product(m)
-    corner, ox, oy, oz = corner_of(ints, at, p)
-    zero = fixed[WEIGHT] * 0
+    x, y, z = p // (n[1] * n[2]), (p // n[2]) % n[1], p % n[2]
+    firsts = head[FIRSTS]
+    i0, j0 = ints[firsts + x // 2], ints[firsts + (n[0] + y) // 2]
+    k0 = ints[firsts + (n[0] + n[1] + z) // 2]
+    zero = fixed[AXES] * 0
     u = ti.Vector([zero, zero, zero])
     for i in range(3):
         for j in range(3):
-            line = corner + (i * m[1] + j) * m[2]
+            line = at + ((i0 + i) * m[1] + j0 + j) * m[2] + k0
+            flat = fixed[starts[0] + AXIS * x + i] * fixed[starts[1] + AXIS * y + j]
             for k in range(3):
-                weight = fixed[WEIGHT + ox + i] * fixed[WEIGHT + oy + j] * fixed[WEIGHT + oz + k]
+                weight = flat * fixed[starts[2] + AXIS * z + k]
                 for c in ti.static(range(3)):
                     u[c] += weight * a[line + c * nodes + k]
     return u
 
 
+# ----------------------------------------------------------------------------------------------------- blocks and tiles
+
+
 @ti.func
-def neighbour_cell(fixed: ti.template(), node, k, odd, points):
-    """The point, along an axis, ``odd`` of the k-th cell back from a node; its weight and slope, 0 outside the body."""
+def sync(gpu: ti.template()):
+    """Wait for the other threads of the block."""
+    if ti.static(gpu):
+        ti.simt.block.sync()
+
+
+@ti.func
+def meet(ints: ti.template(), blocks, q):
+    """Wait for the other blocks, all of which must run at the same time."""
+    ti.simt.block.sync()
+    if q == 0:
+        ti.simt.grid.memfence()
+        passed = ti.atomic_max(ints[PASSED], 0)  # as loads may come from a cache
+        if ti.atomic_add(ints[ARRIVED], 1) == blocks - 1:
+            ints[ARRIVED] = 0
+            ti.simt.grid.memfence()
+            ti.atomic_add(ints[PASSED], 1)
+        else:
+            while ti.atomic_max(ints[PASSED], 0) == passed:
+                pass
+        ti.simt.grid.memfence()
+    ti.simt.block.sync()
+
+
+@ti.func
+def tile_count(head: ti.template()):
+    """Tiles of a simulation."""
+    return head[TX] * head[TY] * head[TZ]
+
+
+@ti.func
+def node_chunks(head: ti.template()):
+    """Blocks of threads that the nodes of a simulation take."""
+    return (product(nodes_per_axis(head)) + TILE - 1) // TILE
+
+
+@ti.func
+def chamber_slots(head: ti.template(), ints: ti.template()):
+    """Pairs of a tile and a chamber that has points in it, of a simulation."""
+    return ints[head[CHAMBER_START] + head[CHAMBERS]]
+
+
+@ti.func
+def tile_box(head: ti.template(), ints: ti.template(), tile):
+    """The lowest cell of a tile, its cells along x, y, z, and its lowest node."""
+    x, y, z = tile // (head[TY] * head[TZ]), (tile // head[TZ]) % head[TY], tile % head[TZ]
+    ax, ay, az = (
+        head[TILES] + 3 * x,
+        head[TILES] + 3 * (head[TX] + y),
+        head[TILES] + 3 * (head[TX] + head[TY] + z),
+    )
+    cell = ti.Vector([ints[ax], ints[ay], ints[az]])
+    cells = ti.Vector([ints[ax + 1], ints[ay + 1], ints[az + 1]])
+    return cell, cells, ti.Vector([ints[ax + 2], ints[ay + 2], ints[az + 2]])
+
+
+@ti.func
+def point_place(cell, q):
+    """Number, along each axis, of the tile's point q."""
+    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
+    return ti.Vector([2 * cell[0] + x, 2 * cell[1] + y, 2 * cell[2] + z])
+
+
+@ti.func
+def point_of(head: ti.template(), cell, cells, q):
+    """The point that thread q works on; -1 if the tile has fewer."""
+    at = point_place(cell, q) - 2 * cell
+    p = ti.cast(-1, ti.i32)
+    if at[0] < 2 * cells[0] and at[1] < 2 * cells[1] and at[2] < 2 * cells[2]:
+        p = ((2 * cell[0] + at[0]) * head[NY] + 2 * cell[1] + at[1]) * head[NZ] + 2 * cell[2] + at[2]
+    return p
+
+
+@ti.func
+def stage(head: ti.template(), a: ti.template(), at, pad: ti.template(), base, number: ti.template(), node, q0, q1):
+    """Copy a vector field at the nodes of a tile to the pad, as its field of that number."""
+    m = nodes_per_axis(head)
+    nodes = product(m)
+    for q in range(q0, q1):
+        for part in ti.static(range((SLOT + TILE - 1) // TILE)):
+            one = q + part * TILE
+            if one < SLOT:
+                c, i = one // TILE_NODES, one % TILE_NODES
+                # A tile with fewer cells than usual reads some nodes in vain.
+                x = ti.min(node[0] + i // ti.static(TILE_Y * TILE_Z), m[0] - 1)
+                y = ti.min(node[1] + i // TILE_Z % TILE_Y, m[1] - 1)
+                z = ti.min(node[2] + i % TILE_Z, m[2] - 1)
+                pad[base + PAD_NODES + number * SLOT + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
+
+
+@ti.func
+def tile_gradient(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, number: ti.template(), cell, q):
+    """Gradient of a staged field by the reference place at the tile's point q."""
+    at, starts = point_place(cell, q), axis_starts(head)
+    fx, fy, fz = starts[0] + AXIS * at[0], starts[1] + AXIS * at[1], starts[2] + AXIS * at[2]
+    i0, j0, k0 = (at[0] // 2 - cell[0]), (at[1] // 2 - cell[1]), (at[2] // 2 - cell[2])
+    corner = base + PAD_NODES + number * SLOT + (i0 * TILE_Y + j0) * TILE_Z + k0
+    wy = ti.Vector([fixed[fy + k] for k in ti.static(range(3))])
+    sy = ti.Vector([fixed[fy + 3 + k] for k in ti.static(range(3))])
+    w = ti.Vector([fixed[fz + k] for k in ti.static(range(3))])
+    s = ti.Vector([fixed[fz + 3 + k] for k in ti.static(range(3))])
+    zero = w[0] * 0
+    G = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    for i in range(3):
+        wx, sx = fixed[fx + i], fixed[fx + 3 + i]
+        for j in ti.static(range(3)):
+            line = corner + (i * TILE_Y + j) * TILE_Z
+            for c in ti.static(range(3)):
+                place = line + c * TILE_NODES
+                a0, a1, a2 = pad[place], pad[place + 1], pad[place + 2]
+                value = w[0] * a0 + w[1] * a1 + w[2] * a2
+                G[c, 0] += sx * wy[j] * value
+                G[c, 1] += wx * sy[j] * value
+                G[c, 2] += wx * wy[j] * (s[0] * a0 + s[1] * a1 + s[2] * a2)
+    return G
+
+
+@ti.func
+def tile_value(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, number: ti.template(), cell, q):
+    """A staged field at the tile's point q."""
+    at, starts = point_place(cell, q), axis_starts(head)
+    fx, fy, fz = starts[0] + AXIS * at[0], starts[1] + AXIS * at[1], starts[2] + AXIS * at[2]
+    i0, j0, k0 = (at[0] // 2 - cell[0]), (at[1] // 2 - cell[1]), (at[2] // 2 - cell[2])
+    corner = base + PAD_NODES + number * SLOT + (i0 * TILE_Y + j0) * TILE_Z + k0
+    zero = fixed[fx] * 0
+    u = ti.Vector([zero, zero, zero])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                weight = fixed[fx + i] * fixed[fy + j] * fixed[fz + k]
+                for c in ti.static(range(3)):
+                    u[c] += weight * pad[corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
+    return u
+
+
+@ti.func
+def hand_over(pad: ti.template(), base, q, m):
+    """Write the tensor that the tile's point q hands to the nodes."""
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        pad[base + (3 * i + j) * TILE + q] = m[i, j]
+
+
+@ti.func
+def hand_over_vector(pad: ti.template(), base, q, v):
+    """Write the vector that goes with it."""
+    for i in ti.static(range(3)):
+        pad[base + (9 + i) * TILE + q] = v[i]
+
+
+@ti.func
+def neighbour_point(fixed: ti.template(), start, first, count, node, k, odd):
+    """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope."""
     cell = node - k
-    inside = cell >= 0 and 2 * cell < points
-    w, s = fixed[WEIGHT + 3 * odd + k], fixed[SLOPE + 3 * odd + k]
-    # Outside, a point that is there is read for nothing, so that loads need not wait for branches.
+    inside = cell >= 0 and cell < count
+    # Elsewhere, a point that is there is read for nothing, so that loads need not wait for branches.
     p = ti.select(inside, 2 * cell + odd, 0)
+    at = start + AXIS * (2 * first + p) + k
+    w, s = fixed[at], fixed[at + 3]
     return p, ti.select(inside, w, w * 0), ti.select(inside, s, s * 0)
 
 
 @ti.func
-def sum_line(
-    fixed: ti.template(), a: ti.template(), points_at, out: ti.template(), lines_at, line, n, vectors: ti.template()
+def sum_tile(
+    gpu: ti.template(),
+    vectors: ti.template(),
+    head: ti.template(),
+    fixed: ti.template(),
+    pad: ti.template(),
+    base,
+    with_vector,
+    cell,
+    cells,
+    out: ti.template(),
+    out_at,
+    alone: ti.template(),
+    alone_at,
+    q0,
+    q1,
 ):
-    """Sum what the points with the same x and y hand to one node along z: tensors, and vectors if there are any."""
-    nodes_z = n[2] // 2 + 2
-    iz = line % nodes_z
-    column = points_at + line // nodes_z * n[2]
-    points = product(n)
-    zero = fixed[WEIGHT] * 0
-    along_x = ti.Vector([zero, zero, zero])
-    along_y = ti.Vector([zero, zero, zero])
-    along_z = ti.Vector([zero, zero, zero])
-    for k in range(3):
-        for odd in ti.static(range(2)):
-            pz, w, s = neighbour_cell(fixed, iz, k, odd, n[2])
-            for c in ti.static(range(3)):
-                along_x[c] += w * a[column + pz + (3 * c) * points]
-                along_y[c] += w * a[column + pz + (3 * c + 1) * points]
-                along_z[c] += s * a[column + pz + (3 * c + 2) * points]
-                if ti.static(vectors):
-                    along_z[c] += w * a[column + pz + (9 + c) * points]
-    count = line_count(n)
-    for c in ti.static(range(3)):
-        out[lines_at + c * count + line] = along_x[c]
-        out[lines_at + (3 + c) * count + line] = along_y[c]
-        out[lines_at + (6 + c) * count + line] = along_z[c]
+    """Sum what the points of a tile hand to its nodes: tensors, and vectors too if ``with_vector``.
 
-
-@ti.func
-def sum_sheet(fixed: ti.template(), a: ti.template(), lines_at, sheets_at, sheet, n):
-    """Sum the lines with the same x and z that one node along y needs."""
-    m = nodes_per_axis(n)
-    iz, iy, px = sheet % m[2], sheet // m[2] % m[1], sheet // (m[1] * m[2])
-    count, lines = sheet_count(n), line_count(n)
-    zero = fixed[WEIGHT] * 0
-    slope = ti.Vector([zero, zero, zero])
-    flat = ti.Vector([zero, zero, zero])
-    for j in range(3):
-        for odd in ti.static(range(2)):
-            py, w, s = neighbour_cell(fixed, iy, j, odd, n[1])
-            at = lines_at + (px * n[1] + py) * m[2] + iz
-            for c in ti.static(range(3)):
-                slope[c] += w * a[at + c * lines]
-                flat[c] += s * a[at + (3 + c) * lines] + w * a[at + (6 + c) * lines]
-    for c in ti.static(range(3)):
-        a[sheets_at + c * count + sheet] = slope[c]
-        a[sheets_at + (3 + c) * count + sheet] = flat[c]
-
-
-@ti.func
-def sum_node(fixed: ti.template(), a: ti.template(), sheets_at, i, n):
-    """Sum the sheets around node i: sum_p bundle_p (grad N_i, N_i)."""
-    m = nodes_per_axis(n)
-    layer = m[1] * m[2]
-    ix, rest = i // layer, i % layer
-    count = sheet_count(n)
-    zero = fixed[WEIGHT] * 0
-    total = ti.Vector([zero, zero, zero])
-    for k in ti.static(range(3)):
-        for odd in ti.static(range(2)):
-            px, w, s = neighbour_cell(fixed, ix, k, odd, n[0])
-            at = sheets_at + px * layer + rest
-            for c in ti.static(range(3)):
-                total[c] += s * a[at + c * count] + w * a[at + (3 + c) * count]
-    return total
-
-
-@ti.func
-def line_tasks(ints: ti.template(), n):
-    """Threads of :func:`sum_lines`."""
-    return ints[BATCH] * ((1 + ints[CHAMBERS]) * line_count(n) + CHAMBER_PARTS * ints[CHAMBERS])
-
-
-@ti.func
-def sum_lines(ints: ti.template(), fixed: ti.template(), scratch: ti.template(), w, n, vectors: ti.template()):
-    """What thread w of the pass over lines does: a line, a line of a chamber's area, or a part of a chamber's sum.
-
-    What the points of each chamber hand on is summed apart, since the pressure is not known before their volume is.
+    Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone_at``
+    is negative.
     """
-    points, count, chambers = product(n), line_count(n), ints[CHAMBERS]
-    each = (1 + chambers) * count + CHAMBER_PARTS * chambers
-    b, task = w // each, w % each
-    if task < count:
-        points_at, lines_at = ints[POINT_SUM] + b * BUNDLE * points, ints[LINE_SUM] + b * LINE * count
-        sum_line(fixed, scratch, points_at, scratch, lines_at, task, n, vectors)
-    elif task < (1 + chambers) * count:
-        k, line = task // count - 1, task % count
-        if ints[ints[NEAR_LINES] + k * count + line] == 1:
-            one = b * chambers + k
-            points_at, lines_at = ints[AREA] + one * BUNDLE * points, ints[AREA_LINES] + one * LINE * count
-            sum_line(fixed, scratch, points_at, scratch, lines_at, line, n, False)
-    else:
-        part = task - (1 + chambers) * count
-        k = part // CHAMBER_PARTS
-        first, last = ints[ints[FILLED] + k], ints[ints[FILLED] + k + 1]
-        share = (last - first + CHAMBER_PARTS - 1) // CHAMBER_PARTS
-        first += part % CHAMBER_PARTS * share
-        swept = ints[SWEPT] + b * ints[ints[FILLED] + chambers]
-        total = fixed[WEIGHT] * 0
-        for m in range(first, ti.min(last, first + share)):
-            total += scratch[swept + m]
-        scratch[ints[PART_SUM] + b * chambers * CHAMBER_PARTS + part] = total
+    starts = axis_starts(head)
+    for q in range(q0, q1):
+        if q < TILE_LINES:
+            node, column = q % TILE_Z, base + q // TILE_Z * HIGH
+            zero = fixed[AXES] * 0
+            along_x = ti.Vector([zero, zero, zero])
+            along_y = ti.Vector([zero, zero, zero])
+            along_z = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(fixed, starts[2], cell[2], cells[2], node, k, odd)
+                    for c in ti.static(range(3)):
+                        along_x[c] += w * pad[column + p + (3 * c) * TILE]
+                        along_y[c] += w * pad[column + p + (3 * c + 1) * TILE]
+                        along_z[c] += s * pad[column + p + (3 * c + 2) * TILE]
+                    if ti.static(vectors):
+                        if with_vector == 1:
+                            for c in ti.static(range(3)):
+                                along_z[c] += w * pad[column + p + (9 + c) * TILE]
+            for c in ti.static(range(3)):
+                pad[base + PAD_LINES + c * TILE_LINES + q] = along_x[c]
+                pad[base + PAD_LINES + (3 + c) * TILE_LINES + q] = along_y[c]
+                pad[base + PAD_LINES + (6 + c) * TILE_LINES + q] = along_z[c]
+        elif with_vector == 0 and alone_at >= 0:
+            one = q - TILE_LINES
+            total = pad[base + ALONE + 4 * one]
+            for m in ti.static(range(1, 4)):
+                total += pad[base + ALONE + 4 * one + m]
+            pad[base + ALONE + TILE + one] = total
+    sync(gpu)
+    for q in range(q0, q1):
+        if q < TILE_SHEETS:
+            iz, iy, px = q % TILE_Z, q // TILE_Z % TILE_Y, q // ti.static(TILE_Y * TILE_Z)
+            zero = fixed[AXES] * 0
+            slope = ti.Vector([zero, zero, zero])
+            flat = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(fixed, starts[1], cell[1], cells[1], iy, k, odd)
+                    at = base + PAD_LINES + (px * DEEP + p) * TILE_Z + iz
+                    for c in ti.static(range(3)):
+                        slope[c] += w * pad[at + c * TILE_LINES]
+                        flat[c] += s * pad[at + (3 + c) * TILE_LINES] + w * pad[at + (6 + c) * TILE_LINES]
+            for c in ti.static(range(3)):
+                pad[base + c * TILE_SHEETS + q] = slope[c]
+                pad[base + (3 + c) * TILE_SHEETS + q] = flat[c]
+        elif q < TILE_SHEETS + 8 and with_vector == 0 and alone_at >= 0:
+            one = q - TILE_SHEETS
+            total = pad[base + ALONE + TILE + 8 * one]
+            for m in ti.static(range(1, 8)):
+                total += pad[base + ALONE + TILE + 8 * one + m]
+            pad[base + ALONE + 2 * TILE + one] = total
+    sync(gpu)
+    for q in range(q0, q1):
+        if q < TILE_NODES:
+            rest, ix = q % ti.static(TILE_Y * TILE_Z), q // ti.static(TILE_Y * TILE_Z)
+            zero = fixed[AXES] * 0
+            total = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(fixed, starts[0], cell[0], cells[0], ix, k, odd)
+                    at = base + p * ti.static(TILE_Y * TILE_Z) + rest
+                    for c in ti.static(range(3)):
+                        total[c] += s * pad[at + c * TILE_SHEETS] + w * pad[at + (3 + c) * TILE_SHEETS]
+            for c in ti.static(range(3)):
+                out[out_at + c * TILE_NODES + q] = total[c]
+        elif q == TILE_NODES and with_vector == 0 and alone_at >= 0:
+            total = pad[base + ALONE + 2 * TILE]
+            for m in ti.static(range(1, 8)):
+                total += pad[base + ALONE + 2 * TILE + m]
+            alone[alone_at] = total
+    sync(gpu)
 
 
 @ti.func
-def sheet_tasks(ints: ti.template(), n):
-    """Threads of :func:`sum_sheets`."""
-    return ints[BATCH] * ((1 + ints[CHAMBERS]) * sheet_count(n) + CHAMBER_GROUPS * ints[CHAMBERS])
-
-
-@ti.func
-def sum_sheets(ints: ti.template(), fixed: ti.template(), scratch: ti.template(), w, n):
-    """What thread w of the pass over sheets does: a sheet, one of a chamber's area, or a group of parts."""
-    count, lines, chambers = sheet_count(n), line_count(n), ints[CHAMBERS]
-    each = (1 + chambers) * count + CHAMBER_GROUPS * chambers
-    b, task = w // each, w % each
-    if task < count:
-        lines_at, sheets_at = ints[LINE_SUM] + b * LINE * lines, ints[SHEET_SUM] + b * SHEET * count
-        sum_sheet(fixed, scratch, lines_at, sheets_at, task, n)
-    elif task < (1 + chambers) * count:
-        k, sheet = task // count - 1, task % count
-        if ints[ints[NEAR_SHEETS] + k * count + sheet] == 1:
-            one = b * chambers + k
-            lines_at, sheets_at = ints[AREA_LINES] + one * LINE * lines, ints[AREA_SHEETS] + one * SHEET * count
-            sum_sheet(fixed, scratch, lines_at, sheets_at, sheet, n)
-    else:
-        group = b * chambers * CHAMBER_GROUPS + task - (1 + chambers) * count
-        parts = ti.static(CHAMBER_PARTS // CHAMBER_GROUPS)
-        scratch[ints[GROUP_SUM] + group] = sum_row(scratch, ints[PART_SUM] + group * parts, parts)
-
-
-@ti.func
-def sum_row(a: ti.template(), at, length: ti.template()):
-    """Sum of a few numbers in a row."""
-    total = a[at]
-    for m in ti.static(range(1, length)):
-        total += a[at + m]
+def sum_tiles(fixed: ti.template(), ints: ti.template(), a: ti.template(), at, sources, i, nodes):
+    """Sum at node i the shares of tiles; ``sources`` is where the table begins that says where these lie."""
+    zero = fixed[AXES] * 0
+    total = ti.Vector([zero, zero, zero])
+    for n in ti.static(range(SHARED)):
+        source = ints[sources + n * nodes + i]
+        place = at + ti.max(source, 0)
+        for c in ti.static(range(3)):
+            share = a[place + c * TILE_NODES]
+            total[c] += ti.select(source >= 0, share, zero)
     return total
 
 
 @ti.func
-def sum_chamber(ints: ti.template(), scratch: ti.template(), one):
-    """A sum over chamber number ``one`` (of all simulations)."""
-    return sum_row(scratch, ints[GROUP_SUM] + one * CHAMBER_GROUPS, CHAMBER_GROUPS)
+def sum_chambers(
+    gpu: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    scratch: ti.template(),
+    pad: ti.template(),
+    base,
+    b,
+    q0,
+    q1,
+):
+    """Sum what the tiles of each chamber of simulation b hand over alone: at TOTALS of the pad, number by number."""
+    chambers, start = head[CHAMBERS], head[CHAMBER_START]
+    for k in range(chambers):
+        first, last = ints[start + k], ints[start + k + 1]
+        swept = head[SWEPT] + b * ints[start + chambers]
+        for q in range(q0, q1):
+            total = fixed[AXES] * 0
+            one = first + q
+            while one < last:
+                total += scratch[swept + one]
+                one += TILE
+            pad[base + q] = total
+        sync(gpu)
+        for q in range(q0, q1):
+            if q < PARTS:
+                total = pad[base + q]
+                for m in ti.static(range(1, TILE // PARTS)):
+                    total += pad[base + m * PARTS + q]
+                pad[base + TILE + q] = total
+        sync(gpu)
+        for q in range(q0, q1):
+            if q == 0:
+                total = pad[base + TILE]
+                for m in ti.static(range(1, PARTS)):
+                    total += pad[base + TILE + m]
+                pad[base + TOTALS + k] = total
+        sync(gpu)

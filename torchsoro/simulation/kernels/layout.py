@@ -51,6 +51,9 @@ NODE_NEW = 6
 ADJOINT_MOVED, ADJOINT_FLIP = 0, 3
 ADJOINT_NEW = 6
 
+# The clock of the updated form: substep, and whether the last pass did anything.
+NOW, ACTIVE = 0, 2
+
 # What a substep flags; the march then repeats the chunk step by step to say where.
 FLAG_LEFT_BOX, FLAG_COLLAPSED = 0, 1
 
@@ -64,45 +67,59 @@ def lattice_components(nodes: int, points: int, elements: int) -> int:
     return 6 * nodes + 6 * elements * points
 
 
-# Its kernels take few buffers, since each costs a microsecond a launch on a GPU. The integers begin with the clock
-# (substep, where to stop, whether the last pass did anything, first substep at which a solid collapsed), sizes, and
-# where each quantity begins in its buffer.
-NOW, STOP, ACTIVE, COLLAPSED = 0, 1, 2, 3
+# Its kernels take few buffers. The integers begin with what a launch changes (first substep at which a solid collapsed;
+# blocks that have arrived at a barrier, and how often all have), sizes, and where each quantity begins in its buffer.
+COLLAPSED, ARRIVED, PASSED = 0, 1, 2
 SIZES = (
-    *("batch", "nx", "ny", "nz", "elements", "chambers", "groups", "springs", "viscous", "planes"),
-    *("ring", "kept_ring", "steps", "want_prony", "tallies"),
+    *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
+    *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks"),
 )
-BATCH, NX, NY, NZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS, VISCOUS, PLANES = range(4, 14)
-RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES = range(14, 19)
+BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(3, 17)
+VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS = range(17, 26)
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
 # kept of every substep beside the states; what points and nodes hand each other, forward and (from FORCES) backward;
 # sums of gradients.
 BUFFERS = {
-    "integers": ("kind", "plane_kind", "corner", "rank", "filled", "near_lines", "near_sheets", "near_nodes"),
+    "integers": (
+        *("kind", "plane_kind", "firsts", "tiles", "chamber_start", "slot_start", "slot_chamber", "sources"),
+        "near_nodes",
+    ),
     "fixed": ("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share"),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed"),
-    "scratch": ("points", "lines", "sheets", "area", "area_lines", "area_sheets", "swept", "parts", "groups"),
-    "backward": ("forces", "surfaces", "rates", "rate_lines", "rate_sheets", "volume_bar", "jacobians"),
+    "scratch": ("partials", "swept", "pads"),
+    "backward": ("forces", "surfaces", "volume_bar", "jacobians"),
     "sums": tuple(
         f"{name}_bar"
         for name in ("coefficients", "prony", "pressure", "gravity", "force", "plane_numbers", "nodal", "chamber")
     ),
 }
-KIND, PLANE_KIND, POINT_CORNER, RANK, FILLED, NEAR_LINES, NEAR_SHEETS, NEAR_NODES = range(19, 27)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE = range(27, 34)
-PRESSURE, GRAVITY, FORCE = range(34, 37)
-VOLUMES, PUSHED = range(37, 39)
-POINT_SUM, LINE_SUM, SHEET_SUM, AREA, AREA_LINES, AREA_SHEETS, SWEPT, PART_SUM, GROUP_SUM = range(39, 48)
-FORCES, SURFACES, RATES, RATE_LINES, RATE_SHEETS, VOLUME_BAR, JACOBIANS = range(48, 55)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(55, 63)
-HEAD = 63
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(26, 35)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE = range(35, 42)
+PRESSURE, GRAVITY, FORCE = range(42, 45)
+VOLUMES, PUSHED = range(45, 47)
+PARTIALS, SWEPT, PADS = range(47, 50)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(50, 54)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(54, 62)
+HEAD = 62
 
-# Numbers of the lattice: substep, cell, lower corner of the body; the weights of the three nodes per axis for the
-# first and the second point of a cell, and their slopes by the reference place.
-STEP_SIZE, EDGE, CORNER, WEIGHT, SLOPE = 0, 1, 2, 5, 11
-LATTICE_NUMBERS = 17
+# Numbers of the lattice: substep, edge of a cell; then the axes one after the other: for each point the weights of its
+# three nodes and their slopes by the reference place; places of the particles; places of the nodes.
+STEP_SIZE, EDGE, AXES = 0, 1, 2
+AXIS = 6
+
+# A tile is a box of cells whose points a block of threads works on, one each; its nodes are two more along each axis
+# than its cells, as it ends at creases. A node belongs to two tiles along each axis at most.
+TILE_CELLS = (2, 4, 4)
+TILE = 256  # points of a tile
+TILE_X, TILE_Y, TILE_Z = (n + 2 for n in TILE_CELLS)  # nodes
+TILE_NODES = TILE_X * TILE_Y * TILE_Z
+TILE_LINES = 2 * TILE_CELLS[0] * 2 * TILE_CELLS[1] * TILE_Z
+TILE_SHEETS = 2 * TILE_CELLS[0] * TILE_Y * TILE_Z
+SHARED = 8  # tiles that a node belongs to
+# What a tile hands to one of its nodes: its share of a force, by all its points or by those of a chamber (a "slot").
+SLOT = 3 * TILE_NODES
 
 # A node's mass, the way from it to the surface of the matter that it carries, in cells, and its drag factor: the share
 # of its velocity that implicit drag leaves in a substep.
@@ -114,12 +131,11 @@ NODAL = 5
 BUNDLE = 12
 LINE = 9
 SHEET = 6
+# Numbers that a tile shares: of its points, and then of its sheets; of its lines; of its nodes, three vectors.
+PAD_POINTS, PAD_LINES, PAD_NODES = 0, BUNDLE * TILE, BUNDLE * TILE + LINE * TILE_LINES
+PAD = PAD_NODES + 9 * TILE_NODES
 
 # A chamber: mean air stiffness, reference volume.
 CHAMBER_STIFFNESS, CHAMBER_VOLUME = 0, 1
 CHAMBER = 2
-# A sum over a chamber's points is taken in parts, these in groups, and these by whoever needs the sum.
-CHAMBER_GROUPS = 32
-CHAMBER_PARTS = 32 * CHAMBER_GROUPS
-
 ABSENT = -2  # kind of a lattice place without a particle

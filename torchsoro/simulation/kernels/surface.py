@@ -2,16 +2,16 @@
 
 A node outside of a face lies half a cell in front of it, and of a design the outer layers may be void. So a node
 responds to a plane not where it is itself but where the surface of the matter is that it carries: some way
-(``NODAL_REACH``, in cells, known from the masses) towards its neighbours, wherever these have moved.
+(``NODAL_REACH``, as share of that to the next node, known from the masses) towards its neighbours, wherever these
+have moved.
 """
 
 import taichi as ti
 
 from torchsoro.simulation.kernels.contact import axis_normal, gap_response, gap_response_adjoint
-from torchsoro.simulation.kernels.lattice import nodes_per_axis, product
+from torchsoro.simulation.kernels.lattice import node_place, nodes_per_axis, product
 from torchsoro.simulation.kernels.layout import (
     BATCH,
-    CORNER,
     EDGE,
     NODAL,
     NODAL_REACH,
@@ -50,12 +50,26 @@ def neighbour(i, m, c: ti.template(), side):
 
 
 @ti.func
-def step_inward(fixed: ti.template(), state: ti.template(), at, i, m, axis, c: ti.template(), reach):
+def index_along(i, m, axis):
+    """Number of node i along an axis."""
+    index = i // (m[1] * m[2])
+    if axis == 1:
+        index = (i // m[2]) % m[1]
+    elif axis == 2:
+        index = i % m[2]
+    return index
+
+
+@ti.func
+def step_inward(
+    ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, axis, c: ti.template(), reach
+):
     """From node i to its neighbour towards ``reach`` along axis c: the coordinate along ``axis`` gained."""
     along = at + axis * product(m)
     gain = state[along + neighbour(i, m, c, reach)] - state[along + i]
     if axis == c:
-        gain += ti.select(reach > 0, fixed[EDGE], -fixed[EDGE])
+        here = index_along(i, m, c)
+        gain += node_place(ints, fixed, c, here + ti.select(reach > 0, 1, -1)) - node_place(ints, fixed, c, here)
     return gain
 
 
@@ -63,17 +77,12 @@ def step_inward(fixed: ti.template(), state: ti.template(), at, i, m, axis, c: t
 def places(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, m, axis):
     """Coordinate along ``axis`` of node i, and of the surface of the matter that it carries."""
     nodes = product(m)
-    index = i // (m[1] * m[2])
-    if axis == 1:
-        index = (i // m[2]) % m[1]
-    elif axis == 2:
-        index = i % m[2]
-    node = fixed[CORNER + axis] + (index - 0.5) * fixed[EDGE] + state[at + axis * nodes + i]
+    node = node_place(ints, fixed, axis, index_along(i, m, axis)) + state[at + axis * nodes + i]
     surface = node
     for c in ti.static(range(3)):
         reach = fixed[ints[NODES] + (b * NODAL + NODAL_REACH + c) * nodes + i]
         if reach != 0:
-            surface += step_inward(fixed, state, at, i, m, axis, c, reach) * ti.abs(reach)
+            surface += step_inward(ints, fixed, state, at, i, m, axis, c, reach) * ti.abs(reach)
     return node, surface
 
 
@@ -88,11 +97,11 @@ def adhesive_hold(ints: ti.template(), fixed: ti.template(), plane, gap, mass):
 
 
 @ti.func
-def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, n, count, mass, u):
+def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, count, mass, u):
     """Velocity of node i after the first ``count`` planes, one after the other, and what carries it onto them."""
     r = u
     onto = u * 0
-    m = nodes_per_axis(n)
+    m = nodes_per_axis(ints)
     for k in range(count):
         plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
         kind = ints[PLANE_KIND] + 3 * k
@@ -118,7 +127,6 @@ def surface_response_adjoint(
     sums: ti.template(),
     b,
     i,
-    n,
     mass,
     u,
     r_bar,
@@ -131,7 +139,7 @@ def surface_response_adjoint(
     u_bar = r_bar
     surface_bar = r_bar * 0
     mass_bar = mass * 0
-    m = nodes_per_axis(n)
+    m = nodes_per_axis(ints)
     nodes = product(m)
     dt = fixed[STEP_SIZE]
     for back in range(ints[PLANES]):
@@ -143,7 +151,7 @@ def surface_response_adjoint(
         if sign * (node - fixed[plane + PLANE_OFFSET]) < LOOK * fixed[EDGE]:
             gap = sign * (surface - fixed[plane + PLANE_OFFSET])
             hold = adhesive_hold(ints, fixed, plane, gap, mass)
-            arriving, _ = surface_response(ints, fixed, state, at, b, i, n, k, mass, u)
+            arriving, _ = surface_response(ints, fixed, state, at, b, i, k, mass, u)
             normal = axis_normal(axis, sign, u)
             friction, stick = fixed[plane + PLANE_FRICTION], ints[kind + PLANE_STICK]
             by_u, gap_bar, by_friction, hold_bar = gap_response_adjoint(
@@ -163,15 +171,15 @@ def surface_response_adjoint(
                     mine = (b * NODAL + NODAL_REACH + c) * nodes + i
                     reach = fixed[ints[NODES] + mine]
                     if reach != 0:
-                        gain = sign * gap_bar * step_inward(fixed, state, at, i, m, axis, c, reach)
+                        gain = sign * gap_bar * step_inward(ints, fixed, state, at, i, m, axis, c, reach)
                         add(False, sums, ints[NODES_BAR] + mine, ti.select(reach > 0, gain, -gain))
     return u_bar, surface_bar, mass_bar
 
 
 @ti.func
-def surface_spread(ints: ti.template(), fixed: ti.template(), back: ti.template(), parity, b, i, n):
+def surface_spread(ints: ti.template(), fixed: ti.template(), back: ti.template(), parity, b, i):
     """What the surfaces of node i and of the neighbours that reach to it add to the gradient by its place."""
-    m = nodes_per_axis(n)
+    m = nodes_per_axis(ints)
     nodes = product(m)
     surfaces = ints[SURFACES] + (parity * ints[BATCH] + b) * 3 * nodes
     reaches = ints[NODES] + (b * NODAL + NODAL_REACH) * nodes

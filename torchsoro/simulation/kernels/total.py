@@ -1,37 +1,46 @@
-"""One substep forward of the total-Lagrangian form: points, lines, sheets, nodes.
+"""One substep forward of the total-Lagrangian form: points, then nodes.
 
-Points find F and their stress from the nodes; lines, sheets and nodes sum the forces; nodes move and meet the planes.
-These are four loops of one kernel, into which ``repeats`` substeps are unrolled, since a launch costs more than a loop.
-The clock advances in the pass over lines, which does not read it. ``loaded`` says at compile time whether there are
-forces, springs, drag or viscosity, ``stiffens`` whether solids stiffen with stretch.
+Points find F and their stress from the nodes, tile by tile, and each tile sums what its points hand to its nodes; then
+nodes add up these sums, move, and meet the planes. ``loaded`` says at compile time whether there are forces, springs or
+viscosity, ``stiffens`` whether solids stiffen with stretch.
 """
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.forward import Integers, Reals
+from torchsoro.simulation.kernels.forward import (
+    CPU_UNIT,
+    Integers,
+    Reals,
+)
 from torchsoro.simulation.kernels.lattice import (
-    gather_gradient,
-    gather_value,
-    line_tasks,
+    ALONE,
+    TOTALS,
+    chamber_slots,
+    hand_over,
+    hand_over_vector,
+    meet,
+    node_chunks,
     nodes_per_axis,
+    particle_place,
+    point_of,
     points_per_axis,
     product,
-    sheet_count,
-    sheet_tasks,
-    sum_chamber,
-    sum_lines,
-    sum_node,
-    sum_sheets,
+    stage,
+    sum_chambers,
+    sum_tile,
+    sum_tiles,
+    sync,
+    tile_box,
+    tile_count,
+    tile_gradient,
+    tile_value,
 )
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
-    ACTIVE,
     ANCHOR,
-    AREA,
-    AREA_SHEETS,
     BATCH,
+    BLOCKS,
     BULK,
-    BUNDLE,
     CHAMBER,
     CHAMBER_NUMBERS,
     CHAMBER_STIFFNESS,
@@ -40,14 +49,12 @@ from torchsoro.simulation.kernels.layout import (
     COEFFICIENT,
     COEFFICIENTS,
     COLLAPSED,
-    CORNER,
-    EDGE,
     ELEMENT,
     ELEMENTS,
-    FILLED,
     FORCE,
     GRAVITY,
     GROUPS,
+    HEAD,
     KEPT_RING,
     KIND,
     NEAR_NODES,
@@ -55,27 +62,31 @@ from torchsoro.simulation.kernels.layout import (
     NODAL_DRAG_FACTOR,
     NODAL_MASS,
     NODES,
-    NOW,
+    PAD,
+    PADS,
+    PARTIALS,
     PLANES,
-    POINT_SUM,
     PRESSURE,
     PRONY,
     PRONY_DECAY,
     PRONY_GAIN,
     PRONY_MODULUS,
     PUSHED,
-    RANK,
     RING,
     SHARE,
+    SHARED,
     SHEAR,
-    SHEET,
-    SHEET_SUM,
+    SLOT,
+    SLOT_CHAMBER,
+    SLOT_START,
+    SLOTS,
+    SOURCES,
     SPRING,
     SPRINGS,
     STEP_SIZE,
     STIFFENING,
-    STOP,
     SWEPT,
+    TILE,
     VISCOSITY,
     VISCOUS,
     VOID_FRACTION,
@@ -83,74 +94,272 @@ from torchsoro.simulation.kernels.layout import (
     VOLUME_VISCOSITY,
     VOLUMES,
 )
-from torchsoro.simulation.kernels.stress import least_ratio, piola, pull_back, stiffening, viscous_piola, void_piola
-from torchsoro.simulation.kernels.surface import surface_response
+from torchsoro.simulation.kernels.stress import (
+    least_ratio,
+    piola,
+    pull_back,
+    stiffening,
+    viscous_piola,
+    void_piola,
+)
+from torchsoro.simulation.kernels.surface import (
+    surface_response,
+)
 from torchsoro.simulation.kernels.tensor import (
     cofactor,
     contract,
     load_symmetric,
     load_vector,
     plus_identity,
-    store_matrix,
     store_symmetric,
     store_vector,
 )
 
 
 @ti.func
-def state_length(ints: ti.template(), n):
+def state_length(head: ti.template()):
     """Numbers in the state of a simulation."""
-    return 6 * product(nodes_per_axis(n)) + 6 * ints[ELEMENTS] * product(n)
+    return 6 * product(nodes_per_axis(head)) + 6 * head[ELEMENTS] * product(points_per_axis(head))
 
 
 @ti.func
-def chamber_pressure(ints: ti.template(), fixed: ti.template(), supply, volume, one):
+def chamber_pressure(head: ti.template(), fixed: ti.template(), supply, volume, one):
     """p_act - k (V/V0 - 1) in chamber number ``one`` of all simulations."""
-    at = ints[CHAMBER_NUMBERS] + one * CHAMBER
+    at = head[CHAMBER_NUMBERS] + one * CHAMBER
     return supply - fixed[at + CHAMBER_STIFFNESS] * (volume / fixed[at + CHAMBER_VOLUME] - 1)
 
 
 @ti.func
-def particle_place(fixed: ti.template(), p, n):
-    """Reference place of the particle of point p."""
-    half = fixed[EDGE] / 2
-    x = load_vector(fixed, CORNER, 1)
-    x[0] += (p // (n[1] * n[2]) + 0.5) * half
-    x[1] += ((p // n[2]) % n[1] + 0.5) * half
-    x[2] += (p % n[2] + 0.5) * half
-    return x
-
-
-@ti.func
-def spring_stretch(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, p, n):
-    """From point p to its anchor."""
-    points = product(n)
-    anchor = ints[COEFFICIENT] + (b * COEFFICIENTS + ANCHOR) * points + p
-    d = gather_value(ints, fixed, state, at, p, n)
-    return load_vector(fixed, anchor, points) - particle_place(fixed, p, n) - d
+def spring_stretch(head: ti.template(), fixed: ti.template(), d, b, p):
+    """From point p, displaced by d, to its anchor."""
+    points = product(points_per_axis(head))
+    anchor = head[COEFFICIENT] + (b * COEFFICIENTS + ANCHOR) * points + p
+    return load_vector(fixed, anchor, points) - particle_place(head, fixed, p) - d
 
 
 @ti.func
 def external_force(
-    ints: ti.template(), fixed: ti.template(), supply: ti.template(), state: ti.template(), at, t, b, p, n
+    head: ti.template(), fixed: ti.template(), supply: ti.template(), pad: ti.template(), base, cell, q, t, b, p
 ):
     """Shares of the group forces, and spring to an anchor [N] at point p; drag is with the nodes."""
-    points = product(n)
-    push = load_vector(fixed, CORNER, 1) * 0
-    for g in range(ints[GROUPS]):
-        force = ints[FORCE] + ((t * ints[BATCH] + b) * ints[GROUPS] + g) * 3
-        push += fixed[ints[SHARE] + g * points + p] * load_vector(supply, force, 1)
-    if ints[SPRINGS] == 1:
-        spring = fixed[ints[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
-        push += spring * spring_stretch(ints, fixed, state, at, b, p, n)
+    points = product(points_per_axis(head))
+    push = ti.Vector([fixed[STEP_SIZE] * 0, fixed[STEP_SIZE] * 0, fixed[STEP_SIZE] * 0])
+    for g in range(head[GROUPS]):
+        force = head[FORCE] + ((t * head[BATCH] + b) * head[GROUPS] + g) * 3
+        push += fixed[head[SHARE] + g * points + p] * load_vector(supply, force, 1)
+    if head[SPRINGS] == 1:
+        spring = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
+        push += spring * spring_stretch(head, fixed, tile_value(head, fixed, pad, base, 0, cell, q), b, p)
     return push
+
+
+@ti.func
+def chamber_share(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, cell, q, b, p, mine):
+    """Hand over the share of point p in its chamber's area, volume times cof F; nothing if it is in none (``mine``).
+
+    Returns:
+        The reference volume, the volume ratio, and cof F.
+    """
+    points = product(points_per_axis(head))
+    zero = fixed[STEP_SIZE] * 0
+    cof = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    volume = zero
+    ratio = zero
+    if mine == 1:
+        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        volume = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + VOLUME) * points + p]
+        cof = cofactor(F)
+        ratio = contract(cof, F) / 3
+    hand_over(pad, base, q, volume * cof)
+    return volume, ratio, cof
+
+
+@ti.func
+def stress_point(
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    pad: ti.template(),
+    base,
+    cell,
+    q,
+    t,
+    b,
+    p,
+):
+    """Stress of point p in substep t, its elements a substep on; hands over volume times stress, and external force."""
+    zero = fixed[STEP_SIZE] * 0
+    P = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    push = ti.Vector([zero, zero, zero])
+    kind = ti.cast(ABSENT, ti.i32)
+    if p >= 0:
+        kind = ints[head[KIND] + p]
+    if kind != ABSENT:
+        points, elements = product(points_per_axis(head)), head[ELEMENTS]
+        nodes, length = product(nodes_per_axis(head)), state_length(head)
+        at = ((t % head[RING]) * head[BATCH] + b) * length + 6 * nodes + p
+        out = (((t + 1) % head[RING]) * head[BATCH] + b) * length + 6 * nodes + p
+        mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
+        volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
+        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        if kind < 0:
+            void_fraction = fixed[mat + VOID_FRACTION * points]
+            Q = F * 0
+            factor = void_fraction * 0 + 1
+            if void_fraction < 1:
+                least = least_ratio(void_fraction)
+                if ti.static(stiffens):
+                    linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
+                    factor = stiffening(F, least, linear, square)
+                if elements > 0:
+                    S = factor * pull_back(F, least)
+                    for e in range(elements):
+                        number = head[ELEMENT] + (b * elements + e) * PRONY
+                        decay, gain = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN]
+                        Z = load_symmetric(state, at + 6 * e * points, points)
+                        Q += fixed[number + PRONY_MODULUS] * (Z + gain * S)
+                        store_symmetric(state, out + 6 * e * points, points, decay * Z - gain * (1 - decay) * S)
+                if void_fraction == 0 and not F.determinant() > 0:
+                    ti.atomic_min(ints[COLLAPSED], t)
+            else:
+                for c in range(6 * elements):
+                    state[out + c * points] = 0
+            P = volume * piola(F, Q, fixed[mat + BULK * points], shear, factor, void_fraction)
+        else:
+            for c in range(6 * elements):
+                state[out + c * points] = 0
+            if not F.determinant() > 0:
+                ti.atomic_min(ints[COLLAPSED], t)
+            P = volume * void_piola(F, shear)
+        if ti.static(loaded):
+            if kind < 0 and head[VISCOUS] == 1:
+                eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
+                rate = tile_gradient(head, fixed, pad, base, 1, cell, q)
+                P += volume * viscous_piola(F, rate, eta, zeta)
+            push = external_force(head, fixed, supply, pad, base, cell, q, t, b, p)
+    hand_over(pad, base, q, P)
+    if ti.static(loaded):
+        hand_over_vector(pad, base, q, -push)
+
+
+@ti.func
+def point_pass(
+    gpu: ti.template(),
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    scratch: ti.template(),
+    pad: ti.template(),
+    base,
+    item,
+    t,
+    q0,
+    q1,
+):
+    """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
+    b, tile = item // tile_count(head), item % tile_count(head)
+    cell, cells, node = tile_box(head, ints, tile)
+    at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
+    stage(head, state, at, pad, base, 0, node, q0, q1)
+    if ti.static(loaded):
+        if head[VISCOUS] == 1:
+            stage(head, state, at + 3 * product(nodes_per_axis(head)), pad, base, 1, node, q0, q1)
+    sync(gpu)
+    partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+    first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
+    for slot in range(first - 1, last):
+        # The tile's own slot, then those of the chambers that it has points of.
+        out = partials + tile * SLOT
+        alone = ti.cast(-1, ti.i32)
+        if slot < first:
+            for q in range(q0, q1):
+                p = point_of(head, cell, cells, q)
+                stress_point(loaded, stiffens, head, ints, fixed, supply, state, pad, base, cell, q, t, b, p)
+        else:
+            out = partials + (tile_count(head) + slot) * SLOT
+            alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
+            for q in range(q0, q1):
+                p = point_of(head, cell, cells, q)
+                mine = ti.cast(0, ti.i32)
+                if p >= 0:
+                    mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
+                volume, ratio, _ = chamber_share(head, fixed, pad, base, cell, q, b, p, mine)
+                pad[base + ALONE + q] = volume * ratio
+        sync(gpu)
+        own = ti.cast(slot < first, ti.i32)
+        sum_tile(gpu, loaded, head, fixed, pad, base, own, cell, cells, scratch, out, scratch, alone, q0, q1)
+
+
+@ti.func
+def node_pass(
+    gpu: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    kept: ti.template(),
+    scratch: ti.template(),
+    pad: ti.template(),
+    base,
+    item,
+    t,
+    q0,
+    q1,
+):
+    """Move the 256 nodes of number ``item`` by substep t."""
+    nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
+    b, chunk = item // node_chunks(head), item % node_chunks(head)
+    slot = (t % head[KEPT_RING]) * head[BATCH] + b
+    sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
+    for q in range(q0, q1):
+        i = chunk * TILE + q
+        if i < chambers:  # every simulation has more nodes than chambers
+            kept[head[VOLUMES] + slot * chambers + i] = pad[base + TOTALS + i]
+        if i < nodes:
+            length = state_length(head)
+            at = ((t % head[RING]) * head[BATCH] + b) * length + i
+            out = (((t + 1) % head[RING]) * head[BATCH] + b) * length + i
+            dt = fixed[STEP_SIZE]
+            mass = fixed[head[NODES] + (b * NODAL + NODAL_MASS) * nodes + i]
+            d = load_vector(state, at, nodes)
+            v = load_vector(state, at + 3 * nodes, nodes)
+            # Divide wherever there is mass, with no floor: a void node weighs 1e-12 kg.
+            if mass > 0:
+                partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+                f = sum_tiles(fixed, ints, scratch, partials, head[SOURCES], i, nodes)
+                for k in range(chambers):
+                    if ints[head[NEAR_NODES] + k * nodes + i] == 1:
+                        one = b * chambers + k
+                        p_act = supply[head[PRESSURE] + t * head[BATCH] * chambers + one]
+                        p = chamber_pressure(head, fixed, p_act, pad[base + TOTALS + k], one)
+                        table = head[SOURCES] + (k + 1) * SHARED * nodes
+                        f -= p * sum_tiles(fixed, ints, scratch, partials, table, i, nodes)
+                pull = load_vector(supply, head[GRAVITY] + (t * head[BATCH] + b) * 3, 1)
+                drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
+                v = drag_factor * (v + dt * (pull - f / mass))
+                store_vector(kept, head[PUSHED] + slot * 3 * nodes + i, nodes, v)
+                after, onto = surface_response(ints, fixed, state, at - i, b, i, head[PLANES], mass, v)
+                v = after
+                d += dt * (onto + v)
+            store_vector(state, out, nodes, d)
+            store_vector(state, out + 3 * nodes, nodes, v)
+    sync(gpu)
 
 
 @ti.kernel
 def total_substep(
-    repeats: ti.template(),
     loaded: ti.template(),
     stiffens: ti.template(),
+    t: ti.i32,
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -158,114 +367,60 @@ def total_substep(
     kept: Reals,
     scratch: Reals,
 ):
-    """Advance by ``repeats`` substeps, but not beyond ints[STOP]; the buffers are those of ``layout.BUFFERS``."""
-    # Lengths of loops are found once: each that is not known costs a launch.
-    n = points_per_axis(ints)
-    point_threads, line_threads = ints[BATCH] * product(n), line_tasks(ints, n)
-    sheet_threads = sheet_tasks(ints, n)
-    node_threads = ints[BATCH] * (product(nodes_per_axis(n)) + ints[CHAMBERS])
-    for _ in ti.static(range(repeats)):
-        for w in range(point_threads):
-            t = ints[NOW]
-            n = points_per_axis(ints)
-            points = product(n)
-            b, p = w // points, w % points
-            kind = ints[ints[KIND] + p]
-            if t < ints[STOP] and kind != ABSENT:
-                length, elements = state_length(ints, n), ints[ELEMENTS]
-                nodes = product(nodes_per_axis(n))
-                at = ((t % ints[RING]) * ints[BATCH] + b) * length
-                out = (((t + 1) % ints[RING]) * ints[BATCH] + b) * length
-                mat = ints[COEFFICIENT] + b * COEFFICIENTS * points + p
-                F = plus_identity(gather_gradient(ints, fixed, state, at, p, n), 1)
-                volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-                P = F * 0
-                history = 6 * nodes + p
-                if kind < 0:
-                    void_fraction = fixed[mat + VOID_FRACTION * points]
-                    Q = F * 0
-                    factor = void_fraction * 0 + 1
-                    if void_fraction < 1:
-                        least = least_ratio(void_fraction)
-                        if ti.static(stiffens):
-                            linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
-                            factor = stiffening(F, least, linear, square)
-                        if elements > 0:
-                            S = factor * pull_back(F, least)
-                            for e in range(elements):
-                                place = history + 6 * e * points
-                                number = ints[ELEMENT] + (b * elements + e) * PRONY
-                                decay, gain = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN]
-                                Z = load_symmetric(state, at + place, points)
-                                Q += fixed[number + PRONY_MODULUS] * (Z + gain * S)
-                                store_symmetric(state, out + place, points, decay * Z - gain * (1 - decay) * S)
-                        if void_fraction == 0 and not F.determinant() > 0:
-                            ti.atomic_min(ints[COLLAPSED], t)
-                    else:
-                        for c in range(6 * elements):
-                            state[out + history + c * points] = 0
-                    P = piola(F, Q, fixed[mat + BULK * points], shear, factor, void_fraction)
-                else:
-                    for c in range(6 * elements):
-                        state[out + history + c * points] = 0
-                    cof = cofactor(F)
-                    if not contract(cof, F) > 0:
-                        ti.atomic_min(ints[COLLAPSED], t)
-                    P = void_piola(F, shear)
-                    area = ints[AREA] + (b * ints[CHAMBERS] + kind) * BUNDLE * points + p
-                    store_matrix(scratch, area, points, volume * cof)
-                    swept = ints[SWEPT] + b * ints[ints[FILLED] + ints[CHAMBERS]] + ints[ints[RANK] + p]
-                    scratch[swept] = volume * contract(cof, F) / 3
-                if ti.static(loaded):
-                    eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                    if kind < 0 and ints[VISCOUS] == 1:
-                        P += viscous_piola(F, gather_gradient(ints, fixed, state, at + 3 * nodes, p, n), eta, zeta)
-                    push = external_force(ints, fixed, supply, state, at, t, b, p, n)
-                    store_vector(scratch, ints[POINT_SUM] + (b * BUNDLE + 9) * points + p, points, -push)
-                store_matrix(scratch, ints[POINT_SUM] + b * BUNDLE * points + p, points, volume * P)
-        for w in range(line_threads):
-            if w == 0:
-                ints[ACTIVE] = 0
-                if ints[NOW] < ints[STOP]:
-                    ints[NOW] = ints[NOW] + 1
-                    ints[ACTIVE] = 1
-            sum_lines(ints, fixed, scratch, w, points_per_axis(ints), loaded)
-        for w in range(sheet_threads):
-            sum_sheets(ints, fixed, scratch, w, points_per_axis(ints))
-        for w in range(node_threads):
-            if ints[ACTIVE] == 1:
-                t = ints[NOW] - 1
-                n = points_per_axis(ints)
-                nodes, chambers = product(nodes_per_axis(n)), ints[CHAMBERS]
-                b, i = w // (nodes + chambers), w % (nodes + chambers)
-                slot = (t % ints[KEPT_RING]) * ints[BATCH]
-                if i >= nodes:
-                    one = b * chambers + i - nodes
-                    kept[ints[VOLUMES] + slot * chambers + one] = sum_chamber(ints, scratch, one)
-                else:
-                    length = state_length(ints, n)
-                    at = ((t % ints[RING]) * ints[BATCH] + b) * length + i
-                    out = (((t + 1) % ints[RING]) * ints[BATCH] + b) * length + i
-                    dt = fixed[STEP_SIZE]
-                    mass = fixed[ints[NODES] + (b * NODAL + NODAL_MASS) * nodes + i]
-                    d = load_vector(state, at, nodes)
-                    v = load_vector(state, at + 3 * nodes, nodes)
-                    # Divide wherever there is mass, with no floor: a void node weighs 1e-12 kg.
-                    if mass > 0:
-                        count = SHEET * sheet_count(n)
-                        f = sum_node(fixed, scratch, ints[SHEET_SUM] + b * count, i, n)
-                        for k in range(chambers):
-                            if ints[ints[NEAR_NODES] + k * nodes + i] == 1:
-                                one = b * chambers + k
-                                p_act = supply[ints[PRESSURE] + t * ints[BATCH] * chambers + one]
-                                p = chamber_pressure(ints, fixed, p_act, sum_chamber(ints, scratch, one), one)
-                                f -= p * sum_node(fixed, scratch, ints[AREA_SHEETS] + one * count, i, n)
-                        pull = load_vector(supply, ints[GRAVITY] + (t * ints[BATCH] + b) * 3, 1)
-                        drag_factor = fixed[ints[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
-                        v = drag_factor * (v + dt * (pull - f / mass))
-                        store_vector(kept, ints[PUSHED] + (slot + b) * 3 * nodes + i, nodes, v)
-                        after, onto = surface_response(ints, fixed, state, at - i, b, i, n, ints[PLANES], mass, v)
-                        v = after
-                        d += dt * (onto + v)
-                    store_vector(state, out, nodes, d)
-                    store_vector(state, out + 3 * nodes, nodes, v)
+    """Substep t on a CPU; the buffers are those of ``layout.BUFFERS``."""
+    for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
+        if w % CPU_UNIT == 0:
+            item = w // CPU_UNIT
+            pad = ints[PADS] + item * PAD
+            point_pass(
+                *(False, loaded, stiffens, ints, ints, fixed, supply, state, scratch, scratch, pad, item, t, 0, TILE)
+            )
+    for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
+        if w % CPU_UNIT == 0:
+            item = w // CPU_UNIT
+            pad = ints[PADS] + item * PAD
+            node_pass(False, ints, ints, fixed, supply, state, kept, scratch, scratch, pad, item, t, 0, TILE)
+
+
+@ti.kernel
+def total_march(
+    real: ti.template(),
+    most: ti.template(),
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    first: ti.i32,
+    last: ti.i32,
+    ints: Integers,
+    fixed: Reals,
+    supply: Reals,
+    state: Reals,
+    kept: Reals,
+    scratch: Reals,
+):
+    """Substeps from ``first`` to ``last`` on a GPU that runs ``most`` blocks of 256 threads at a time.
+
+    The blocks stay until the last substep and wait for each other between the passes, so that a host need not keep up.
+    """
+    ti.loop_config(block_dim=TILE)
+    for w in range(most * TILE):
+        q, block = w % TILE, w // TILE
+        head = ti.simt.block.SharedArray((HEAD,), ti.i32)
+        pad = ti.simt.block.SharedArray((PAD,), real)
+        if q < HEAD:
+            head[q] = ints[q]
+        sync(True)
+        blocks = head[BLOCKS]
+        if block < blocks:
+            for t in range(first, last):
+                item = block
+                while item < head[BATCH] * tile_count(head):
+                    point_pass(
+                        *(True, loaded, stiffens, head, ints, fixed, supply, state, scratch, pad, 0, item, t, q, q + 1)
+                    )
+                    item += blocks
+                meet(ints, blocks, q)
+                item = block
+                while item < head[BATCH] * node_chunks(head):
+                    node_pass(True, head, ints, fixed, supply, state, kept, scratch, pad, 0, item, t, q, q + 1)
+                    item += blocks
+                meet(ints, blocks, q)

@@ -1,38 +1,46 @@
-"""One substep backward of the total-Lagrangian form: nodes, points, lines, sheets, from the kept states.
+"""One substep backward of the total-Lagrangian form: nodes, then points, from the kept states.
 
 The adjoint state lies in one buffer, laid out as the state, that each pass overwrites in place. A pass finishes the
 sums over substep t + 1 and begins substep t, so that a caller may add its own gradients by the state after t + 1
-substeps between two passes. The clock goes down in the pass over lines, which does not read it.
+substeps between two passes.
 """
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.forward import Integers, Reals
+from torchsoro.simulation.kernels.forward import (
+    CPU_UNIT,
+    Integers,
+    Reals,
+)
 from torchsoro.simulation.kernels.lattice import (
-    gather_gradient,
+    ALONE,
+    TOTALS,
+    chamber_slots,
     gather_value,
-    line_count,
-    line_tasks,
+    hand_over,
+    hand_over_vector,
+    meet,
+    node_chunks,
     nodes_per_axis,
+    point_of,
     points_per_axis,
     product,
-    sheet_count,
-    sheet_tasks,
-    sum_chamber,
-    sum_line,
-    sum_lines,
-    sum_node,
-    sum_sheet,
-    sum_sheets,
+    stage,
+    sum_chambers,
+    sum_tile,
+    sum_tiles,
+    sync,
+    tile_box,
+    tile_count,
+    tile_gradient,
+    tile_value,
 )
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
     ANCHOR,
-    AREA,
-    AREA_SHEETS,
     BATCH,
+    BLOCKS,
     BULK,
-    BUNDLE,
     CHAMBER,
     CHAMBER_BAR,
     CHAMBER_NUMBERS,
@@ -42,28 +50,27 @@ from torchsoro.simulation.kernels.layout import (
     COEFFICIENT,
     COEFFICIENT_BAR,
     COEFFICIENTS,
-    CORNER,
     ELEMENT,
     ELEMENT_BAR,
     ELEMENTS,
-    FILLED,
     FORCE_BAR,
     FORCES,
     GRAVITY,
     GRAVITY_BAR,
     GROUPS,
+    HEAD,
     JACOBIANS,
     KIND,
-    LINE,
     NEAR_NODES,
     NODAL,
     NODAL_DRAG_FACTOR,
     NODAL_MASS,
     NODES,
     NODES_BAR,
-    NOW,
+    PAD,
+    PADS,
+    PARTIALS,
     PLANES,
-    POINT_SUM,
     PRESSURE,
     PRESSURE_BAR,
     PRONY,
@@ -71,23 +78,23 @@ from torchsoro.simulation.kernels.layout import (
     PRONY_GAIN,
     PRONY_MODULUS,
     PUSHED,
-    RANK,
-    RATE_LINES,
-    RATE_SHEETS,
-    RATES,
     SHARE,
+    SHARED,
     SHEAR,
-    SHEET,
-    SHEET_SUM,
+    SLOT,
+    SLOT_CHAMBER,
+    SLOT_START,
+    SLOTS,
+    SOURCES,
     SPRING,
     SPRINGS,
     STEP_SIZE,
     STEPS,
     STIFFENING,
-    STOP,
     SURFACES,
     SWEPT,
     TALLIES,
+    TILE,
     VISCOSITY,
     VISCOUS,
     VOID_FRACTION,
@@ -108,7 +115,10 @@ from torchsoro.simulation.kernels.stress import (
     void_piola_adjoint,
     void_work,
 )
-from torchsoro.simulation.kernels.surface import surface_response_adjoint, surface_spread
+from torchsoro.simulation.kernels.surface import (
+    surface_response_adjoint,
+    surface_spread,
+)
 from torchsoro.simulation.kernels.tensor import (
     add,
     cofactor,
@@ -118,15 +128,20 @@ from torchsoro.simulation.kernels.tensor import (
     load_symmetric_adjoint,
     load_vector,
     plus_identity,
-    store_matrix,
     store_symmetric_adjoint,
     store_vector,
 )
-from torchsoro.simulation.kernels.total import chamber_pressure, spring_stretch, state_length
+from torchsoro.simulation.kernels.total import (
+    chamber_pressure,
+    chamber_share,
+    spring_stretch,
+    state_length,
+)
 
 
 @ti.func
 def node_adjoint(
+    head: ti.template(),
     ints: ti.template(),
     fixed: ti.template(),
     supply: ti.template(),
@@ -136,89 +151,93 @@ def node_adjoint(
     bar: ti.template(),
     back: ti.template(),
     sums: ti.template(),
+    pad: ti.template(),
+    base,
     t,
     b,
     i,
-    n,
     rates: ti.template(),
 ):
     """Finish the gradient by the place of node i after t + 1 substeps, and go back to the force on it in substep t."""
-    nodes, chambers = product(nodes_per_axis(n)), ints[CHAMBERS]
-    here = b * state_length(ints, n) + i
-    mass = fixed[ints[NODES] + (b * NODAL + NODAL_MASS) * nodes + i]
+    nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
+    here = b * state_length(head) + i
+    mass = fixed[head[NODES] + (b * NODAL + NODAL_MASS) * nodes + i]
     if mass > 0:
         d_bar = load_vector(bar, here, nodes)
         v_bar = load_vector(bar, here + 3 * nodes, nodes)
-        if t + 1 < ints[STEPS]:
-            count = SHEET * sheet_count(n)
-            d_bar += sum_node(fixed, scratch, ints[SHEET_SUM] + b * count, i, n)
+        if t + 1 < head[STEPS]:
+            partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+            d_bar += sum_tiles(fixed, ints, scratch, partials, head[SOURCES], i, nodes)
             for k in range(chambers):
-                if ints[ints[NEAR_NODES] + k * nodes + i] == 1:
+                if ints[head[NEAR_NODES] + k * nodes + i] == 1:
                     one = b * chambers + k
-                    by_volume = chamber_volume_bar(ints, fixed, scratch, one)
-                    d_bar += by_volume * sum_node(fixed, scratch, ints[AREA_SHEETS] + one * count, i, n)
-            if ints[PLANES] > 0:
-                d_bar += surface_spread(ints, fixed, back, (t + 1) % 2, b, i, n)
+                    by_volume = chamber_volume_bar(head, fixed, pad[base + TOTALS + k], one)
+                    table = head[SOURCES] + (k + 1) * SHARED * nodes
+                    d_bar += by_volume * sum_tiles(fixed, ints, scratch, partials, table, i, nodes)
+            if head[PLANES] > 0:
+                d_bar += surface_spread(ints, fixed, back, (t + 1) % 2, b, i)
             if ti.static(rates):
-                v_bar += sum_node(fixed, back, ints[RATE_SHEETS] + b * count, i, n)
+                if head[VISCOUS] == 1:
+                    rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * SLOT
+                    v_bar += sum_tiles(fixed, ints, scratch, rates_at, head[SOURCES], i, nodes)
             store_vector(bar, here, nodes, d_bar)
         if t >= 0:
             dt = fixed[STEP_SIZE]
-            slot = t * ints[BATCH] + b
-            at = slot * state_length(ints, n)
+            slot = t * head[BATCH] + b
+            at = slot * state_length(head)
             v = load_vector(state, at + 3 * nodes + i, nodes)
-            u = load_vector(kept, ints[PUSHED] + slot * 3 * nodes + i, nodes)
+            u = load_vector(kept, head[PUSHED] + slot * 3 * nodes + i, nodes)
             v_bar += dt * d_bar
             mass_bar = mass * 0
-            if ints[PLANES] > 0:
+            if head[PLANES] > 0:
                 u_bar, by_surface, by_mass = surface_response_adjoint(
-                    ints, fixed, state, at, sums, b, i, n, mass, u, v_bar, dt * d_bar
+                    ints, fixed, state, at, sums, b, i, mass, u, v_bar, dt * d_bar
                 )
                 v_bar, mass_bar = u_bar, by_mass
-                surfaces = ints[SURFACES] + ((t % 2) * ints[BATCH] + b) * 3 * nodes
+                surfaces = head[SURFACES] + ((t % 2) * head[BATCH] + b) * 3 * nodes
                 store_vector(back, surfaces + i, nodes, by_surface)
-            drag_factor = fixed[ints[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
-            add(False, sums, ints[NODES_BAR] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i, u.dot(v_bar) / drag_factor)
+            drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
+            add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i, u.dot(v_bar) / drag_factor)
             v_bar *= drag_factor
-            pull = dt * load_vector(supply, ints[GRAVITY] + slot * 3, 1)
+            pull = dt * load_vector(supply, head[GRAVITY] + slot * 3, 1)
             mass_bar -= (u / drag_factor - v - pull).dot(v_bar) / mass
-            add(False, sums, ints[NODES_BAR] + (b * NODAL + NODAL_MASS) * nodes + i, mass_bar)
-            store_vector(back, ints[FORCES] + b * 3 * nodes + i, nodes, (dt / mass) * v_bar)
+            add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_MASS) * nodes + i, mass_bar)
+            store_vector(back, head[FORCES] + b * 3 * nodes + i, nodes, (dt / mass) * v_bar)
         store_vector(bar, here + 3 * nodes, nodes, v_bar)
 
 
 @ti.func
-def chamber_volume_bar(ints: ti.template(), fixed: ti.template(), scratch: ti.template(), one):
-    """Gradient by a chamber's volume, from the summed gradient by its pressure."""
-    at = ints[CHAMBER_NUMBERS] + one * CHAMBER
-    return -sum_chamber(ints, scratch, one) * fixed[at + CHAMBER_STIFFNESS] / fixed[at + CHAMBER_VOLUME]
+def chamber_volume_bar(head: ti.template(), fixed: ti.template(), p_bar, one):
+    """Gradient by a chamber's volume, from that by its pressure."""
+    at = head[CHAMBER_NUMBERS] + one * CHAMBER
+    return -p_bar * fixed[at + CHAMBER_STIFFNESS] / fixed[at + CHAMBER_VOLUME]
 
 
 @ti.func
 def chamber_adjoint(
-    ints: ti.template(),
+    head: ti.template(),
     fixed: ti.template(),
     kept: ti.template(),
-    scratch: ti.template(),
     back: ti.template(),
     sums: ti.template(),
     t,
     one,
+    p_bar,
 ):
     """Gradients by the pressure, stiffness and volumes of a chamber in substep t."""
-    p_bar = sum_chamber(ints, scratch, one)
-    volume_bar = chamber_volume_bar(ints, fixed, scratch, one)
-    step = t * ints[BATCH] * ints[CHAMBERS] + one
-    ratio = kept[ints[VOLUMES] + step] / fixed[ints[CHAMBER_NUMBERS] + one * CHAMBER + CHAMBER_VOLUME]
-    mine = ints[CHAMBER_BAR] + one * CHAMBER
+    volume_bar = chamber_volume_bar(head, fixed, p_bar, one)
+    step = t * head[BATCH] * head[CHAMBERS] + one
+    ratio = kept[head[VOLUMES] + step] / fixed[head[CHAMBER_NUMBERS] + one * CHAMBER + CHAMBER_VOLUME]
+    mine = head[CHAMBER_BAR] + one * CHAMBER
     add(False, sums, mine + CHAMBER_STIFFNESS, -p_bar * (ratio - 1))
     add(False, sums, mine + CHAMBER_VOLUME, -volume_bar * ratio)
-    add(False, sums, ints[PRESSURE_BAR] + step, p_bar)
-    back[ints[VOLUME_BAR] + one] = volume_bar
+    add(False, sums, head[PRESSURE_BAR] + step, p_bar)
+    back[head[VOLUME_BAR] + one] = volume_bar
 
 
 @ti.func
 def tally(
+    head: ti.template(),
     ints: ti.template(),
     fixed: ti.template(),
     bar: ti.template(),
@@ -227,31 +246,30 @@ def tally(
     t,
     b,
     row,
-    n,
 ):
     """One share of the sums over all nodes and points that gravity and group forces of substep t need."""
-    nodes, points, tallies = product(nodes_per_axis(n)), product(n), ints[TALLIES]
-    mine = (t * tallies + row) * ints[BATCH] + b
-    velocity = b * state_length(ints, n) + 3 * nodes
+    nodes, points, tallies = product(nodes_per_axis(head)), product(points_per_axis(head)), head[TALLIES]
+    mine = (t * tallies + row) * head[BATCH] + b
+    velocity = b * state_length(head) + 3 * nodes
     total = load_vector(fixed, 0, 1) * 0
     for m in range((nodes + tallies - 1) // tallies):
         i = row + m * tallies
-        if i < nodes and fixed[ints[NODES] + (b * NODAL + NODAL_MASS) * nodes + i] > 0:
+        if i < nodes and fixed[head[NODES] + (b * NODAL + NODAL_MASS) * nodes + i] > 0:
             total += load_vector(bar, velocity + i, nodes)
-    store_vector(sums, ints[GRAVITY_BAR] + 3 * mine, 1, fixed[STEP_SIZE] * total)
-    for g in range(ints[GROUPS]):
+    store_vector(sums, head[GRAVITY_BAR] + 3 * mine, 1, fixed[STEP_SIZE] * total)
+    for g in range(head[GROUPS]):
         total *= 0
         for m in range((points + tallies - 1) // tallies):
             i = row + m * tallies
-            if i < points and fixed[ints[SHARE] + g * points + i] != 0:
-                by_push = gather_value(ints, fixed, back, ints[FORCES] + b * 3 * nodes, i, n)
-                total += fixed[ints[SHARE] + g * points + i] * by_push
-        store_vector(sums, ints[FORCE_BAR] + 3 * (mine * ints[GROUPS] + g), 1, total)
+            if i < points and fixed[head[SHARE] + g * points + i] != 0:
+                by_push = gather_value(head, ints, fixed, back, head[FORCES] + b * 3 * nodes, i)
+                total += fixed[head[SHARE] + g * points + i] * by_push
+        store_vector(sums, head[FORCE_BAR] + 3 * (mine * head[GROUPS] + g), 1, total)
 
 
 @ti.func
 def maxwell_adjoint(
-    ints: ti.template(),
+    head: ti.template(),
     fixed: ti.template(),
     state: ti.template(),
     at,
@@ -265,17 +283,17 @@ def maxwell_adjoint(
     Q_bar,
 ):
     """Through the Maxwell elements of a point, whose places in state and adjoint are given: the gradient by S."""
-    elements = ints[ELEMENTS]
+    elements = head[ELEMENTS]
     S_bar = S * 0
     for e in range(elements):
         place = here + 6 * e * points
-        number = ints[ELEMENT] + (b * elements + e) * PRONY
+        number = head[ELEMENT] + (b * elements + e) * PRONY
         a, gain, g = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN], fixed[number + PRONY_MODULUS]
         Z_bar = load_symmetric_adjoint(bar, place, points)
         S_bar += gain * (g * Q_bar - (1 - a) * Z_bar)
-        if ints[WANT_PRONY] == 1:
+        if head[WANT_PRONY] == 1:
             Z = load_symmetric(state, at + 6 * e * points, points)
-            mine = ints[ELEMENT_BAR] + (b * elements + e) * PRONY * points + p
+            mine = head[ELEMENT_BAR] + (b * elements + e) * PRONY * points + p
             by_stress, by_history = contract(Q_bar, S), contract(Z_bar, S)
             add(False, sums, mine + PRONY_MODULUS * points, contract(Q_bar, Z) + gain * by_stress)
             add(False, sums, mine + PRONY_GAIN * points, g * by_stress - (1 - a) * by_history)
@@ -286,36 +304,266 @@ def maxwell_adjoint(
 
 @ti.func
 def external_adjoint(
-    ints: ti.template(),
+    head: ti.template(),
     fixed: ti.template(),
-    state: ti.template(),
-    at,
-    back: ti.template(),
-    scratch: ti.template(),
+    pad: ti.template(),
+    base,
+    cell,
+    q,
     sums: ti.template(),
     b,
     p,
-    n,
 ):
-    """Adjoint of ``total.external_force``, but for the group forces: by springs, anchors and place."""
-    nodes, points = product(nodes_per_axis(n)), product(n)
+    """Adjoint of ``total.external_force``, group forces excepted: by springs, anchors, and (returned) the place."""
+    points = product(points_per_axis(head))
     mine = b * COEFFICIENTS * points + p
-    mat, mat_bar = ints[COEFFICIENT] + mine, ints[COEFFICIENT_BAR] + mine
-    push_bar = gather_value(ints, fixed, back, ints[FORCES] + b * 3 * nodes, p, n)
+    mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
+    push_bar = tile_value(head, fixed, pad, base, 1, cell, q)
     spring = fixed[mat + SPRING * points]
-    stretch = spring_stretch(ints, fixed, state, at, b, p, n)
+    stretch = spring_stretch(head, fixed, tile_value(head, fixed, pad, base, 0, cell, q), b, p)
     add(False, sums, mat_bar + SPRING * points, push_bar.dot(stretch))
     for c in ti.static(range(3)):
         add(False, sums, mat_bar + (ANCHOR + c) * points, spring * push_bar[c])
-    vector = (b * BUNDLE + 9) * points + p
-    store_vector(scratch, ints[POINT_SUM] + vector, points, -spring * push_bar)
+    return -spring * push_bar
+
+
+@ti.func
+def stress_point_adjoint(
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    kept: ti.template(),
+    bar: ti.template(),
+    back: ti.template(),
+    sums: ti.template(),
+    pad: ti.template(),
+    base,
+    cell,
+    q,
+    t,
+    b,
+    p,
+):
+    """Adjoint of ``total.stress_point``: sums of its own; hands over the gradients by F and by the place of point p."""
+    zero = fixed[STEP_SIZE] * 0
+    F_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    place_bar = ti.Vector([zero, zero, zero])
+    kind = ti.cast(ABSENT, ti.i32)
+    if p >= 0:
+        kind = ints[head[KIND] + p]
+    points, elements, nodes = product(points_per_axis(head)), head[ELEMENTS], product(nodes_per_axis(head))
+    mine = b * COEFFICIENTS * points + p
+    mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
+    if kind >= 0 and t + 1 < head[STEPS]:
+        # The gradient by a chamber's volume is known one pass after the points that fill it.
+        by_volume = back[head[VOLUME_BAR] + b * head[CHAMBERS] + kind]
+        add(False, sums, mat_bar + VOLUME * points, by_volume * back[head[JACOBIANS] + b * points + p])
+    if t >= 0 and kind != ABSENT:
+        history = b * state_length(head) + 6 * nodes + p
+        maxwell = (t * head[BATCH] + b) * state_length(head) + 6 * nodes + p
+        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
+        P_bar = -volume * tile_gradient(head, fixed, pad, base, 1, cell, q)
+        work = volume * 0  # P : P_bar, by which the gradient by the volume is known
+        if kind < 0:
+            bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
+            least = least_ratio(void_fraction)
+            Q = F * 0
+            S = F * 0
+            factor, linear, square = void_fraction * 0 + 1, void_fraction * 0, void_fraction * 0
+            if ti.static(stiffens):
+                linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
+                factor = stiffening(F, least, linear, square)
+            if elements > 0 and void_fraction < 1:
+                S = factor * pull_back(F, least)
+                for e in range(elements):
+                    number = head[ELEMENT] + (b * elements + e) * PRONY
+                    Z = load_symmetric(state, maxwell + 6 * e * points, points)
+                    Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
+            by_F, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
+                F, Q, bulk, shear, factor, void_fraction, P_bar
+            )
+            F_bar = by_F
+            work = bulk * bulk_bar + shear * shear_bar
+            add(False, sums, mat_bar + BULK * points, bulk_bar)
+            add(False, sums, mat_bar + SHEAR * points, shear_bar)
+            add(False, sums, mat_bar + VOID_FRACTION * points, void_bar)
+            if elements > 0 and void_fraction < 1:
+                S_bar = maxwell_adjoint(head, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar)
+                F_bar += pull_back_adjoint(F, least, factor * S_bar)
+                if ti.static(stiffens):
+                    factor_bar += contract(S_bar, pull_back(F, least))
+            else:
+                for c in range(6 * elements):
+                    bar[history + c * points] = 0
+            if ti.static(stiffens):
+                by_F, linear_bar, square_bar = stiffening_adjoint(F, least, linear, square, factor_bar)
+                F_bar += by_F
+                add(False, sums, mat_bar + STIFFENING * points, linear_bar)
+                add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
+        else:
+            for c in range(6 * elements):
+                bar[history + c * points] = 0
+            cof = cofactor(F)
+            one = b * head[CHAMBERS] + kind
+            step = t * head[BATCH] * head[CHAMBERS] + one
+            p_act, swelled = supply[head[PRESSURE] + step], kept[head[VOLUMES] + step]
+            pressure = chamber_pressure(head, fixed, p_act, swelled, one)
+            shear_bar = void_work(F, P_bar)
+            F_bar = void_piola_adjoint(F, shear, P_bar) - pressure * cross(F, P_bar)
+            work = shear * shear_bar - pressure * contract(P_bar, cof)
+            add(False, sums, mat_bar + SHEAR * points, shear_bar)
+            back[head[JACOBIANS] + b * points + p] = contract(cof, F) / 3
+        if ti.static(loaded):
+            if kind < 0 and head[VISCOUS] == 1:
+                eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
+                rate = tile_gradient(head, fixed, pad, base, 2, cell, q)
+                by_F, _, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
+                F_bar += by_F
+                work += eta * eta_bar + zeta * zeta_bar
+                add(False, sums, mat_bar + VISCOSITY * points, eta_bar)
+                add(False, sums, mat_bar + VOLUME_VISCOSITY * points, zeta_bar)
+            if head[SPRINGS] == 1:
+                place_bar = external_adjoint(head, fixed, pad, base, cell, q, sums, b, p)
+        add(False, sums, mat_bar + VOLUME * points, work / volume)
+    hand_over(pad, base, q, F_bar)
+    if ti.static(loaded):
+        hand_over_vector(pad, base, q, place_bar)
+
+
+@ti.func
+def rate_point_adjoint(
+    head: ti.template(), ints: ti.template(), fixed: ti.template(), pad: ti.template(), base, cell, q, b, p
+):
+    """Hand over the gradient by the rate of F at point p, through viscosity."""
+    zero = fixed[STEP_SIZE] * 0
+    rate_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    if p >= 0:
+        if ints[head[KIND] + p] == -1:
+            points = product(points_per_axis(head))
+            mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
+            F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(head, fixed, pad, base, 1, cell, q)
+            rate = tile_gradient(head, fixed, pad, base, 2, cell, q)
+            eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
+            _, by_rate, _, _ = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
+            rate_bar = by_rate
+    hand_over(pad, base, q, rate_bar)
+
+
+@ti.func
+def point_pass_adjoint(
+    gpu: ti.template(),
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    kept: ti.template(),
+    scratch: ti.template(),
+    bar: ti.template(),
+    back: ti.template(),
+    sums: ti.template(),
+    pad: ti.template(),
+    base,
+    item,
+    t,
+    q0,
+    q1,
+):
+    """Adjoint of ``total.point_pass``."""
+    b, tile = item // tile_count(head), item % tile_count(head)
+    cell, cells, node = tile_box(head, ints, tile)
+    nodes = product(nodes_per_axis(head))
+    at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
+    viscous = ti.cast(0, ti.i32)
+    stage(head, state, at, pad, base, 0, node, q0, q1)
+    stage(head, back, head[FORCES] + b * 3 * nodes, pad, base, 1, node, q0, q1)
+    if ti.static(loaded):
+        viscous = head[VISCOUS]
+        if viscous == 1:
+            stage(head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)
+    sync(gpu)
+    partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+    first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
+    for slot in range(first - 1, last + viscous):
+        # The tile's own slot, then those of the chambers that it has points of, then that of the rates of F.
+        out = partials + tile * SLOT
+        alone = ti.cast(-1, ti.i32)
+        if slot < first:
+            for q in range(q0, q1):
+                p = point_of(head, cell, cells, q)
+                stress_point_adjoint(
+                    *(loaded, stiffens, head, ints, fixed, supply, state, kept, bar, back, sums),
+                    *(pad, base, cell, q, t, b, p),
+                )
+        elif slot < last:
+            out = partials + (tile_count(head) + slot) * SLOT
+            alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
+            for q in range(q0, q1):
+                p = point_of(head, cell, cells, q)
+                mine = ti.cast(0, ti.i32)
+                if p >= 0:
+                    mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
+                volume, _, cof = chamber_share(head, fixed, pad, base, cell, q, b, p, mine)
+                P_bar = tile_gradient(head, fixed, pad, base, 1, cell, ti.select(mine == 1, q, 0))
+                pad[base + ALONE + q] = volume * contract(P_bar, cof)
+        else:
+            out = partials + (tile_count(head) + chamber_slots(head, ints) + tile) * SLOT
+            if ti.static(loaded):
+                for q in range(q0, q1):
+                    p = point_of(head, cell, cells, q)
+                    rate_point_adjoint(head, ints, fixed, pad, base, cell, q, b, p)
+        sync(gpu)
+        own = ti.cast(slot < first, ti.i32)
+        sum_tile(gpu, loaded, head, fixed, pad, base, own, cell, cells, scratch, out, scratch, alone, q0, q1)
+
+
+@ti.func
+def node_pass_adjoint(
+    gpu: ti.template(),
+    loaded: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    supply: ti.template(),
+    state: ti.template(),
+    kept: ti.template(),
+    scratch: ti.template(),
+    bar: ti.template(),
+    back: ti.template(),
+    sums: ti.template(),
+    pad: ti.template(),
+    base,
+    item,
+    t,
+    q0,
+    q1,
+):
+    """Adjoint of ``total.node_pass``."""
+    nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
+    b, chunk = item // node_chunks(head), item % node_chunks(head)
+    sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
+    for q in range(q0, q1):
+        i = chunk * TILE + q
+        if i < chambers and t + 1 < head[STEPS]:
+            chamber_adjoint(head, fixed, kept, back, sums, t + 1, b * chambers + i, pad[base + TOTALS + i])
+        if i < nodes:
+            node_adjoint(head, ints, fixed, supply, state, kept, scratch, bar, back, sums, pad, base, t, b, i, loaded)
+    sync(gpu)
 
 
 @ti.kernel
 def total_substep_adjoint(
-    repeats: ti.template(),
     loaded: ti.template(),
     stiffens: ti.template(),
+    t: ti.i32,
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -326,140 +574,77 @@ def total_substep_adjoint(
     back: Reals,
     sums: Reals,
 ):
-    """Go back by ``repeats`` substeps, but not below ints[STOP]; substep -1 only finishes the sums of the first."""
-    n = points_per_axis(ints)
-    node_threads = ints[BATCH] * (product(nodes_per_axis(n)) + ints[CHAMBERS])
-    point_threads, line_threads = ints[BATCH] * (product(n) + ints[TALLIES]), line_tasks(ints, n)
-    sheet_threads = sheet_tasks(ints, n)
-    for _ in ti.static(range(repeats)):
-        for w in range(node_threads):
-            t = ints[NOW]
-            if t >= ints[STOP]:
-                n = points_per_axis(ints)
-                nodes, chambers = product(nodes_per_axis(n)), ints[CHAMBERS]
-                b, i = w // (nodes + chambers), w % (nodes + chambers)
-                if i < nodes:
-                    node_adjoint(ints, fixed, supply, state, kept, scratch, bar, back, sums, t, b, i, n, loaded)
-                elif t + 1 < ints[STEPS]:
-                    chamber_adjoint(ints, fixed, kept, scratch, back, sums, t + 1, b * chambers + i - nodes)
-        for w in range(point_threads):
-            t = ints[NOW]
-            n = points_per_axis(ints)
-            points, nodes, elements = product(n), product(nodes_per_axis(n)), ints[ELEMENTS]
-            b, p = w // (points + ints[TALLIES]), w % (points + ints[TALLIES])
-            if t >= ints[STOP] and p >= points:
+    """Back by substep t on a CPU; substep -1 only finishes the sums of the first."""
+    for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
+        if w % CPU_UNIT == 0:
+            item = w // CPU_UNIT
+            pad = ints[PADS] + item * PAD
+            node_pass_adjoint(
+                *(False, loaded, ints, ints, fixed, supply, state, kept, scratch, bar, back, sums),
+                *(scratch, pad, item, t, 0, TILE),
+            )
+    for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
+        if w % CPU_UNIT == 0:
+            item = w // CPU_UNIT
+            pad = ints[PADS] + item * PAD
+            point_pass_adjoint(
+                *(False, loaded, stiffens, ints, ints, fixed, supply, state, kept, scratch, bar, back, sums),
+                *(scratch, pad, item, t, 0, TILE),
+            )
+    for w in range(ints[BATCH] * ints[TALLIES]):
+        if t >= 0:
+            tally(ints, ints, fixed, bar, back, sums, t, w // ints[TALLIES], w % ints[TALLIES])
+
+
+@ti.kernel
+def total_march_adjoint(
+    real: ti.template(),
+    most: ti.template(),
+    loaded: ti.template(),
+    stiffens: ti.template(),
+    first: ti.i32,
+    last: ti.i32,
+    ints: Integers,
+    fixed: Reals,
+    supply: Reals,
+    state: Reals,
+    kept: Reals,
+    scratch: Reals,
+    bar: Reals,
+    back: Reals,
+    sums: Reals,
+):
+    """Back from substep ``last - 1`` to ``first`` on a GPU, as ``total.total_march``."""
+    ti.loop_config(block_dim=TILE)
+    for w in range(most * TILE):
+        q, block = w % TILE, w // TILE
+        head = ti.simt.block.SharedArray((HEAD,), ti.i32)
+        pad = ti.simt.block.SharedArray((PAD,), real)
+        if q < HEAD:
+            head[q] = ints[q]
+        sync(True)
+        blocks = head[BLOCKS]
+        if block < blocks:
+            for passed in range(last - first):
+                t = last - 1 - passed
+                item = block
+                while item < head[BATCH] * node_chunks(head):
+                    node_pass_adjoint(
+                        *(True, loaded, head, ints, fixed, supply, state, kept, scratch, bar, back, sums),
+                        *(pad, 0, item, t, q, q + 1),
+                    )
+                    item += blocks
+                meet(ints, blocks, q)
+                item = block
+                while item < head[BATCH] * tile_count(head):
+                    point_pass_adjoint(
+                        *(True, loaded, stiffens, head, ints, fixed, supply, state, kept, scratch, bar, back, sums),
+                        *(pad, 0, item, t, q, q + 1),
+                    )
+                    item += blocks
                 if t >= 0:
-                    tally(ints, fixed, bar, back, sums, t, b, p - points, n)
-            elif t >= ints[STOP] and ints[ints[KIND] + p] != ABSENT:
-                kind = ints[ints[KIND] + p]
-                mine = b * COEFFICIENTS * points + p
-                mat, mat_bar = ints[COEFFICIENT] + mine, ints[COEFFICIENT_BAR] + mine
-                if kind >= 0 and t + 1 < ints[STEPS]:
-                    # The gradient by a chamber's volume is known one pass after the points that fill it.
-                    by_volume = back[ints[VOLUME_BAR] + b * ints[CHAMBERS] + kind]
-                    gas = b * ints[ints[FILLED] + ints[CHAMBERS]] + ints[ints[RANK] + p]
-                    add(False, sums, mat_bar + VOLUME * points, by_volume * back[ints[JACOBIANS] + gas])
-                if t >= 0:
-                    at = (t * ints[BATCH] + b) * state_length(ints, n)
-                    history = b * state_length(ints, n) + 6 * nodes + p
-                    F = plus_identity(gather_gradient(ints, fixed, state, at, p, n), 1)
-                    volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-                    P_bar = -volume * gather_gradient(ints, fixed, back, ints[FORCES] + b * 3 * nodes, p, n)
-                    F_bar = F * 0
-                    work = volume * 0  # P : P_bar, by which the gradient by the volume is known
-                    if kind < 0:
-                        bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
-                        Q = F * 0
-                        S = F * 0
-                        factor, linear, square = void_fraction * 0 + 1, void_fraction * 0, void_fraction * 0
-                        if ti.static(stiffens):
-                            linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
-                            factor = stiffening(F, least_ratio(void_fraction), linear, square)
-                        if elements > 0 and void_fraction < 1:
-                            S = factor * pull_back(F, least_ratio(void_fraction))
-                            for e in range(elements):
-                                number = ints[ELEMENT] + (b * elements + e) * PRONY
-                                Z = load_symmetric(state, at + 6 * nodes + p + 6 * e * points, points)
-                                Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
-                        by_F, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
-                            F, Q, bulk, shear, factor, void_fraction, P_bar
-                        )
-                        F_bar = by_F
-                        work = bulk * bulk_bar + shear * shear_bar
-                        add(False, sums, mat_bar + BULK * points, bulk_bar)
-                        add(False, sums, mat_bar + SHEAR * points, shear_bar)
-                        add(False, sums, mat_bar + VOID_FRACTION * points, void_bar)
-                        if elements > 0 and void_fraction < 1:
-                            maxwell = at + 6 * nodes + p
-                            S_bar = maxwell_adjoint(
-                                ints, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar
-                            )
-                            F_bar += pull_back_adjoint(F, least_ratio(void_fraction), factor * S_bar)
-                            if ti.static(stiffens):
-                                factor_bar += contract(S_bar, pull_back(F, least_ratio(void_fraction)))
-                        else:
-                            for c in range(6 * elements):
-                                bar[history + c * points] = 0
-                        if ti.static(stiffens):
-                            by_F, linear_bar, square_bar = stiffening_adjoint(
-                                F, least_ratio(void_fraction), linear, square, factor_bar
-                            )
-                            F_bar += by_F
-                            add(False, sums, mat_bar + STIFFENING * points, linear_bar)
-                            add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
-                    else:
-                        for c in range(6 * elements):
-                            bar[history + c * points] = 0
-                        cof = cofactor(F)
-                        one = b * ints[CHAMBERS] + kind
-                        step = t * ints[BATCH] * ints[CHAMBERS] + one
-                        p_act, swelled = supply[ints[PRESSURE] + step], kept[ints[VOLUMES] + step]
-                        pressure = chamber_pressure(ints, fixed, p_act, swelled, one)
-                        by_F, shear_bar = void_piola_adjoint(F, shear, P_bar), void_work(F, P_bar)
-                        p_bar = -contract(P_bar, cof)
-                        F_bar = by_F - pressure * cross(F, P_bar)
-                        work = shear * shear_bar + pressure * p_bar
-                        add(False, sums, mat_bar + SHEAR * points, shear_bar)
-                        store_matrix(scratch, ints[AREA] + one * BUNDLE * points + p, points, volume * cof)
-                        gas = b * ints[ints[FILLED] + ints[CHAMBERS]] + ints[ints[RANK] + p]
-                        scratch[ints[SWEPT] + gas] = p_bar
-                        back[ints[JACOBIANS] + gas] = contract(cof, F) / 3
-                    if ti.static(loaded):
-                        eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                        rate_bar = F * 0
-                        if kind < 0 and ints[VISCOUS] == 1:
-                            rate = gather_gradient(ints, fixed, state, at + 3 * nodes, p, n)
-                            by_F, by_rate, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
-                            F_bar += by_F
-                            rate_bar = by_rate
-                            work += eta * eta_bar + zeta * zeta_bar
-                            add(False, sums, mat_bar + VISCOSITY * points, eta_bar)
-                            add(False, sums, mat_bar + VOLUME_VISCOSITY * points, zeta_bar)
-                        store_matrix(back, ints[RATES] + b * BUNDLE * points + p, points, rate_bar)
-                        if ints[SPRINGS] == 1:
-                            external_adjoint(ints, fixed, state, at, back, scratch, sums, b, p, n)
-                        else:
-                            vector = ints[POINT_SUM] + (b * BUNDLE + 9) * points + p
-                            store_vector(scratch, vector, points, load_vector(fixed, CORNER, 1) * 0)
-                    add(False, sums, mat_bar + VOLUME * points, work / volume)
-                    store_matrix(scratch, ints[POINT_SUM] + b * BUNDLE * points + p, points, F_bar)
-        for w in range(line_threads):
-            if w == 0 and ints[NOW] >= ints[STOP]:
-                ints[NOW] = ints[NOW] - 1
-            n = points_per_axis(ints)
-            sum_lines(ints, fixed, scratch, w, n, loaded)
-            if ti.static(loaded):
-                count = line_count(n)
-                if w < ints[BATCH] * count:
-                    b, line = w // count, w % count
-                    rates, lines = ints[RATES] + b * BUNDLE * product(n), ints[RATE_LINES] + b * LINE * count
-                    sum_line(fixed, back, rates, back, lines, line, n, False)
-        for w in range(sheet_threads):
-            n = points_per_axis(ints)
-            sum_sheets(ints, fixed, scratch, w, n)
-            if ti.static(loaded):
-                count = sheet_count(n)
-                if w < ints[BATCH] * count:
-                    b, sheet = w // count, w % count
-                    lines, sheets = ints[RATE_LINES] + b * LINE * line_count(n), ints[RATE_SHEETS] + b * SHEET * count
-                    sum_sheet(fixed, back, lines, sheets, sheet, n)
+                    row = w
+                    while row < head[BATCH] * head[TALLIES]:
+                        tally(head, ints, fixed, bar, back, sums, t, row // head[TALLIES], row % head[TALLIES])
+                        row += blocks * TILE
+                meet(ints, blocks, q)

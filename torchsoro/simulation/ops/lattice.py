@@ -6,59 +6,34 @@ import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.axis import GAUSS, MARK, Axis
 from torchsoro.simulation.ops.inertia import Matching
 
 # Places of a cell's two points per axis: the two of Gauss, for which the pressure of a uniformly deformed chamber does
 # no work inside it; and those of the particles, where motion is recorded.
-QUADRATURE = 0.5 / math.sqrt(3.0)
-PARTICLES = 0.25
+QUADRATURE, PARTICLES = GAUSS, MARK
 # The centre of the matter that a node outside of a face carries is 3/4 of a cell away, the face half a cell.
 _DEPTH = 0.25
 _OFF = 1e-3  # how far a particle may be from its place, in particle spacings
 
-
-@lru_cache(maxsize=256)
-def spline(count: int, place: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights of a line's nodes at its points, the distances from node to point, and the slopes; in cells.
-
-    Args:
-        count: Points along the axis, an even number.
-        place: Of the two points of a cell, from its centre.
-
-    Returns:
-        Three float64 matrices [count, count / 2 + 2].
-    """
-    cells = count // 2
-    weight, slope = torch.zeros(2, count, cells + 2, dtype=torch.float64)
-    cell = torch.arange(cells)
-    for odd, sign in enumerate((-1, 1)):
-        f = 1 + sign * place
-        numbers = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2)
-        slopes = (f - 1.5, -2 * (f - 1), f - 0.5)
-        for k in range(3):
-            weight[2 * cell + odd, cell + k] = numbers[k]
-            slope[2 * cell + odd, cell + k] = slopes[k]
-    points = (
-        (torch.arange(count) // 2).double() + 0.5 + torch.tensor([-place, place], dtype=torch.float64).repeat(cells)
-    )
-    nodes = torch.arange(cells + 2).double() - 0.5
-    return weight, points[:, None] - nodes[None, :], slope
+_uniform = lru_cache(maxsize=256)(Axis.uniform)  # one axis, so one set of matrices, for equal arguments
 
 
 @lru_cache(maxsize=1024)
-def _matrix(kind: str, count: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A matrix [points, nodes] of an axis: "weight", "slope" (1/cell), "moment" (cells), "mark", or "back"."""
-    weight, distance, slope = spline(count, QUADRATURE)
-    mark = spline(count, PARTICLES)[0]
-    if kind == "back":
-        found = torch.linalg.pinv(mark).T
-    else:
-        found = {"weight": weight, "slope": slope, "moment": weight * distance, "mark": mark}[kind]
-    return found.to(dtype=dtype, device=device)
+def _matrix(kind: str, axis: Axis, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """A matrix [points, nodes] of an axis: "weight", "slope" (1/m), "moment" (m), "mark", or "back"."""
+    weight, slope = axis.tabulate(PARTICLES if kind in ("mark", "back") else QUADRATURE)
+    values = slope if kind == "slope" else weight
+    if kind == "moment":
+        values = weight * (axis.points[..., None] - axis.places[axis.first[:, None, None] + np.arange(3)])
+    wide = np.zeros((axis.cells, 2, axis.nodes))
+    np.put_along_axis(wide, axis.first[:, None, None] + np.arange(3) + np.zeros((1, 2, 1), int), values, 2)
+    found = torch.from_numpy(wide.reshape(-1, axis.nodes))
+    return (torch.linalg.pinv(found).T if kind == "back" else found).to(dtype=dtype, device=device)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -66,16 +41,31 @@ class Lattice:
     """A box of 2 x 2 x 2 points per cell around a body, and its nodes.
 
     Attributes:
-        points: Points along x, y, z; even numbers.
-        low: Lower corner [m].
-        cell: Edge of a cell [m].
+        axes: Along x, y, z.
         index: int64 [N], the point of each particle; None if there is one for each, in the same order.
     """
 
-    points: tuple[int, int, int]
-    low: tuple[float, float, float]
-    cell: float
+    axes: tuple[Axis, Axis, Axis]
     index: Tensor | None = None
+
+    @classmethod
+    def uniform(
+        cls,
+        points: tuple[int, int, int],
+        low: tuple[float, float, float],
+        cell: float,
+        index: Tensor | None = None,
+    ) -> Lattice:
+        """Cubic cells with an edge of ``cell`` [m] from a lower corner [m] on, with nodes in front of all faces.
+
+        Args:
+            points: Points along x, y, z; even numbers.
+            low: Lower corner [m].
+            cell: Edge of a cell [m].
+            index: As the attribute.
+        """
+        x, y, z = (_uniform(a, cell, n // 2) for a, n in zip(low, points, strict=True))
+        return cls(axes=(x, y, z), index=index)
 
     @classmethod
     def around(cls, position: Tensor, cell: float) -> Lattice:
@@ -110,7 +100,13 @@ class Lattice:
             raise ValueError("body.position: two particles share a lattice place, wanted one particle for each")
         every = len(index) == nx * ny * nz and bool((index == torch.arange(len(index), device=x.device)).all())
         a, b, c = low.tolist()
-        return cls(points=(nx, ny, nz), low=(a, b, c), cell=cell, index=None if every else index)
+        return cls.uniform((nx, ny, nz), (a, b, c), cell, None if every else index)
+
+    @property
+    def points(self) -> tuple[int, int, int]:
+        """Points along x, y, z."""
+        x, y, z = (2 * a.cells for a in self.axes)
+        return x, y, z
 
     @property
     def count(self) -> int:
@@ -120,13 +116,18 @@ class Lattice:
     @property
     def shape(self) -> tuple[int, int, int]:
         """Nodes along x, y, z."""
-        nx, ny, nz = (n // 2 + 2 for n in self.points)
-        return nx, ny, nz
+        x, y, z = (a.nodes for a in self.axes)
+        return x, y, z
 
     @property
     def nodes(self) -> int:
         """Number of nodes."""
         return math.prod(self.shape)
+
+    @cached_property
+    def cell(self) -> float:
+        """Edge of the largest cell [m]."""
+        return max(float(a.widths.max()) for a in self.axes)
 
     def spread(self, values: Tensor, empty: float = 0.0) -> Tensor:
         """From particles to points: [..., N] to [..., points], differentiable."""
@@ -138,16 +139,12 @@ class Lattice:
     @cached_property
     def places(self) -> Tensor:
         """Reference places of the particles of all points [points, 3] m, float64."""
-        axes = [
-            low + (torch.arange(n).double() + 0.5) * self.cell / 2 for n, low in zip(self.points, self.low, strict=True)
-        ]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        return _mesh(*(a.inside(PARTICLES).reshape(-1) for a in self.axes))
 
     @cached_property
     def node_places(self) -> Tensor:
         """Reference places of the nodes [nodes, 3] m, float64."""
-        axes = [low + (torch.arange(n).double() - 0.5) * self.cell for n, low in zip(self.shape, self.low, strict=True)]
-        return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+        return _mesh(*(a.places for a in self.axes))
 
     def to_nodes(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
         """Sum over points, with weights or another kind of matrix (and one more along an axis): [..., nodes]."""
@@ -163,7 +160,7 @@ class Lattice:
 
     def _matrices(self, like: Tensor, kind: str, along: tuple[int, str] | None) -> list[Tensor]:
         kinds = [along[1] if along and a == along[0] else kind for a in range(3)]
-        return [_matrix(k, n, like.dtype, like.device) for k, n in zip(kinds, self.points, strict=True)]
+        return [_matrix(k, a, like.dtype, like.device) for k, a in zip(kinds, self.axes, strict=True)]
 
     def nodal(self, mass: Tensor, drag: Tensor, dt: float) -> Tensor:
         """What kernels need to know of the nodes.
@@ -175,22 +172,42 @@ class Lattice:
 
         Returns:
             [B, 5, nodes], differentiable: mass in kg; the way from the node to the surface of the matter that it
-            carries, along x, y, z in cells; what drag, taken implicitly, leaves of its velocity in a substep.
+            carries, along x, y, z, as share of that to the next node; what drag, taken implicitly, leaves of its
+            velocity in a substep.
         """
         lumped = self.to_nodes(mass)
         there = lumped > 0
         safe = torch.where(there, lumped, torch.ones_like(lumped))
-        ways = []
-        for axis in range(3):
-            center = self.to_nodes(mass, along=(axis, "moment")) / safe
-            way = torch.sign(center) * torch.relu(center.abs() - _DEPTH - 1e-6)
-            ways.append(torch.where(there, way, torch.zeros_like(way)))
+        ways = [torch.where(there, self._reach(mass, safe, axis)[0], torch.zeros_like(lumped)) for axis in range(3)]
         factor = safe / (safe + dt * self.to_nodes(drag))
         return torch.stack([self._matching(lumped).matched.to(mass), *ways, factor], 1)
 
+    def _reach(self, mass: Tensor, total: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The reaches of :meth:`nodal` along an axis, the centre of mass from the node [m], and d reach / d centre.
+
+        A node of which the matter fills all that its spline covers, or half of it, reaches nowhere.
+        """
+        a = self.axes[axis]
+        gaps = np.diff(a.places)
+        rows = np.stack([a.centers, _DEPTH * a.spans, a.spans, np.append(gaps, 1.0), np.append(1.0, gaps)])
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        middle, depth, span, up, down = (
+            row.view(shape).expand(self.shape).reshape(-1) for row in torch.from_numpy(rows).to(total)
+        )
+        center = self.to_nodes(mass, along=(axis, "moment")) / total
+        off = center - middle
+        gap = torch.where(off > 0, up, down)
+        beyond = off.abs() - depth - 1e-6 * span
+        return (
+            torch.sign(off) * torch.relu(beyond) / gap,
+            center,
+            torch.where(beyond > 0, 1 / gap, torch.zeros_like(off)),
+        )
+
     def _matching(self, lumped: Tensor) -> Matching:
         """Lumped masses of the nodes [B, nodes], with the body's moments of inertia."""
-        return Matching.of(lumped, self.node_places, torch.full((self.nodes, 3), self.cell**2 / 4))
+        return Matching.of(lumped, self.node_places, _mesh(*(a.spreads for a in self.axes)))
 
     def nodal_mass(self, mass: Tensor) -> Tensor:
         """Masses of the nodes [B, nodes] kg, from those of the points [B, points]: the first of :meth:`nodal`."""
@@ -210,16 +227,15 @@ class Lattice:
         total_bar = total_bar + torch.where(there, by_factor * resistance, torch.zeros_like(lumped))
         mass_bar = torch.zeros_like(mass)
         for axis in range(3):
-            center = self.to_nodes(mass, along=(axis, "moment")) / safe
-            moved = there & (center.abs() > _DEPTH + 1e-6)
-            moment_bar = torch.where(moved, bar[:, 1 + axis] / safe, torch.zeros_like(lumped))
+            _, center, slope = self._reach(mass, safe, axis)
+            moment_bar = torch.where(there, bar[:, 1 + axis] * slope / safe, torch.zeros_like(lumped))
             total_bar = total_bar - moment_bar * center
             mass_bar += self.to_points(moment_bar, along=(axis, "moment"))
         return mass_bar + self.to_points(total_bar), -dt * self.to_points(by_factor * safe)
 
     def gradient(self, field: Tensor) -> Tensor:
         """Gradient at all places of quadrature of a nodal vector field: [B, 3, nodes] to [B, 3, 3, points]."""
-        return torch.stack([self.to_points(field, along=(axis, "slope")) / self.cell for axis in range(3)], 2)
+        return torch.stack([self.to_points(field, along=(axis, "slope")) for axis in range(3)], 2)
 
     def stencil(self, points: Tensor, *, place: float) -> tuple[Tensor, Tensor, Tensor]:
         """Nodes of some points, their weights, and slopes.
@@ -231,17 +247,15 @@ class Lattice:
         Returns:
             int64 [P, 27]; [P, 27]; [P, 3, 27] in 1/m.
         """
-        points = points.cpu()
-        _, ny, nz = self.points
+        at = torch.unravel_index(points.cpu(), self.points)
+        weights, slopes, low = [], [], []
+        for axis, p in zip(self.axes, at, strict=True):
+            weight, slope = (torch.from_numpy(t.reshape(-1, 3)) for t in axis.tabulate(place))
+            weights.append(weight[p])
+            slopes.append(slope[p])
+            low.append(torch.from_numpy(axis.first)[p // 2])
         _, my, mz = self.shape
-        low = torch.stack([points // (ny * nz), points // nz % ny, points % nz], 1)
-        weights, slopes = [], []
-        for axis in range(3):
-            weight, _, slope = spline(self.points[axis], place)
-            columns = (low[:, axis] // 2)[:, None] + torch.arange(3)
-            weights.append(weight[low[:, axis, None], columns])
-            slopes.append(slope[low[:, axis, None], columns] / self.cell)
-        corner = ((low[:, 0] // 2) * my + low[:, 1] // 2) * mz + low[:, 2] // 2
+        corner = (low[0] * my + low[1]) * mz + low[2]
         three = torch.arange(3)
         offsets = ((three[:, None, None] * my + three[None, :, None]) * mz + three[None, None, :]).reshape(-1)
 
@@ -274,10 +288,17 @@ class Lattice:
         return found.to(values.dtype)
 
 
-def numbers(lattice: Lattice, dt: float) -> list[float]:
-    """What kernels need to know of a lattice, in the order of ``kernels.layout``."""
-    weight, _, slope = spline(2, QUADRATURE)
-    table = [*weight.reshape(-1).tolist(), *(slope / lattice.cell).reshape(-1).tolist()]
-    found = [dt, lattice.cell, *lattice.low, *table]
-    assert len(found) == layout.LATTICE_NUMBERS
-    return found
+def _mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3))
+
+
+def numbers(lattice: Lattice, dt: float) -> Tensor:
+    """What kernels need to know of a lattice, float64: substep and cell, then axis by axis.
+
+    Of an axis: three weights and three slopes [1/m] for each point; the places of the particles and of the nodes [m].
+    """
+    rows = [np.array([dt, lattice.cell])]
+    for axis in lattice.axes:
+        table = np.concatenate([t.reshape(-1, 3) for t in axis.table], 1)
+        rows += [table.reshape(-1), axis.inside(PARTICLES).reshape(-1), axis.places]
+    return torch.from_numpy(np.concatenate(rows))

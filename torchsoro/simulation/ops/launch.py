@@ -19,7 +19,7 @@ from torch import Tensor
 _compiled: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
 
 
-def capture(kernel, *arguments) -> Callable[[int], None]:
+def capture(kernel, *arguments) -> Callable[..., None]:
     """Fix a kernel's arguments: templates, contiguous tensors on Taichi's device, and integers.
 
     This does by hand, once, what ``Kernel.launch_kernel`` of Taichi 1.7 does on every call.
@@ -29,7 +29,8 @@ def capture(kernel, *arguments) -> Callable[[int], None]:
         *arguments: Its arguments; the tensors are kept alive by the returned function.
 
     Returns:
-        A function that launches the kernel so many times.
+        A function that launches the kernel so many times, with other integers in place of the first ones if it is given
+        some.
     """
     primal = kernel._primal
     compiled = primal.compiled_kernels[primal.ensure_compiled(*arguments)]
@@ -61,8 +62,11 @@ def capture(kernel, *arguments) -> Callable[[int], None]:
     # A launch on CUDA moves the arguments to the device and leaves the context unusable.
     lasting = None if any(value.is_cuda for value in values if isinstance(value, Tensor)) else prepare()
 
-    def launch(times: int, alive: tuple = arguments) -> None:
+    def launch(times: int, *others: int, alive: tuple = arguments) -> None:
         for _ in range(times):
-            program.launch_kernel(data, lasting or prepare())
+            context = lasting or prepare()
+            for (slot, _), value in zip(integers, others, strict=False):
+                context.set_arg_int(slot, value)
+            program.launch_kernel(data, context)
 
     return launch

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache
 from weakref import WeakKeyDictionary
 
+import numpy as np
+import taichi as ti
 import torch
 from torch import Tensor
 
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.kernels import layout, total, total_adjoint
-from torchsoro.simulation.ops.lattice import QUADRATURE, numbers, spline
+from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.ops.segment import empty_record
+from torchsoro.simulation.ops.tiles import tables, tile_count, tile_counts
 from torchsoro.simulation.runtime import init
 
 CHUNK = 1024  # substeps between two checks for divergence
-REPEATS = 2  # substeps in a launch on a GPU, forward; backward a launch takes less time than the substep
+BLOCKS = 2  # of 256 threads that a multiprocessor runs at a time: Taichi asks for so many, at 128 registers a thread
 TALLIES = 64  # shares in which sums over all nodes or points are taken
 _NEVER = 2**31 - 1
 
@@ -66,26 +70,17 @@ class Arena:
 _tables: WeakKeyDictionary[Scene, Arena] = WeakKeyDictionary()
 
 
-def _integers(scene: Scene) -> list[Tensor]:
+def _integers(scene: Scene, chambers: int) -> list[Tensor]:
     """In the order of ``layout.BUFFERS``."""
     assert scene.lattice is not None
-    kind, (nx, ny, nz), (mx, my, mz) = scene.kind, scene.lattice.points, scene.lattice.shape
-    x, y, z = torch.meshgrid(*(torch.arange(n, device=kind.device) for n in (nx, ny, nz)), indexing="ij")
-    corner = (((x // 2 * my + y // 2) * mz + z // 2) * 8 + 4 * (x % 2) + 2 * (y % 2) + z % 2).reshape(-1)
-    gas = [(kind == c).nonzero().squeeze(1) for c in range(int(kind.max()) + 1)]
-    members = torch.cat([kind.new_zeros(0).long(), *gas])
-    rank = torch.zeros_like(kind).index_copy(0, members, torch.arange(len(members), device=kind.device).to(kind))
-    filled = torch.tensor([0, *(len(g) for g in gas)]).cumsum(0)
-    # Lines, sheets and nodes whose support contains points of a chamber.
-    wx, wy, wz = (spline(n, QUADRATURE)[0].to(kind.device) for n in scene.lattice.points)
-    near = [[kind.new_zeros(0, n)] for n in (nx * ny * mz, nx * my * mz, mx * my * mz)]
-    for c in range(len(gas)):
-        line = (kind == c).double().view(nx, ny, nz) @ wz
-        sheet = torch.einsum("xyk,yj->xjk", line, wy)
-        node = torch.einsum("xjk,xi->ijk", sheet, wx)
-        for rows, row in zip(near, (line, sheet, node), strict=True):
-            rows.append((row.reshape(1, -1) > 0).to(kind))
-    return [kind, scene.plane_kind, corner.to(kind), rank, filled.to(kind), *map(torch.cat, near)]
+    found = tables(scene.lattice, scene.kind, chambers)
+    return [scene.kind, scene.plane_kind, *(torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in found)]
+
+
+@lru_cache
+def most_blocks(device: torch.device) -> int:
+    """Blocks that a GPU runs at the same time."""
+    return BLOCKS * torch.cuda.get_device_properties(device).multi_processor_count
 
 
 class TotalSegmentIntegrator:
@@ -112,24 +107,25 @@ class TotalSegmentIntegrator:
         self.elements, self.chambers = inputs.prony.shape[1], inputs.pressure.shape[2]
         self.planes, self.groups = inputs.planes.shape[1], scene.share.shape[0]
         self.loaded = scene.viscous or scene.springs or self.groups > 0
-        nx, ny, _ = self.lattice.points
-        _, my, mz = self.lattice.shape
-        self.lines, self.sheets = nx * ny * mz, nx * my * mz
         self.nodal = self.lattice.nodal(like[:, layout.MASS], like[:, layout.DRAG], scene.dt)
         self.chamber = self._chamber(like)
         if scene not in _tables:
-            _tables[scene] = Arena("integers", *_integers(scene))
+            _tables[scene] = Arena("integers", *_integers(scene, self.chambers))
         self.tables = _tables[scene]
         self.fixed = Arena(
             "fixed",
-            torch.tensor(numbers(self.lattice, scene.dt), dtype=torch.float64).to(like),
+            numbers(self.lattice, scene.dt).to(like),
             *(like, inputs.prony, inputs.planes, self.nodal, self.chamber, scene.share),
         )
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, inputs.force)
-        b, c = self.batch, self.chambers
-        self.gas = int((scene.kind >= 0).sum())
-        areas = ((b, n) for n in (self.gas, c * layout.CHAMBER_PARTS, c * layout.CHAMBER_GROUPS))
-        self.scratch = Arena.zeros("scratch", like, *self._sums(b), *self._sums(b * c), *areas)
+        tiles, chunks = tile_count(self.lattice), -(-self.nodes // layout.TILE)
+        # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
+        in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND])
+        self.slots = tiles + in_chambers + tiles * int(scene.viscous)
+        self.items = self.batch * max(tiles, chunks)
+        pads = 0 if self.gpu else self.items
+        shapes = (self.batch, self.slots, layout.SLOT), (self.batch, in_chambers), (pads, layout.PAD)
+        self.scratch = Arena.zeros("scratch", like, *shapes)
         self.kept = Arena.zeros("kept", like, (0,), (0,))
 
     def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
@@ -141,13 +137,9 @@ class TotalSegmentIntegrator:
         states[0] = start
         self.kept = Arena.zeros("kept", start, *self._kept(slots))
         ints = self._ints([self.fixed, self.supply, self.kept, self.scratch], ring=ring, kept_ring=slots)
-        launch = capture(
-            total.total_substep,
-            REPEATS if self.gpu else 1,
-            self.loaded,
-            self.scene.stiffens,
-            ints,
-            *(self.fixed.buffer, self.supply.buffer, states.view(-1), self.kept.buffer, self.scratch.buffer),
+        march = self._march(
+            *(total.total_march, total.total_substep, ints, self.fixed.buffer, self.supply.buffer, states.view(-1)),
+            *(self.kept.buffer, self.scratch.buffer),
         )
         if 0 in self.samples:
             observe(0, states[0])
@@ -155,14 +147,13 @@ class TotalSegmentIntegrator:
         while now < self.steps:
             before = None if keep else states[now % 2].clone()
             stop = min([self.steps, now + CHUNK, *(k for k in self.samples if k > now)])
-            self._go(launch, ints, stop, stop - now)
+            march(now, stop)
             after = states[stop % ring]
             collapsed = int(ints[layout.COLLAPSED])
             if collapsed < _NEVER:
                 if before is not None:
                     states[now % 2] = before
-                    ints[layout.NOW] = now
-                    self._go(launch, ints, collapsed, collapsed - now)
+                    march(now, collapsed)
                 self._report(collapsed, states[collapsed % ring])
             if not bool(torch.isfinite(after).all()) or bool(self._outside(after).any()):
                 self._report(stop, after)
@@ -197,30 +188,24 @@ class TotalSegmentIntegrator:
             self.nodal.shape,
             self.chamber.shape,
         )
-        forces, loads = ((b, 3, nodes), (2, b, 3, nodes)), self._sums(b * self.loaded)
-        back = Arena.zeros("backward", bar, *forces, *loads, (b, self.chambers), (b, self.gas))
+        shapes = (b, 3, nodes), (2, b, 3, nodes), (b, self.chambers), (b, points if self.chambers else 0)
+        back = Arena.zeros("backward", bar, *shapes)
         arenas = [self.fixed, self.supply, self.kept, self.scratch, back, sums]
         ints = self._ints(arenas, want_prony="prony" in wanted, tallies=tallies)
-        launch = capture(
-            total_adjoint.total_substep_adjoint,
-            1,
-            self.loaded,
-            self.scene.stiffens,
-            ints,
+        march = self._march(
+            *(total_adjoint.total_march_adjoint, total_adjoint.total_substep_adjoint, ints),
             *(self.fixed.buffer, self.supply.buffer, states.view(-1), self.kept.buffer, self.scratch.buffer),
             *(bar.view(-1), back.buffer, sums.buffer),
+            backward=True,
         )
-        ints[layout.NOW] = steps - 1
         at = steps
         for stop in sorted({0, *self.samples}, reverse=True):
             if stop < at:
-                ints[layout.STOP] = stop
-                launch(at - stop)
+                march(stop, at)
                 at = stop
             if stop in self.samples:
                 add(stop, bar)
-        ints[layout.STOP] = -1
-        launch(1)
+        march(-1, 0)
         *views, nodal_bar, chamber_bar = sums.views
         found: dict[str, Tensor] = dict(zip(_SUMS, views, strict=True))
         mass, drag = i.coefficients[:, layout.MASS], i.coefficients[:, layout.DRAG]
@@ -233,31 +218,40 @@ class TotalSegmentIntegrator:
         found["pressure"] = found["pressure"].clone()
         return {**found, "origin": torch.zeros_like(i.origin)}
 
-    def _go(self, launch, ints: Tensor, stop: int, steps: int) -> None:
-        """Launch until the clock stands at ``stop``; substeps beyond it do nothing."""
-        ints[layout.STOP] = stop
-        launch(-(-steps // (REPEATS if self.gpu else 1)))
+    def _march(self, on_gpu, on_cpu, *buffers: Tensor, backward: bool = False) -> Callable[[int, int], None]:
+        """A function that takes the substeps from its first number to before its second, or these back."""
+        flags = (self.loaded, self.scene.stiffens)
+        if self.gpu:
+            real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
+            launch = capture(on_gpu, real, most_blocks(buffers[0].device), *flags, 0, 0, *buffers)
+            return lambda first, last: launch(1, first, last)
+        step = capture(on_cpu, *flags, 0, *buffers)
+
+        def march(first: int, last: int) -> None:
+            for t in reversed(range(first, last)) if backward else range(first, last):
+                step(1, t)
+
+        return march
 
     def _ints(self, arenas: list[Arena], **more: int) -> Tensor:
         """The buffer of integers: clock, sizes, offset of each quantity in its buffer, then the index tables."""
+        names = ("nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz")
+        values = (*self.lattice.points, *self.lattice.shape, *tile_counts(self.lattice))
+        blocks = min(most_blocks(self.scene.kind.device), self.items) if self.gpu else 0
         sizes = {
-            **dict(zip(("nx", "ny", "nz"), self.lattice.points, strict=True)),
+            **dict(zip(names, values, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
-            **{"steps": self.steps, **{name: int(value) for name, value in more.items()}},
+            **{"slots": self.slots, "blocks": blocks, "steps": self.steps},
+            **{name: int(value) for name, value in more.items()},
         }
-        head = [0, 0, 0, _NEVER, *(sizes.get(name, 0) for name in layout.SIZES)]
+        head = [_NEVER, 0, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
         given = {arena.name: arena.offsets for arena in [self.tables, *arenas]}
         for name, quantities in layout.BUFFERS.items():
             shift = layout.HEAD if name == "integers" else 0
             head += [shift + offset for offset in given.get(name, [0] * len(quantities))]
         assert len(head) == layout.HEAD
         return torch.cat([self.tables.buffer.new_tensor(head), self.tables.buffer])
-
-    def _sums(self, blocks: int) -> tuple[tuple[int, int, int], ...]:
-        """Shapes of the points' contributions to nodes, and of their sums over lines and sheets."""
-        pairs = ((layout.BUNDLE, self.points), (layout.LINE, self.lines), (layout.SHEET, self.sheets))
-        return tuple((blocks, *pair) for pair in pairs)
 
     def _kept(self, slots: int) -> tuple[tuple[int, ...], ...]:
         """Shapes of the quantities that are kept of every substep beside the states."""

@@ -1,0 +1,103 @@
+"""How the cells of a total-Lagrangian lattice are dealt out in tiles, and the index tables of its kernels."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import lru_cache
+
+import numpy as np
+from torch import Tensor
+
+from torchsoro.simulation.axis import Axis
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lattice import Lattice
+
+
+@lru_cache(maxsize=256)
+def tiles_along(axis: Axis, most: int) -> np.ndarray:
+    """The tiles along an axis, of ``most`` cells at most: first cell, cells, first node [T, 3].
+
+    They end at creases, so that the nodes of a tile follow each other and no node belongs to more than two tiles.
+    """
+    rows = []
+    runs = [0, *(np.flatnonzero(np.diff(axis.first) > 1) + 1).tolist(), axis.cells]
+    for begin, end in itertools.pairwise(runs):
+        rows += [(cell, min(most, end - cell), axis.first[cell]) for cell in range(begin, end, most)]
+    return np.array(rows)
+
+
+def tile_counts(lattice: Lattice) -> tuple[int, int, int]:
+    """Tiles along x, y, z."""
+    x, y, z = (len(tiles_along(a, n)) for a, n in zip(lattice.axes, layout.TILE_CELLS, strict=True))
+    return x, y, z
+
+
+def tile_count(lattice: Lattice) -> int:
+    """Number of tiles."""
+    return math.prod(tile_counts(lattice))
+
+
+def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
+    """Index tables of a lattice whose points are of these kinds [points].
+
+    Returns:
+        In the order of ``layout.BUFFERS``: the lowest node of the cells along x, y and z; the tiles along them; where
+        each chamber's pairs of it and a tile begin; likewise each tile's; the chamber of each tile's pair, and its
+        number among those of the chambers; for all tiles, and for each chamber's, where what they hand to a node lies,
+        -1 for none; whether a node has any of a chamber's.
+    """
+    along = [tiles_along(a, n) for a, n in zip(lattice.axes, layout.TILE_CELLS, strict=True)]
+    counts = tile_counts(lattice)
+    kinds = kind.cpu().numpy().reshape(lattice.points)
+    points = np.meshgrid(*map(_tile_of_points, along), indexing="ij")
+    tile_of = np.ravel_multi_index(points, counts)
+    has = np.zeros((tile_count(lattice), chambers), bool)
+    has[tile_of[kinds >= 0], kinds[kinds >= 0]] = True
+    pairs = np.argwhere(has)  # tile and chamber, tile by tile
+    order = np.argsort(pairs[:, 1], kind="stable")
+    place = np.empty(len(pairs), int)
+    place[order] = np.arange(len(pairs))
+    slot = np.full(has.shape, -1)
+    slot[has] = tile_count(lattice) + np.arange(len(pairs))
+    # The two tiles of a node along each axis, and its number there.
+    tiles, local = zip(*map(_tiles_of_nodes, lattice.axes, along), strict=True)
+    rows = []
+    for parts in itertools.product(range(2), repeat=3):
+        x, y, z = np.meshgrid(*(t[:, i] for t, i in zip(tiles, parts, strict=True)), indexing="ij")
+        there = (x >= 0) & (y >= 0) & (z >= 0)
+        tile = np.where(there, (x * counts[1] + y) * counts[2] + z, 0)
+        i, j, k = np.meshgrid(*(n[:, i] for n, i in zip(local, parts, strict=True)), indexing="ij")
+        node = (i * layout.TILE_Y + j) * layout.TILE_Z + k
+        slots = np.concatenate([tile[..., None], slot[tile]], -1)
+        rows.append(np.where(there[..., None] & (slots >= 0), slots * layout.SLOT + node[..., None], -1))
+    sources = np.stack(rows).reshape(layout.SHARED, lattice.nodes, 1 + chambers).transpose(2, 0, 1)
+    return [
+        np.concatenate([a.first for a in lattice.axes]),
+        np.concatenate(along),
+        _starts(pairs[:, 1], chambers),
+        _starts(pairs[:, 0], tile_count(lattice)),
+        np.stack([pairs[:, 1], place], 1),
+        sources,
+        (sources[1:] >= 0).any(1),
+    ]
+
+
+def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:
+    """Where the rows of each number begin, and where the last end [count + 1]."""
+    return np.concatenate([[0], np.cumsum(np.bincount(sorted_or_not, minlength=count))])
+
+
+def _tile_of_points(along: np.ndarray) -> np.ndarray:
+    """Tile of each point along an axis [2 cells]."""
+    return np.repeat(np.arange(len(along)), 2 * along[:, 1])
+
+
+def _tiles_of_nodes(axis: Axis, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Tiles that a node along an axis belongs to, and its number among their nodes; each [nodes, 2], -1 for none."""
+    tiles, local = np.full((2, axis.nodes, 2), -1)
+    for number, (_, cells, first) in enumerate(along):
+        nodes = np.arange(first, first + cells + 2)
+        free = (tiles[nodes, 0] >= 0).astype(int)
+        tiles[nodes, free], local[nodes, free] = number, np.arange(len(nodes))
+    return tiles, local
