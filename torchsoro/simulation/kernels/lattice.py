@@ -21,17 +21,19 @@ from torchsoro.simulation.kernels.layout import (
     CHAMBER_START,
     CHAMBERS,
     FIRSTS,
+    HEAD,
     MX,
     MY,
     MZ,
     NX,
     NY,
     NZ,
+    PAD_AXES,
     PAD_LINES,
     PAD_NODES,
-    PASSED,
     SHARED,
     SLOT,
+    STEP_SIZE,
     SWEPT,
     TILE,
     TILE_CELLS,
@@ -134,19 +136,23 @@ def sync(gpu: ti.template()):
 
 
 @ti.func
-def meet(ints: ti.template(), blocks, q):
-    """Wait for the other blocks, all of which must run at the same time."""
+def thread(gpu: ti.template(), head: ti.template(), each):
+    """Number of a thread, read anew: else what follows from it would be kept, in slow memory, from the start."""
+    q = each
+    if ti.static(gpu):
+        q += head[HEAD]  # 0
+    return q
+
+
+@ti.func
+def meet(ints: ti.template(), arrivals, q):
+    """Wait for the other blocks, all of which must run at the same time, until so many have arrived in all."""
     ti.simt.block.sync()
     if q == 0:
         ti.simt.grid.memfence()
-        passed = ti.atomic_max(ints[PASSED], 0)  # as loads may come from a cache
-        if ti.atomic_add(ints[ARRIVED], 1) == blocks - 1:
-            ints[ARRIVED] = 0
-            ti.simt.grid.memfence()
-            ti.atomic_add(ints[PASSED], 1)
-        else:
-            while ti.atomic_max(ints[PASSED], 0) == passed:
-                pass
+        ti.atomic_add(ints[ARRIVED], 1)
+        while ti.atomic_max(ints[ARRIVED], 0) < arrivals:  # a plain load may come from a cache
+            pass
         ti.simt.grid.memfence()
     ti.simt.block.sync()
 
@@ -201,11 +207,29 @@ def point_of(head: ti.template(), cell, cells, q):
 
 
 @ti.func
-def stage(head: ti.template(), a: ti.template(), at, pad: ti.template(), base, number: ti.template(), node, q0, q1):
+def field_start(base, number: ti.template()):
+    """Where a staged field begins in the pad."""
+    return base + ti.static(PAD_LINES if number == 2 else PAD_NODES + number * SLOT)
+
+
+@ti.func
+def stage(
+    gpu: ti.template(),
+    head: ti.template(),
+    a: ti.template(),
+    at,
+    pad: ti.template(),
+    base,
+    number: ti.template(),
+    node,
+    q0,
+    q1,
+):
     """Copy a vector field at the nodes of a tile to the pad, as its field of that number."""
     m = nodes_per_axis(head)
     nodes = product(m)
-    for q in range(q0, q1):
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         for part in ti.static(range((SLOT + TILE - 1) // TILE)):
             one = q + part * TILE
             if one < SLOT:
@@ -214,24 +238,59 @@ def stage(head: ti.template(), a: ti.template(), at, pad: ti.template(), base, n
                 x = ti.min(node[0] + i // ti.static(TILE_Y * TILE_Z), m[0] - 1)
                 y = ti.min(node[1] + i // TILE_Z % TILE_Y, m[1] - 1)
                 z = ti.min(node[2] + i % TILE_Z, m[2] - 1)
-                pad[base + PAD_NODES + number * SLOT + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
+                pad[field_start(base, number) + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
 
 
 @ti.func
-def tile_gradient(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, number: ti.template(), cell, q):
+def stage_axes(
+    gpu: ti.template(),
+    head: ti.template(),
+    fixed: ti.template(),
+    pad: ti.template(),
+    base,
+    cell,
+    cells,
+    q0,
+    q1,
+):
+    """Copy weights and slopes of a tile's points along the axes to the pad; zeros for cells that it has not."""
+    starts = axis_starts(head)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        if q < ti.static(AXIS * (WIDE + DEEP + HIGH)):
+            p, start, first, count = q // AXIS, starts[0], cell[0], cells[0]
+            if p >= ti.static(WIDE + DEEP):
+                p, start, first, count = p - ti.static(WIDE + DEEP), starts[2], cell[2], cells[2]
+            elif p >= WIDE:
+                p, start, first, count = p - WIDE, starts[1], cell[1], cells[1]
+            number = fixed[STEP_SIZE] * 0
+            if p < 2 * count:
+                number = fixed[start + AXIS * (2 * first + p) + q % AXIS]
+            pad[base + PAD_AXES + q] = number
+
+
+@ti.func
+def point_axes(base, q):
+    """Where the weights of the tile's point q along the axes begin, and that of its cell's lowest node in a field."""
+    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
+    at = base + PAD_AXES
+    axes = ti.Vector([at + AXIS * x, at + AXIS * (WIDE + y), at + AXIS * (WIDE + DEEP + z)])
+    return axes, ((x // 2) * TILE_Y + y // 2) * TILE_Z + z // 2
+
+
+@ti.func
+def tile_gradient(pad: ti.template(), base, number: ti.template(), q):
     """Gradient of a staged field by the reference place at the tile's point q."""
-    at, starts = point_place(cell, q), axis_starts(head)
-    fx, fy, fz = starts[0] + AXIS * at[0], starts[1] + AXIS * at[1], starts[2] + AXIS * at[2]
-    i0, j0, k0 = (at[0] // 2 - cell[0]), (at[1] // 2 - cell[1]), (at[2] // 2 - cell[2])
-    corner = base + PAD_NODES + number * SLOT + (i0 * TILE_Y + j0) * TILE_Z + k0
-    wy = ti.Vector([fixed[fy + k] for k in ti.static(range(3))])
-    sy = ti.Vector([fixed[fy + 3 + k] for k in ti.static(range(3))])
-    w = ti.Vector([fixed[fz + k] for k in ti.static(range(3))])
-    s = ti.Vector([fixed[fz + 3 + k] for k in ti.static(range(3))])
+    axes, corner = point_axes(base, q)
+    corner += field_start(base, number)
+    wy = ti.Vector([pad[axes[1] + k] for k in ti.static(range(3))])
+    sy = ti.Vector([pad[axes[1] + 3 + k] for k in ti.static(range(3))])
+    w = ti.Vector([pad[axes[2] + k] for k in ti.static(range(3))])
+    s = ti.Vector([pad[axes[2] + 3 + k] for k in ti.static(range(3))])
     zero = w[0] * 0
     G = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     for i in range(3):
-        wx, sx = fixed[fx + i], fixed[fx + 3 + i]
+        wx, sx = pad[axes[0] + i], pad[axes[0] + 3 + i]
         for j in ti.static(range(3)):
             line = corner + (i * TILE_Y + j) * TILE_Z
             for c in ti.static(range(3)):
@@ -245,18 +304,16 @@ def tile_gradient(head: ti.template(), fixed: ti.template(), pad: ti.template(),
 
 
 @ti.func
-def tile_value(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, number: ti.template(), cell, q):
+def tile_value(pad: ti.template(), base, number: ti.template(), q):
     """A staged field at the tile's point q."""
-    at, starts = point_place(cell, q), axis_starts(head)
-    fx, fy, fz = starts[0] + AXIS * at[0], starts[1] + AXIS * at[1], starts[2] + AXIS * at[2]
-    i0, j0, k0 = (at[0] // 2 - cell[0]), (at[1] // 2 - cell[1]), (at[2] // 2 - cell[2])
-    corner = base + PAD_NODES + number * SLOT + (i0 * TILE_Y + j0) * TILE_Z + k0
-    zero = fixed[fx] * 0
+    axes, corner = point_axes(base, q)
+    corner += field_start(base, number)
+    zero = pad[axes[0]] * 0
     u = ti.Vector([zero, zero, zero])
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                weight = fixed[fx + i] * fixed[fy + j] * fixed[fz + k]
+                weight = pad[axes[0] + i] * pad[axes[1] + j] * pad[axes[2] + k]
                 for c in ti.static(range(3)):
                     u[c] += weight * pad[corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
     return u
@@ -277,14 +334,16 @@ def hand_over_vector(pad: ti.template(), base, q, v):
 
 
 @ti.func
-def neighbour_point(fixed: ti.template(), start, first, count, node, k, odd):
-    """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope."""
+def neighbour_point(pad: ti.template(), axis, most: ti.template(), node, k, odd):
+    """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope.
+
+    ``axis`` is where the tile's weights along an axis begin, ``most`` how many cells a tile has along it.
+    """
     cell = node - k
-    inside = cell >= 0 and cell < count
+    inside = cell >= 0 and cell < most
     # Elsewhere, a point that is there is read for nothing, so that loads need not wait for branches.
     p = ti.select(inside, 2 * cell + odd, 0)
-    at = start + AXIS * (2 * first + p) + k
-    w, s = fixed[at], fixed[at + 3]
+    w, s = pad[axis + AXIS * p + k], pad[axis + AXIS * p + 3 + k]
     return p, ti.select(inside, w, w * 0), ti.select(inside, s, s * 0)
 
 
@@ -293,12 +352,9 @@ def sum_tile(
     gpu: ti.template(),
     vectors: ti.template(),
     head: ti.template(),
-    fixed: ti.template(),
     pad: ti.template(),
     base,
     with_vector,
-    cell,
-    cells,
     out: ti.template(),
     out_at,
     alone: ti.template(),
@@ -311,17 +367,19 @@ def sum_tile(
     Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone_at``
     is negative.
     """
-    starts = axis_starts(head)
-    for q in range(q0, q1):
+    axis_x = base + PAD_AXES
+    axis_y, axis_z = axis_x + AXIS * WIDE, axis_x + AXIS * (WIDE + DEEP)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         if q < TILE_LINES:
             node, column = q % TILE_Z, base + q // TILE_Z * HIGH
-            zero = fixed[AXES] * 0
+            zero = pad[axis_x] * 0
             along_x = ti.Vector([zero, zero, zero])
             along_y = ti.Vector([zero, zero, zero])
             along_z = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(fixed, starts[2], cell[2], cells[2], node, k, odd)
+                    p, w, s = neighbour_point(pad, axis_z, TILE_CELLS[2], node, k, odd)
                     for c in ti.static(range(3)):
                         along_x[c] += w * pad[column + p + (3 * c) * TILE]
                         along_y[c] += w * pad[column + p + (3 * c + 1) * TILE]
@@ -341,15 +399,16 @@ def sum_tile(
                 total += pad[base + ALONE + 4 * one + m]
             pad[base + ALONE + TILE + one] = total
     sync(gpu)
-    for q in range(q0, q1):
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         if q < TILE_SHEETS:
             iz, iy, px = q % TILE_Z, q // TILE_Z % TILE_Y, q // ti.static(TILE_Y * TILE_Z)
-            zero = fixed[AXES] * 0
+            zero = pad[axis_x] * 0
             slope = ti.Vector([zero, zero, zero])
             flat = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(fixed, starts[1], cell[1], cells[1], iy, k, odd)
+                    p, w, s = neighbour_point(pad, axis_y, TILE_CELLS[1], iy, k, odd)
                     at = base + PAD_LINES + (px * DEEP + p) * TILE_Z + iz
                     for c in ti.static(range(3)):
                         slope[c] += w * pad[at + c * TILE_LINES]
@@ -364,14 +423,15 @@ def sum_tile(
                 total += pad[base + ALONE + TILE + 8 * one + m]
             pad[base + ALONE + 2 * TILE + one] = total
     sync(gpu)
-    for q in range(q0, q1):
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         if q < TILE_NODES:
             rest, ix = q % ti.static(TILE_Y * TILE_Z), q // ti.static(TILE_Y * TILE_Z)
-            zero = fixed[AXES] * 0
+            zero = pad[axis_x] * 0
             total = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(fixed, starts[0], cell[0], cells[0], ix, k, odd)
+                    p, w, s = neighbour_point(pad, axis_x, TILE_CELLS[0], ix, k, odd)
                     at = base + p * ti.static(TILE_Y * TILE_Z) + rest
                     for c in ti.static(range(3)):
                         total[c] += s * pad[at + c * TILE_SHEETS] + w * pad[at + (3 + c) * TILE_SHEETS]
@@ -417,7 +477,8 @@ def sum_chambers(
     for k in range(chambers):
         first, last = ints[start + k], ints[start + k + 1]
         swept = head[SWEPT] + b * ints[start + chambers]
-        for q in range(q0, q1):
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
             total = fixed[AXES] * 0
             one = first + q
             while one < last:
@@ -425,14 +486,16 @@ def sum_chambers(
                 one += TILE
             pad[base + q] = total
         sync(gpu)
-        for q in range(q0, q1):
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
             if q < PARTS:
                 total = pad[base + q]
                 for m in ti.static(range(1, TILE // PARTS)):
                     total += pad[base + m * PARTS + q]
                 pad[base + TILE + q] = total
         sync(gpu)
-        for q in range(q0, q1):
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
             if q == 0:
                 total = pad[base + TILE]
                 for m in ti.static(range(1, PARTS)):

@@ -67,15 +67,15 @@ def lattice_components(nodes: int, points: int, elements: int) -> int:
     return 6 * nodes + 6 * elements * points
 
 
-# Its kernels take few buffers. The integers begin with what a launch changes (first substep at which a solid collapsed;
-# blocks that have arrived at a barrier, and how often all have), sizes, and where each quantity begins in its buffer.
-COLLAPSED, ARRIVED, PASSED = 0, 1, 2
+# Its kernels take few buffers. The integers begin with what kernels change (first substep at which a solid collapsed;
+# how often blocks have arrived at a barrier), sizes, and where each quantity begins in its buffer.
+COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks"),
 )
-BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(3, 17)
-VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS = range(17, 26)
+BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
+VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS = range(16, 25)
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
 # kept of every substep beside the states; what points and nodes hand each other, forward and (from FORCES) backward;
@@ -95,14 +95,14 @@ BUFFERS = {
         for name in ("coefficients", "prony", "pressure", "gravity", "force", "plane_numbers", "nodal", "chamber")
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(26, 35)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE = range(35, 42)
-PRESSURE, GRAVITY, FORCE = range(42, 45)
-VOLUMES, PUSHED = range(45, 47)
-PARTIALS, SWEPT, PADS = range(47, 50)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(50, 54)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(54, 62)
-HEAD = 62
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(25, 34)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE = range(34, 41)
+PRESSURE, GRAVITY, FORCE = range(41, 44)
+VOLUMES, PUSHED = range(44, 46)
+PARTIALS, SWEPT, PADS = range(46, 49)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(49, 53)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(53, 61)
+HEAD = 61
 
 # Numbers of the lattice: substep, edge of a cell; then the axes one after the other: for each point the weights of its
 # three nodes and their slopes by the reference place; places of the particles; places of the nodes.
@@ -131,9 +131,12 @@ NODAL = 5
 BUNDLE = 12
 LINE = 9
 SHEET = 6
-# Numbers that a tile shares: of its points, and then of its sheets; of its lines; of its nodes, three vectors.
-PAD_POINTS, PAD_LINES, PAD_NODES = 0, BUNDLE * TILE, BUNDLE * TILE + LINE * TILE_LINES
-PAD = PAD_NODES + 9 * TILE_NODES
+# Numbers that a tile shares: of its points, and then of its sheets; of its lines, and before of a third vector at its
+# nodes; two vectors at its nodes; of the axes.
+PAD_POINTS, PAD_LINES = 0, BUNDLE * TILE
+PAD_NODES = PAD_LINES + LINE * TILE_LINES
+PAD_AXES = PAD_NODES + 2 * SLOT
+PAD = PAD_AXES + AXIS * 2 * sum(TILE_CELLS)
 
 # A chamber: mean air stiffness, reference volume.
 CHAMBER_STIFFNESS, CHAMBER_VOLUME = 0, 1

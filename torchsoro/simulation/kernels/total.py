@@ -26,10 +26,12 @@ from torchsoro.simulation.kernels.lattice import (
     points_per_axis,
     product,
     stage,
+    stage_axes,
     sum_chambers,
     sum_tile,
     sum_tiles,
     sync,
+    thread,
     tile_box,
     tile_count,
     tile_gradient,
@@ -139,7 +141,7 @@ def spring_stretch(head: ti.template(), fixed: ti.template(), d, b, p):
 
 @ti.func
 def external_force(
-    head: ti.template(), fixed: ti.template(), supply: ti.template(), pad: ti.template(), base, cell, q, t, b, p
+    head: ti.template(), fixed: ti.template(), supply: ti.template(), pad: ti.template(), base, q, t, b, p
 ):
     """Shares of the group forces, and spring to an anchor [N] at point p; drag is with the nodes."""
     points = product(points_per_axis(head))
@@ -149,12 +151,12 @@ def external_force(
         push += fixed[head[SHARE] + g * points + p] * load_vector(supply, force, 1)
     if head[SPRINGS] == 1:
         spring = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
-        push += spring * spring_stretch(head, fixed, tile_value(head, fixed, pad, base, 0, cell, q), b, p)
+        push += spring * spring_stretch(head, fixed, tile_value(pad, base, 0, q), b, p)
     return push
 
 
 @ti.func
-def chamber_share(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, cell, q, b, p, mine):
+def chamber_share(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, q, b, p, mine):
     """Hand over the share of point p in its chamber's area, volume times cof F; nothing if it is in none (``mine``).
 
     Returns:
@@ -166,7 +168,7 @@ def chamber_share(head: ti.template(), fixed: ti.template(), pad: ti.template(),
     volume = zero
     ratio = zero
     if mine == 1:
-        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
         volume = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + VOLUME) * points + p]
         cof = cofactor(F)
         ratio = contract(cof, F) / 3
@@ -185,7 +187,6 @@ def stress_point(
     state: ti.template(),
     pad: ti.template(),
     base,
-    cell,
     q,
     t,
     b,
@@ -205,7 +206,7 @@ def stress_point(
         out = (((t + 1) % head[RING]) * head[BATCH] + b) * length + 6 * nodes + p
         mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
         volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
         if kind < 0:
             void_fraction = fixed[mat + VOID_FRACTION * points]
             Q = F * 0
@@ -217,12 +218,15 @@ def stress_point(
                     factor = stiffening(F, least, linear, square)
                 if elements > 0:
                     S = factor * pull_back(F, least)
+                    Z = load_symmetric(state, at, points)
                     for e in range(elements):
                         number = head[ELEMENT] + (b * elements + e) * PRONY
                         decay, gain = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN]
-                        Z = load_symmetric(state, at + 6 * e * points, points)
+                        # The next element is read before this one is written, as no load goes ahead of a store.
+                        following = load_symmetric(state, at + 6 * ti.min(e + 1, elements - 1) * points, points)
                         Q += fixed[number + PRONY_MODULUS] * (Z + gain * S)
                         store_symmetric(state, out + 6 * e * points, points, decay * Z - gain * (1 - decay) * S)
+                        Z = following
                 if void_fraction == 0 and not F.determinant() > 0:
                     ti.atomic_min(ints[COLLAPSED], t)
             else:
@@ -238,9 +242,9 @@ def stress_point(
         if ti.static(loaded):
             if kind < 0 and head[VISCOUS] == 1:
                 eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                rate = tile_gradient(head, fixed, pad, base, 1, cell, q)
+                rate = tile_gradient(pad, base, 1, q)
                 P += volume * viscous_piola(F, rate, eta, zeta)
-            push = external_force(head, fixed, supply, pad, base, cell, q, t, b, p)
+            push = external_force(head, fixed, supply, pad, base, q, t, b, p)
     hand_over(pad, base, q, P)
     if ti.static(loaded):
         hand_over_vector(pad, base, q, -push)
@@ -268,10 +272,11 @@ def point_pass(
     b, tile = item // tile_count(head), item % tile_count(head)
     cell, cells, node = tile_box(head, ints, tile)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
-    stage(head, state, at, pad, base, 0, node, q0, q1)
+    stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
+    stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
     if ti.static(loaded):
         if head[VISCOUS] == 1:
-            stage(head, state, at + 3 * product(nodes_per_axis(head)), pad, base, 1, node, q0, q1)
+            stage(gpu, head, state, at + 3 * product(nodes_per_axis(head)), pad, base, 1, node, q0, q1)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
     first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
@@ -280,22 +285,24 @@ def point_pass(
         out = partials + tile * SLOT
         alone = ti.cast(-1, ti.i32)
         if slot < first:
-            for q in range(q0, q1):
+            for each in range(q0, q1):
+                q = thread(gpu, head, each)
                 p = point_of(head, cell, cells, q)
-                stress_point(loaded, stiffens, head, ints, fixed, supply, state, pad, base, cell, q, t, b, p)
+                stress_point(loaded, stiffens, head, ints, fixed, supply, state, pad, base, q, t, b, p)
         else:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
-            for q in range(q0, q1):
+            for each in range(q0, q1):
+                q = thread(gpu, head, each)
                 p = point_of(head, cell, cells, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
-                volume, ratio, _ = chamber_share(head, fixed, pad, base, cell, q, b, p, mine)
+                volume, ratio, _ = chamber_share(head, fixed, pad, base, q, b, p, mine)
                 pad[base + ALONE + q] = volume * ratio
         sync(gpu)
         own = ti.cast(slot < first, ti.i32)
-        sum_tile(gpu, loaded, head, fixed, pad, base, own, cell, cells, scratch, out, scratch, alone, q0, q1)
+        sum_tile(gpu, loaded, head, pad, base, own, scratch, out, scratch, alone, q0, q1)
 
 
 @ti.func
@@ -320,7 +327,8 @@ def node_pass(
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     slot = (t % head[KEPT_RING]) * head[BATCH] + b
     sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
-    for q in range(q0, q1):
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         i = chunk * TILE + q
         if i < chambers:  # every simulation has more nodes than chambers
             kept[head[VOLUMES] + slot * chambers + i] = pad[base + TOTALS + i]
@@ -404,12 +412,14 @@ def total_march(
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
         q, block = w % TILE, w // TILE
-        head = ti.simt.block.SharedArray((HEAD,), ti.i32)
+        head = ti.simt.block.SharedArray((HEAD + 1,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
             head[q] = ints[q]
+        head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
+        arrivals = ti.cast(0, ti.i32)
         if block < blocks:
             for t in range(first, last):
                 item = block
@@ -418,9 +428,11 @@ def total_march(
                         *(True, loaded, stiffens, head, ints, fixed, supply, state, scratch, pad, 0, item, t, q, q + 1)
                     )
                     item += blocks
-                meet(ints, blocks, q)
+                arrivals += blocks
+                meet(ints, arrivals, q)
                 item = block
                 while item < head[BATCH] * node_chunks(head):
                     node_pass(True, head, ints, fixed, supply, state, kept, scratch, pad, 0, item, t, q, q + 1)
                     item += blocks
-                meet(ints, blocks, q)
+                arrivals += blocks
+                meet(ints, arrivals, q)

@@ -26,10 +26,12 @@ from torchsoro.simulation.kernels.lattice import (
     points_per_axis,
     product,
     stage,
+    stage_axes,
     sum_chambers,
     sum_tile,
     sum_tiles,
     sync,
+    thread,
     tile_box,
     tile_count,
     tile_gradient,
@@ -308,7 +310,6 @@ def external_adjoint(
     fixed: ti.template(),
     pad: ti.template(),
     base,
-    cell,
     q,
     sums: ti.template(),
     b,
@@ -318,9 +319,9 @@ def external_adjoint(
     points = product(points_per_axis(head))
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
-    push_bar = tile_value(head, fixed, pad, base, 1, cell, q)
+    push_bar = tile_value(pad, base, 1, q)
     spring = fixed[mat + SPRING * points]
-    stretch = spring_stretch(head, fixed, tile_value(head, fixed, pad, base, 0, cell, q), b, p)
+    stretch = spring_stretch(head, fixed, tile_value(pad, base, 0, q), b, p)
     add(False, sums, mat_bar + SPRING * points, push_bar.dot(stretch))
     for c in ti.static(range(3)):
         add(False, sums, mat_bar + (ANCHOR + c) * points, spring * push_bar[c])
@@ -342,7 +343,6 @@ def stress_point_adjoint(
     sums: ti.template(),
     pad: ti.template(),
     base,
-    cell,
     q,
     t,
     b,
@@ -365,9 +365,9 @@ def stress_point_adjoint(
     if t >= 0 and kind != ABSENT:
         history = b * state_length(head) + 6 * nodes + p
         maxwell = (t * head[BATCH] + b) * state_length(head) + 6 * nodes + p
-        F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
+        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
         volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-        P_bar = -volume * tile_gradient(head, fixed, pad, base, 1, cell, q)
+        P_bar = -volume * tile_gradient(pad, base, 1, q)
         work = volume * 0  # P : P_bar, by which the gradient by the volume is known
         if kind < 0:
             bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
@@ -421,14 +421,14 @@ def stress_point_adjoint(
         if ti.static(loaded):
             if kind < 0 and head[VISCOUS] == 1:
                 eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                rate = tile_gradient(head, fixed, pad, base, 2, cell, q)
+                rate = tile_gradient(pad, base, 2, q)
                 by_F, _, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
                 F_bar += by_F
                 work += eta * eta_bar + zeta * zeta_bar
                 add(False, sums, mat_bar + VISCOSITY * points, eta_bar)
                 add(False, sums, mat_bar + VOLUME_VISCOSITY * points, zeta_bar)
             if head[SPRINGS] == 1:
-                place_bar = external_adjoint(head, fixed, pad, base, cell, q, sums, b, p)
+                place_bar = external_adjoint(head, fixed, pad, base, q, sums, b, p)
         add(False, sums, mat_bar + VOLUME * points, work / volume)
     hand_over(pad, base, q, F_bar)
     if ti.static(loaded):
@@ -437,7 +437,7 @@ def stress_point_adjoint(
 
 @ti.func
 def rate_point_adjoint(
-    head: ti.template(), ints: ti.template(), fixed: ti.template(), pad: ti.template(), base, cell, q, b, p
+    head: ti.template(), ints: ti.template(), fixed: ti.template(), pad: ti.template(), base, q, b, p
 ):
     """Hand over the gradient by the rate of F at point p, through viscosity."""
     zero = fixed[STEP_SIZE] * 0
@@ -446,9 +446,9 @@ def rate_point_adjoint(
         if ints[head[KIND] + p] == -1:
             points = product(points_per_axis(head))
             mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
-            F = plus_identity(tile_gradient(head, fixed, pad, base, 0, cell, q), 1)
-            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(head, fixed, pad, base, 1, cell, q)
-            rate = tile_gradient(head, fixed, pad, base, 2, cell, q)
+            F = plus_identity(tile_gradient(pad, base, 0, q), 1)
+            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(pad, base, 1, q)
+            rate = tile_gradient(pad, base, 2, q)
             eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
             _, by_rate, _, _ = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
             rate_bar = by_rate
@@ -483,12 +483,13 @@ def point_pass_adjoint(
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
-    stage(head, state, at, pad, base, 0, node, q0, q1)
-    stage(head, back, head[FORCES] + b * 3 * nodes, pad, base, 1, node, q0, q1)
+    stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
+    stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
+    stage(gpu, head, back, head[FORCES] + b * 3 * nodes, pad, base, 1, node, q0, q1)
     if ti.static(loaded):
         viscous = head[VISCOUS]
         if viscous == 1:
-            stage(head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)
+            stage(gpu, head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
     first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
@@ -497,32 +498,37 @@ def point_pass_adjoint(
         out = partials + tile * SLOT
         alone = ti.cast(-1, ti.i32)
         if slot < first:
-            for q in range(q0, q1):
+            for each in range(q0, q1):
+                q = thread(gpu, head, each)
                 p = point_of(head, cell, cells, q)
                 stress_point_adjoint(
                     *(loaded, stiffens, head, ints, fixed, supply, state, kept, bar, back, sums),
-                    *(pad, base, cell, q, t, b, p),
+                    *(pad, base, q, t, b, p),
                 )
         elif slot < last:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
-            for q in range(q0, q1):
+            for each in range(q0, q1):
+                q = thread(gpu, head, each)
                 p = point_of(head, cell, cells, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
-                volume, _, cof = chamber_share(head, fixed, pad, base, cell, q, b, p, mine)
-                P_bar = tile_gradient(head, fixed, pad, base, 1, cell, ti.select(mine == 1, q, 0))
+                volume, _, cof = chamber_share(head, fixed, pad, base, q, b, p, mine)
+                P_bar = tile_gradient(pad, base, 1, ti.select(mine == 1, q, 0))
                 pad[base + ALONE + q] = volume * contract(P_bar, cof)
         else:
             out = partials + (tile_count(head) + chamber_slots(head, ints) + tile) * SLOT
             if ti.static(loaded):
-                for q in range(q0, q1):
+                stage(gpu, head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)  # lines have been there
+                sync(gpu)
+                for each in range(q0, q1):
+                    q = thread(gpu, head, each)
                     p = point_of(head, cell, cells, q)
-                    rate_point_adjoint(head, ints, fixed, pad, base, cell, q, b, p)
+                    rate_point_adjoint(head, ints, fixed, pad, base, q, b, p)
         sync(gpu)
         own = ti.cast(slot < first, ti.i32)
-        sum_tile(gpu, loaded, head, fixed, pad, base, own, cell, cells, scratch, out, scratch, alone, q0, q1)
+        sum_tile(gpu, loaded, head, pad, base, own, scratch, out, scratch, alone, q0, q1)
 
 
 @ti.func
@@ -550,7 +556,8 @@ def node_pass_adjoint(
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
-    for q in range(q0, q1):
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
         i = chunk * TILE + q
         if i < chambers and t + 1 < head[STEPS]:
             chamber_adjoint(head, fixed, kept, back, sums, t + 1, b * chambers + i, pad[base + TOTALS + i])
@@ -618,12 +625,14 @@ def total_march_adjoint(
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
         q, block = w % TILE, w // TILE
-        head = ti.simt.block.SharedArray((HEAD,), ti.i32)
+        head = ti.simt.block.SharedArray((HEAD + 1,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
             head[q] = ints[q]
+        head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
+        arrivals = ti.cast(0, ti.i32)
         if block < blocks:
             for passed in range(last - first):
                 t = last - 1 - passed
@@ -634,7 +643,8 @@ def total_march_adjoint(
                         *(pad, 0, item, t, q, q + 1),
                     )
                     item += blocks
-                meet(ints, blocks, q)
+                arrivals += blocks
+                meet(ints, arrivals, q)
                 item = block
                 while item < head[BATCH] * tile_count(head):
                     point_pass_adjoint(
@@ -647,4 +657,5 @@ def total_march_adjoint(
                     while row < head[BATCH] * head[TALLIES]:
                         tally(head, ints, fixed, bar, back, sums, t, row // head[TALLIES], row % head[TALLIES])
                         row += blocks * TILE
-                meet(ints, blocks, q)
+                arrivals += blocks
+                meet(ints, arrivals, q)

@@ -224,7 +224,12 @@ class TotalSegmentIntegrator:
         if self.gpu:
             real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
             launch = capture(on_gpu, real, most_blocks(buffers[0].device), *flags, 0, 0, *buffers)
-            return lambda first, last: launch(1, first, last)
+
+            def go(first: int, last: int) -> None:
+                buffers[0][layout.ARRIVED] = 0
+                launch(1, first, last)
+
+            return go
         step = capture(on_cpu, *flags, 0, *buffers)
 
         def march(first: int, last: int) -> None:
@@ -245,7 +250,7 @@ class TotalSegmentIntegrator:
             **{"slots": self.slots, "blocks": blocks, "steps": self.steps},
             **{name: int(value) for name, value in more.items()},
         }
-        head = [_NEVER, 0, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
+        head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
         given = {arena.name: arena.offsets for arena in [self.tables, *arenas]}
         for name, quantities in layout.BUFFERS.items():
             shift = layout.HEAD if name == "integers" else 0
