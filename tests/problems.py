@@ -136,10 +136,12 @@ def problem(
     spread: float = 1.0,
     dtype: torch.dtype = torch.float64,
     seed: int = 1,
+    lattice: Lattice | None = None,
 ) -> Problem:
     """A problem in units of the cell, all of whose numbers are of order one and random, so that every term counts.
 
-    In the total-Lagrangian form a corner of the lattice is empty, and its nodes there have no mass.
+    In the total-Lagrangian form a corner of the lattice is empty, and its nodes there have no mass. A lattice may be
+    given; else it is uniform.
     """
     g = torch.Generator().manual_seed(seed)
 
@@ -152,6 +154,8 @@ def problem(
     total = formulation == "total"
     axes = [5 + spread * 0.5 * (torch.arange(n, dtype=torch.float64) + 0.5) for n in particles]
     x = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(1, -1, 3).repeat(batch, 1, 1)
+    if lattice is not None:
+        x = lattice.places.repeat(batch, 1, 1)
     count = x.shape[1]
     kind = torch.full((count,), -1, dtype=torch.int32)
     kind[count // 2 : count // 2 + 3], kind[count // 2 + 3 : count // 2 + 5] = 0, 1
@@ -188,9 +192,8 @@ def problem(
         "origin": torch.zeros(batch, 3, dtype=torch.float64),
         "weight": rand(batch, count) + 0.1,
     }
-    lattice = None
     if total:
-        lattice = Lattice.uniform(particles, (5.0, 5.0, 5.0), 1.0)
+        lattice = lattice or Lattice.uniform(particles, (5.0, 5.0, 5.0), 1.0)
         motion = torch.cat([0.02 * randn(batch, 3 * lattice.nodes), 0.3 * randn(batch, 3 * lattice.nodes)], 1)
         history = 0.1 * randn(batch, 6 * elements, count) * (kind != layout.ABSENT)
         tensors["state"] = torch.cat([motion, history.flatten(1)], 1)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from problems import DT, H, block, problem, rotations, simulator
 
+from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers, spline
+from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers
 from torchsoro.simulation.ops.scene import Inputs
 from torchsoro.simulation.ops.total import TotalSegmentIntegrator
 
@@ -24,7 +26,14 @@ def draw(*shape, seed=0):
 
 
 def lattice(points, cell=1.0):
-    return Lattice(points=points, low=(0.3, -1.0, 2.0), cell=cell)
+    return Lattice.uniform(points, (0.3, -1.0, 2.0), cell)
+
+
+def uneven():
+    """Open knots and cells of any width along x, a crease along z; ghost nodes along y: [m]."""
+    x = Axis(np.array([0.3, 0.7, 1.0, 1.9]))
+    z = Axis(np.array([2.0, 2.5, 3.2, 3.9, 4.2, 4.9]), creases=[3.2])
+    return Lattice(axes=(x, Axis.uniform(-1.0, 0.5, 2), z))
 
 
 def affine(where, seed, scale=1.0):
@@ -34,36 +43,79 @@ def affine(where, seed, scale=1.0):
 
 
 def quadrature(lat):
-    """Places of the points of quadrature [points, 3]: from those of the particles to the cell's two Gauss points."""
-    low = torch.tensor(lat.low, dtype=torch.float64)
-    center = low + lat.cell * (((lat.places - low) / lat.cell).floor() + 0.5)
-    return center + (lat.places - center) * QUADRATURE / PARTICLES
+    """Places of the points of quadrature [points, 3] m."""
+    points = [torch.from_numpy(axis.points.reshape(-1)) for axis in lat.axes]
+    return torch.stack(torch.meshgrid(*points, indexing="ij"), -1).reshape(-1, 3)
 
 
 # ------------------------------------------------------------------------------------------------------------- weights
 
 
-@given(count=st.sampled_from([2, 4, 10]), place=st.floats(0.01, 0.49))
-def test_a_line_of_weights_is_a_partition_of_unity_and_reproduces_places(count, place):
-    weight, distance, slope = spline(count, place)
-    assert weight.shape == (count, count // 2 + 2)
-    assert bool((weight >= 0).all())
-    assert ((weight > 0).sum(1) == 3).all()
-    one, zero = torch.ones(count).double(), torch.zeros(count).double()
-    torch.testing.assert_close(weight.sum(1), one, rtol=0, atol=1e-14)
-    torch.testing.assert_close(slope.sum(1), zero, rtol=0, atol=1e-14)
-    torch.testing.assert_close((weight * distance).sum(1), zero, rtol=0, atol=1e-13)
-    torch.testing.assert_close((slope * -distance).sum(1), one, rtol=0, atol=1e-13)
-    # The slope is the weight's derivative by the place.
-    near = spline(count, place + 1e-6)[0]
-    side = torch.tensor([-1.0, 1.0]).double().repeat(count // 2).unsqueeze(1)
-    torch.testing.assert_close((near - weight) / 1e-6 * side, slope, rtol=0, atol=1e-5)
+@given(cells=st.sampled_from([1, 2, 5]), place=st.floats(0.01, 0.49), low=st.floats(-1e3, 1e3), cell=CELLS)
+def test_weights_of_a_uniform_axis_are_those_of_the_quadratic_spline_wherever_it_begins(cells, place, low, cell):
+    axis = Axis.uniform(low, cell, cells)
+    weight, slope = axis.tabulate(place)
+    for odd, sign in enumerate((-1, 1)):
+        f = 1 + sign * place
+        numbers = (0.5 * (1.5 - f) ** 2, 0.75 - (f - 1) ** 2, 0.5 * (f - 0.5) ** 2)
+        assert weight[:, odd] == pytest.approx(np.tile(numbers, (cells, 1)), abs=1e-14)
+        assert slope[:, odd] * cell == pytest.approx(np.tile((f - 1.5, -2 * (f - 1), f - 0.5), (cells, 1)), abs=1e-14)
+    assert axis.nodes == cells + 2
+    assert axis.places == pytest.approx(low + cell * (np.arange(cells + 2) - 0.5), rel=1e-12)
+    assert not np.abs(axis.centers).max() > 1e-9 * max(abs(low), cell)
+    assert axis.spans == pytest.approx(np.full(cells + 2, cell), rel=1e-6)
+
+
+@given(
+    widths=st.lists(st.floats(0.2, 5.0), min_size=1, max_size=6), creased=st.integers(0, 5), place=st.floats(0.0, 0.49)
+)
+def test_weights_of_an_axis_with_open_knots_are_a_partition_of_unity_and_reproduce_places(widths, creased, place):
+    planes = np.cumsum([0.7, *widths])
+    axis = Axis(planes, creases=planes[creased : creased + 1])
+    weight, slope = axis.tabulate(place)
+    nodes = axis.first[:, None, None] + np.arange(3)
+    assert (weight >= 0).all()
+    assert weight.sum(-1) == pytest.approx(np.ones((axis.cells, 2)), abs=1e-13)
+    assert slope.sum(-1) == pytest.approx(np.zeros((axis.cells, 2)), abs=1e-12)
+    assert (weight * axis.places[nodes]).sum(-1) == pytest.approx(axis.inside(place), abs=1e-12)
+    assert (slope * axis.places[nodes]).sum(-1) == pytest.approx(np.ones((axis.cells, 2)), abs=1e-11)
+    assert axis.places[[0, -1]] == pytest.approx(planes[[0, -1]])
+    inner = len(widths) > 1 and 0 < creased < len(widths)
+    assert axis.nodes == axis.cells + 2 + inner == nodes.max() + 1
+
+
+@pytest.mark.parametrize("planes", [[0.0], [0.0, 1.0, 1.0], [1.0, 0.0]])
+def test_planes_that_do_not_increase_are_refused(planes):
+    with pytest.raises(ValueError, match=r"^planes = .*: wanted two coordinates or more, each larger"):
+        Axis(np.array(planes))
 
 
 def test_the_quadrature_is_that_of_gauss():
     # Two points integrate cubics over a cell exactly.
     for power, wanted in ((0, 1.0), (1, 0.0), (2, 1 / 12), (3, 0.0)):
         assert sum((s * QUADRATURE) ** power / 2 for s in (-1, 1)) == pytest.approx(wanted, abs=1e-15)
+
+
+def test_linear_fields_and_their_gradients_are_exact_on_uneven_axes():
+    lat = uneven()
+    field, A = affine(lat.node_places, 3)
+    for kind, where in (("weight", quadrature(lat)), ("mark", lat.places)):
+        torch.testing.assert_close(lat.to_points(field.T, kind).T, affine(where, 3)[0], rtol=0, atol=1e-12)
+    gradient = lat.gradient(field.T.unsqueeze(0))
+    torch.testing.assert_close(gradient, A.view(1, 3, 3, 1).expand_as(gradient), rtol=0, atol=1e-11)
+    at, weights, slopes = lat.stencil(torch.arange(lat.count), place=QUADRATURE)
+    torch.testing.assert_close((field.T[:, at] * weights).sum(-1), lat.to_points(field.T), rtol=0, atol=1e-12)
+    by_slopes = torch.einsum("cpn,pan->cap", field.T[:, at], slopes)
+    torch.testing.assert_close(by_slopes, gradient[0], rtol=0, atol=1e-11)
+
+
+def test_nodes_on_the_faces_of_a_full_body_with_open_knots_reach_nowhere():
+    lat = uneven()
+    size = torch.from_numpy(np.prod(np.meshgrid(*(np.repeat(a.widths, 2) for a in lat.axes), indexing="ij"), axis=0))
+    nodal = lat.nodal(size.reshape(1, -1), torch.zeros(1, lat.count).double(), 0.01)[0]
+    assert not nodal[layout.NODAL_REACH].any()
+    assert not nodal[layout.NODAL_REACH + 2].any()
+    assert bool(nodal[layout.NODAL_REACH + 1].any())  # ghost nodes
 
 
 @given(points=SHAPES, cell=CELLS, seed=st.integers(0, 999))
@@ -221,9 +273,7 @@ def test_a_lattice_that_is_not_half_a_cell_is_refused():
 
 # Where a quantity of ``layout.BUFFERS`` begins is told by the constant of its name, or by this one.
 RENAMED = {
-    "integers": {"corner": "POINT_CORNER"},
     "fixed": {"coefficients": "COEFFICIENT", "prony": "ELEMENT", "nodal": "NODES", "chamber": "CHAMBER_NUMBERS"},
-    "scratch": {name: f"{name[:-1].upper()}_SUM" for name in ("points", "lines", "sheets", "parts", "groups")},
     "sums": {
         **{"coefficients_bar": "COEFFICIENT_BAR", "prony_bar": "ELEMENT_BAR", "plane_numbers_bar": "PLANE_BAR"},
         "nodal_bar": "NODES_BAR",
@@ -232,9 +282,8 @@ RENAMED = {
 
 
 def test_the_constants_of_the_layout_agree_with_its_names():
-    clock = (layout.NOW, layout.STOP, layout.ACTIVE, layout.COLLAPSED)
-    assert clock == (0, 1, 2, 3)
-    place = len(clock)
+    assert (layout.COLLAPSED, layout.ARRIVED) == (0, 1)
+    place = 2
     for name in layout.SIZES:
         assert getattr(layout, name.upper()) == place, name
         place += 1
@@ -261,7 +310,7 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
     laid = {
         (ints, layout.KIND): p.scene.kind,
         (ints, layout.PLANE_KIND): p.scene.plane_kind,
-        (integrator.fixed.buffer, layout.NUMBERS): torch.tensor(numbers(lat, p.scene.dt), dtype=torch.float64),
+        (integrator.fixed.buffer, layout.NUMBERS): numbers(lat, p.scene.dt),
         (integrator.fixed.buffer, layout.COEFFICIENT): t["coefficients"],
         (integrator.fixed.buffer, layout.ELEMENT): t["prony"],
         (integrator.fixed.buffer, layout.PLANE_NUMBERS): t["planes"],
@@ -275,10 +324,14 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
     for (buffer, constant), wanted in laid.items():
         start = int(ints[constant])
         assert torch.equal(buffer[start : start + wanted.numel()], wanted.detach().reshape(-1)), constant
-    table = integrator.fixed.buffer[: layout.LATTICE_NUMBERS]
-    weight, _, slope = spline(2, QUADRATURE)
+    table = integrator.fixed.buffer
     assert float(table[layout.STEP_SIZE]) == p.scene.dt
     assert float(table[layout.EDGE]) == lat.cell
-    assert tuple(table[layout.CORNER : layout.CORNER + 3].tolist()) == lat.low
-    torch.testing.assert_close(table[layout.WEIGHT : layout.WEIGHT + 6].view(2, 3), weight)
-    torch.testing.assert_close(table[layout.SLOPE : layout.SLOPE + 6].view(2, 3), slope / lat.cell)
+    start = layout.AXES
+    for axis in lat.axes:
+        weight, slope = (torch.from_numpy(t.reshape(-1, 3)) for t in axis.table)
+        size = 2 * axis.cells * layout.AXIS
+        rows = table[start : start + size].view(-1, layout.AXIS)
+        assert torch.equal(rows, torch.cat([weight, slope], 1))
+        start += size + 2 * axis.cells + axis.nodes
+        assert torch.equal(table[start - axis.nodes : start], torch.from_numpy(axis.places))

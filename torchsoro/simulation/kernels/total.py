@@ -12,31 +12,7 @@ from torchsoro.simulation.kernels.forward import (
     Integers,
     Reals,
 )
-from torchsoro.simulation.kernels.lattice import (
-    ALONE,
-    TOTALS,
-    chamber_slots,
-    hand_over,
-    hand_over_vector,
-    meet,
-    node_chunks,
-    nodes_per_axis,
-    particle_place,
-    point_of,
-    points_per_axis,
-    product,
-    stage,
-    stage_axes,
-    sum_chambers,
-    sum_tile,
-    sum_tiles,
-    sync,
-    thread,
-    tile_box,
-    tile_count,
-    tile_gradient,
-    tile_value,
-)
+from torchsoro.simulation.kernels.lattice import nodes_per_axis, particle_place, points_per_axis, product
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
     ANCHOR,
@@ -80,7 +56,6 @@ from torchsoro.simulation.kernels.layout import (
     SHEAR,
     SLOT,
     SLOT_CHAMBER,
-    SLOT_START,
     SLOTS,
     SOURCES,
     SPRING,
@@ -115,6 +90,28 @@ from torchsoro.simulation.kernels.tensor import (
     plus_identity,
     store_symmetric,
     store_vector,
+)
+from torchsoro.simulation.kernels.tile import (
+    ALONE,
+    KEPT,
+    TOTALS,
+    chamber_slots,
+    hand_over,
+    hand_over_vector,
+    meet,
+    node_chunks,
+    point_of,
+    stage,
+    stage_axes,
+    sum_chambers,
+    sum_tile,
+    sum_tiles,
+    sync,
+    thread,
+    tile_box,
+    tile_count,
+    tile_gradient,
+    tile_value,
 )
 
 
@@ -264,22 +261,22 @@ def point_pass(
     pad: ti.template(),
     base,
     item,
+    fresh,
     t,
     q0,
     q1,
 ):
     """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
-    b, tile = item // tile_count(head), item % tile_count(head)
-    cell, cells, node = tile_box(head, ints, tile)
+    cell, cells, node, first, last, b, tile = tile_box(gpu, fresh, head, ints, item, q0)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
-    stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
+    if fresh == 1:
+        stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
     stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
     if ti.static(loaded):
         if head[VISCOUS] == 1:
             stage(gpu, head, state, at + 3 * product(nodes_per_axis(head)), pad, base, 1, node, q0, q1)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
-    first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
     for slot in range(first - 1, last):
         # The tile's own slot, then those of the chambers that it has points of.
         out = partials + tile * SLOT
@@ -381,7 +378,7 @@ def total_substep(
             item = w // CPU_UNIT
             pad = ints[PADS] + item * PAD
             point_pass(
-                *(False, loaded, stiffens, ints, ints, fixed, supply, state, scratch, scratch, pad, item, t, 0, TILE)
+                *(False, loaded, stiffens, ints, ints, fixed, supply, state, scratch, scratch, pad, item, 1, t, 0, TILE)
             )
     for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
@@ -412,7 +409,7 @@ def total_march(
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
         q, block = w % TILE, w // TILE
-        head = ti.simt.block.SharedArray((HEAD + 1,), ti.i32)
+        head = ti.simt.block.SharedArray((KEPT,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
             head[q] = ints[q]
@@ -424,8 +421,11 @@ def total_march(
             for t in range(first, last):
                 item = block
                 while item < head[BATCH] * tile_count(head):
+                    # A block that has one tile keeps what it knows of it.
+                    fresh = ti.cast(t == first or head[BATCH] * tile_count(head) > blocks, ti.i32)
                     point_pass(
-                        *(True, loaded, stiffens, head, ints, fixed, supply, state, scratch, pad, 0, item, t, q, q + 1)
+                        *(True, loaded, stiffens, head, ints, fixed, supply, state, scratch, pad, 0, item, fresh),
+                        *(t, q, q + 1),
                     )
                     item += blocks
                 arrivals += blocks

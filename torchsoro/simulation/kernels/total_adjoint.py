@@ -12,56 +12,22 @@ from torchsoro.simulation.kernels.forward import (
     Integers,
     Reals,
 )
-from torchsoro.simulation.kernels.lattice import (
-    ALONE,
-    TOTALS,
-    chamber_slots,
-    gather_value,
-    hand_over,
-    hand_over_vector,
-    meet,
-    node_chunks,
-    nodes_per_axis,
-    point_of,
-    points_per_axis,
-    product,
-    stage,
-    stage_axes,
-    sum_chambers,
-    sum_tile,
-    sum_tiles,
-    sync,
-    thread,
-    tile_box,
-    tile_count,
-    tile_gradient,
-    tile_value,
-)
+from torchsoro.simulation.kernels.lattice import gather_value, nodes_per_axis, points_per_axis, product
 from torchsoro.simulation.kernels.layout import (
-    ABSENT,
-    ANCHOR,
     BATCH,
     BLOCKS,
-    BULK,
     CHAMBER,
     CHAMBER_BAR,
     CHAMBER_NUMBERS,
     CHAMBER_STIFFNESS,
     CHAMBER_VOLUME,
     CHAMBERS,
-    COEFFICIENT,
-    COEFFICIENT_BAR,
-    COEFFICIENTS,
-    ELEMENT,
-    ELEMENT_BAR,
-    ELEMENTS,
     FORCE_BAR,
     FORCES,
     GRAVITY,
     GRAVITY_BAR,
     GROUPS,
     HEAD,
-    JACOBIANS,
     KIND,
     NEAR_NODES,
     NODAL,
@@ -73,49 +39,23 @@ from torchsoro.simulation.kernels.layout import (
     PADS,
     PARTIALS,
     PLANES,
-    PRESSURE,
     PRESSURE_BAR,
-    PRONY,
-    PRONY_DECAY,
-    PRONY_GAIN,
-    PRONY_MODULUS,
     PUSHED,
     SHARE,
     SHARED,
-    SHEAR,
     SLOT,
     SLOT_CHAMBER,
-    SLOT_START,
     SLOTS,
     SOURCES,
-    SPRING,
-    SPRINGS,
     STEP_SIZE,
     STEPS,
-    STIFFENING,
     SURFACES,
     SWEPT,
     TALLIES,
     TILE,
-    VISCOSITY,
     VISCOUS,
-    VOID_FRACTION,
-    VOLUME,
     VOLUME_BAR,
-    VOLUME_VISCOSITY,
     VOLUMES,
-    WANT_PRONY,
-)
-from torchsoro.simulation.kernels.stress import (
-    least_ratio,
-    piola_adjoint,
-    pull_back,
-    pull_back_adjoint,
-    stiffening,
-    stiffening_adjoint,
-    viscous_piola_adjoint,
-    void_piola_adjoint,
-    void_work,
 )
 from torchsoro.simulation.kernels.surface import (
     surface_response_adjoint,
@@ -123,22 +63,34 @@ from torchsoro.simulation.kernels.surface import (
 )
 from torchsoro.simulation.kernels.tensor import (
     add,
-    cofactor,
     contract,
-    cross,
-    load_symmetric,
-    load_symmetric_adjoint,
     load_vector,
-    plus_identity,
-    store_symmetric_adjoint,
     store_vector,
 )
+from torchsoro.simulation.kernels.tile import (
+    ALONE,
+    KEPT,
+    TOTALS,
+    chamber_slots,
+    meet,
+    node_chunks,
+    point_of,
+    stage,
+    stage_axes,
+    sum_chambers,
+    sum_tile,
+    sum_tiles,
+    sync,
+    thread,
+    tile_box,
+    tile_count,
+    tile_gradient,
+)
 from torchsoro.simulation.kernels.total import (
-    chamber_pressure,
     chamber_share,
-    spring_stretch,
     state_length,
 )
+from torchsoro.simulation.kernels.total_points_adjoint import rate_point_adjoint, stress_point_adjoint
 
 
 @ti.func
@@ -270,192 +222,6 @@ def tally(
 
 
 @ti.func
-def maxwell_adjoint(
-    head: ti.template(),
-    fixed: ti.template(),
-    state: ti.template(),
-    at,
-    bar: ti.template(),
-    here,
-    sums: ti.template(),
-    b,
-    p,
-    points,
-    S,
-    Q_bar,
-):
-    """Through the Maxwell elements of a point, whose places in state and adjoint are given: the gradient by S."""
-    elements = head[ELEMENTS]
-    S_bar = S * 0
-    for e in range(elements):
-        place = here + 6 * e * points
-        number = head[ELEMENT] + (b * elements + e) * PRONY
-        a, gain, g = fixed[number + PRONY_DECAY], fixed[number + PRONY_GAIN], fixed[number + PRONY_MODULUS]
-        Z_bar = load_symmetric_adjoint(bar, place, points)
-        S_bar += gain * (g * Q_bar - (1 - a) * Z_bar)
-        if head[WANT_PRONY] == 1:
-            Z = load_symmetric(state, at + 6 * e * points, points)
-            mine = head[ELEMENT_BAR] + (b * elements + e) * PRONY * points + p
-            by_stress, by_history = contract(Q_bar, S), contract(Z_bar, S)
-            add(False, sums, mine + PRONY_MODULUS * points, contract(Q_bar, Z) + gain * by_stress)
-            add(False, sums, mine + PRONY_GAIN * points, g * by_stress - (1 - a) * by_history)
-            add(False, sums, mine + PRONY_DECAY * points, contract(Z_bar, Z) + gain * by_history)
-        store_symmetric_adjoint(bar, place, points, a * Z_bar + g * Q_bar)
-    return S_bar
-
-
-@ti.func
-def external_adjoint(
-    head: ti.template(),
-    fixed: ti.template(),
-    pad: ti.template(),
-    base,
-    q,
-    sums: ti.template(),
-    b,
-    p,
-):
-    """Adjoint of ``total.external_force``, group forces excepted: by springs, anchors, and (returned) the place."""
-    points = product(points_per_axis(head))
-    mine = b * COEFFICIENTS * points + p
-    mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
-    push_bar = tile_value(pad, base, 1, q)
-    spring = fixed[mat + SPRING * points]
-    stretch = spring_stretch(head, fixed, tile_value(pad, base, 0, q), b, p)
-    add(False, sums, mat_bar + SPRING * points, push_bar.dot(stretch))
-    for c in ti.static(range(3)):
-        add(False, sums, mat_bar + (ANCHOR + c) * points, spring * push_bar[c])
-    return -spring * push_bar
-
-
-@ti.func
-def stress_point_adjoint(
-    loaded: ti.template(),
-    stiffens: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    pad: ti.template(),
-    base,
-    q,
-    t,
-    b,
-    p,
-):
-    """Adjoint of ``total.stress_point``: sums of its own; hands over the gradients by F and by the place of point p."""
-    zero = fixed[STEP_SIZE] * 0
-    F_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
-    place_bar = ti.Vector([zero, zero, zero])
-    kind = ti.cast(ABSENT, ti.i32)
-    if p >= 0:
-        kind = ints[head[KIND] + p]
-    points, elements, nodes = product(points_per_axis(head)), head[ELEMENTS], product(nodes_per_axis(head))
-    mine = b * COEFFICIENTS * points + p
-    mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
-    if kind >= 0 and t + 1 < head[STEPS]:
-        # The gradient by a chamber's volume is known one pass after the points that fill it.
-        by_volume = back[head[VOLUME_BAR] + b * head[CHAMBERS] + kind]
-        add(False, sums, mat_bar + VOLUME * points, by_volume * back[head[JACOBIANS] + b * points + p])
-    if t >= 0 and kind != ABSENT:
-        history = b * state_length(head) + 6 * nodes + p
-        maxwell = (t * head[BATCH] + b) * state_length(head) + 6 * nodes + p
-        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
-        volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-        P_bar = -volume * tile_gradient(pad, base, 1, q)
-        work = volume * 0  # P : P_bar, by which the gradient by the volume is known
-        if kind < 0:
-            bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
-            least = least_ratio(void_fraction)
-            Q = F * 0
-            S = F * 0
-            factor, linear, square = void_fraction * 0 + 1, void_fraction * 0, void_fraction * 0
-            if ti.static(stiffens):
-                linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
-                factor = stiffening(F, least, linear, square)
-            if elements > 0 and void_fraction < 1:
-                S = factor * pull_back(F, least)
-                for e in range(elements):
-                    number = head[ELEMENT] + (b * elements + e) * PRONY
-                    Z = load_symmetric(state, maxwell + 6 * e * points, points)
-                    Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
-            by_F, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
-                F, Q, bulk, shear, factor, void_fraction, P_bar
-            )
-            F_bar = by_F
-            work = bulk * bulk_bar + shear * shear_bar
-            add(False, sums, mat_bar + BULK * points, bulk_bar)
-            add(False, sums, mat_bar + SHEAR * points, shear_bar)
-            add(False, sums, mat_bar + VOID_FRACTION * points, void_bar)
-            if elements > 0 and void_fraction < 1:
-                S_bar = maxwell_adjoint(head, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar)
-                F_bar += pull_back_adjoint(F, least, factor * S_bar)
-                if ti.static(stiffens):
-                    factor_bar += contract(S_bar, pull_back(F, least))
-            else:
-                for c in range(6 * elements):
-                    bar[history + c * points] = 0
-            if ti.static(stiffens):
-                by_F, linear_bar, square_bar = stiffening_adjoint(F, least, linear, square, factor_bar)
-                F_bar += by_F
-                add(False, sums, mat_bar + STIFFENING * points, linear_bar)
-                add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
-        else:
-            for c in range(6 * elements):
-                bar[history + c * points] = 0
-            cof = cofactor(F)
-            one = b * head[CHAMBERS] + kind
-            step = t * head[BATCH] * head[CHAMBERS] + one
-            p_act, swelled = supply[head[PRESSURE] + step], kept[head[VOLUMES] + step]
-            pressure = chamber_pressure(head, fixed, p_act, swelled, one)
-            shear_bar = void_work(F, P_bar)
-            F_bar = void_piola_adjoint(F, shear, P_bar) - pressure * cross(F, P_bar)
-            work = shear * shear_bar - pressure * contract(P_bar, cof)
-            add(False, sums, mat_bar + SHEAR * points, shear_bar)
-            back[head[JACOBIANS] + b * points + p] = contract(cof, F) / 3
-        if ti.static(loaded):
-            if kind < 0 and head[VISCOUS] == 1:
-                eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                rate = tile_gradient(pad, base, 2, q)
-                by_F, _, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
-                F_bar += by_F
-                work += eta * eta_bar + zeta * zeta_bar
-                add(False, sums, mat_bar + VISCOSITY * points, eta_bar)
-                add(False, sums, mat_bar + VOLUME_VISCOSITY * points, zeta_bar)
-            if head[SPRINGS] == 1:
-                place_bar = external_adjoint(head, fixed, pad, base, q, sums, b, p)
-        add(False, sums, mat_bar + VOLUME * points, work / volume)
-    hand_over(pad, base, q, F_bar)
-    if ti.static(loaded):
-        hand_over_vector(pad, base, q, place_bar)
-
-
-@ti.func
-def rate_point_adjoint(
-    head: ti.template(), ints: ti.template(), fixed: ti.template(), pad: ti.template(), base, q, b, p
-):
-    """Hand over the gradient by the rate of F at point p, through viscosity."""
-    zero = fixed[STEP_SIZE] * 0
-    rate_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
-    if p >= 0:
-        if ints[head[KIND] + p] == -1:
-            points = product(points_per_axis(head))
-            mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
-            F = plus_identity(tile_gradient(pad, base, 0, q), 1)
-            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(pad, base, 1, q)
-            rate = tile_gradient(pad, base, 2, q)
-            eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-            _, by_rate, _, _ = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
-            rate_bar = by_rate
-    hand_over(pad, base, q, rate_bar)
-
-
-@ti.func
 def point_pass_adjoint(
     gpu: ti.template(),
     loaded: ti.template(),
@@ -473,17 +239,18 @@ def point_pass_adjoint(
     pad: ti.template(),
     base,
     item,
+    fresh,
     t,
     q0,
     q1,
 ):
     """Adjoint of ``total.point_pass``."""
-    b, tile = item // tile_count(head), item % tile_count(head)
-    cell, cells, node = tile_box(head, ints, tile)
+    cell, cells, node, first, last, b, tile = tile_box(gpu, fresh, head, ints, item, q0)
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
-    stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
+    if fresh == 1:
+        stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
     stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
     stage(gpu, head, back, head[FORCES] + b * 3 * nodes, pad, base, 1, node, q0, q1)
     if ti.static(loaded):
@@ -492,7 +259,6 @@ def point_pass_adjoint(
             stage(gpu, head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
-    first, last = ints[head[SLOT_START] + tile], ints[head[SLOT_START] + tile + 1]
     for slot in range(first - 1, last + viscous):
         # The tile's own slot, then those of the chambers that it has points of, then that of the rates of F.
         out = partials + tile * SLOT
@@ -596,7 +362,7 @@ def total_substep_adjoint(
             pad = ints[PADS] + item * PAD
             point_pass_adjoint(
                 *(False, loaded, stiffens, ints, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                *(scratch, pad, item, t, 0, TILE),
+                *(scratch, pad, item, 1, t, 0, TILE),
             )
     for w in range(ints[BATCH] * ints[TALLIES]):
         if t >= 0:
@@ -625,7 +391,7 @@ def total_march_adjoint(
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
         q, block = w % TILE, w // TILE
-        head = ti.simt.block.SharedArray((HEAD + 1,), ti.i32)
+        head = ti.simt.block.SharedArray((KEPT,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
             head[q] = ints[q]
@@ -647,9 +413,10 @@ def total_march_adjoint(
                 meet(ints, arrivals, q)
                 item = block
                 while item < head[BATCH] * tile_count(head):
+                    fresh = ti.cast(passed == 0 or head[BATCH] * tile_count(head) > blocks, ti.i32)
                     point_pass_adjoint(
                         *(True, loaded, stiffens, head, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                        *(pad, 0, item, t, q, q + 1),
+                        *(pad, 0, item, fresh, t, q, q + 1),
                     )
                     item += blocks
                 if t >= 0:

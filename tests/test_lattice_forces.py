@@ -1,0 +1,125 @@
+"""The total-Lagrangian kernels on lattices of any axes: forces, pressure, gradients, and how cells go into tiles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from problems import problem
+from test_ops import TENSORS, check
+
+from torchsoro.simulation.axis import Axis
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.tiles import tables, tiles_along
+
+
+def axis(*widths: float, creases: tuple[int, ...] = ()) -> Axis:
+    planes = 5 + np.cumsum([0.0, *widths])
+    return Axis(planes, creases=planes[list(creases)])
+
+
+def uneven() -> Lattice:
+    """Three cells by two by four, with creases; faces on the outermost nodes."""
+    return Lattice(axes=(axis(1.3, 0.7, 1.1), axis(0.9, 1.2, creases=(1,)), axis(1.3, 0.8, 1.0, 1.2, creases=(2,))))
+
+
+def wide() -> Lattice:
+    """So many cells that there are several tiles along each axis."""
+    return Lattice(
+        axes=(
+            axis(1.2, 0.8, 1.0, 0.9, 1.1, creases=(1,)),
+            Axis.uniform(5.0, 0.9, 6),
+            axis(*(0.8 + 0.1 * (i % 4) for i in range(9)), creases=(3, 4)),
+        )
+    )
+
+
+@pytest.mark.parametrize("name", TENSORS)
+def test_gradcheck_by_every_tensor_with_open_knots_and_creases(name):
+    assert check(problem(formulation="total", lattice=uneven(), batch=2), name)
+
+
+def test_gradcheck_over_several_tiles():
+    p = problem(formulation="total", lattice=wide(), steps=3, samples=(0, 3))
+    assert check(p, "state", "coefficients", "pressure", "gravity")
+
+
+def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamber():
+    # One substep from a random state against the derivatives, by torch, of what is summed over all points at once.
+    p = problem(formulation="total", lattice=wide(), steps=1, samples=(), elements=0)
+    lat, c = wide(), p.tensors["coefficients"]
+    kind = torch.full(lat.points, -1, dtype=torch.int32)
+    kind[2:7, 3:9, 4:15] = 0
+    kind = kind.reshape(-1)
+    kind[p.scene.kind == layout.ABSENT] = layout.ABSENT
+    p.scene = replace(
+        p.scene,
+        **{"kind": kind, "springs": False, "viscous": False, "stiffens": False},
+        **{"share": p.scene.share[:0], "plane_kind": p.scene.plane_kind[:0]},
+    )
+    p.tensors |= {"force": p.tensors["force"][:, :, :0], "planes": p.tensors["planes"][:, :0]}
+    p.tensors["pressure"] = p.tensors["pressure"][..., :1]
+    c[:, (layout.VOID_FRACTION, layout.DRAG)] = 0
+    d, v = p.tensors["state"].view(2, 3, lat.nodes)
+    d = (0.3 * d).requires_grad_()
+    p.tensors["state"] = torch.stack([d.detach(), v]).view(1, -1)
+
+    F = lat.gradient(d.unsqueeze(0))[0].permute(2, 0, 1) + torch.eye(3).double()
+    J, trace = torch.linalg.det(F), (F * F).sum((1, 2))
+    volume, bulk, shear = (c[0, row] for row in (layout.VOLUME, layout.BULK, layout.SHEAR))
+    solid = shear / 2 * (J ** (-2 / 3) * trace - 3) + bulk / 4 * ((J - 1) ** 2 + torch.log(J) ** 2)
+    below = (J - 1) - (J - 1) ** 2 / 2
+    void = shear / 2 * (trace - 3) - shear * torch.where(J > 1, torch.log(J), below)
+    gas = kind == 0
+    energy = (volume * torch.where(gas, void, solid)).sum()
+    V, V0 = (volume * J)[gas].sum(), volume[gas].sum()
+    stiffness = (volume * bulk)[gas].sum() / V0
+    pressure = p.tensors["pressure"][0, 0, 0] - stiffness * (V / V0 - 1)
+    (by_energy,) = torch.autograd.grad(energy, d, retain_graph=True)
+    (area,) = torch.autograd.grad(V, d)
+    mass = lat.to_nodes(c[0, layout.MASS])
+    there = mass > 0
+    wanted = v + p.scene.dt * (p.tensors["gravity"][0, 0][:, None] - (by_energy - pressure.detach() * area) / mass)
+
+    found = p.run()[0][0, 3 * lat.nodes :].view(3, -1)
+    assert float((wanted - v)[:, there].abs().max()) > 1e-2
+    torch.testing.assert_close(found[:, there], wanted.detach()[:, there], rtol=0, atol=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------------------- tiles
+
+
+@given(cells=st.integers(1, 13), creased=st.sets(st.integers(1, 12)), most=st.sampled_from([2, 4]))
+def test_tiles_cover_an_axis_and_no_node_belongs_to_more_than_two(cells, creased, most):
+    a = axis(*np.ones(cells), creases=tuple(c for c in creased if c < cells))
+    tiles = tiles_along(a, most)
+    assert np.concatenate([np.arange(c, c + n) for c, n, _ in tiles]).tolist() == list(range(cells))
+    nodes = np.concatenate([np.arange(first, first + n + 2) for _, n, first in tiles])
+    assert all((a.first[c : c + n] == first + np.arange(n)).all() for c, n, first in tiles)
+    count = np.bincount(nodes, minlength=a.nodes)
+    assert 1 <= count.min() <= count.max() <= 2
+
+
+def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
+    # Tiles hand over 1 for each node of theirs: a node gets as many as there are tiles that have it.
+    lat = wide()
+    kind = torch.full((lat.count,), -1, dtype=torch.int32)
+    kind[: lat.count // 3], kind[-9:] = 0, layout.ABSENT
+    *_, chamber_start, slot_start, slots, sources, near = tables(lat, kind, 2)
+    many = len(slot_start) - 1 + len(slots)
+    at = np.sort(sources[sources >= 0])
+    assert len(np.unique(at)) == len(at)
+    assert at.max() < many * layout.SLOT
+    tiles = [tiles_along(a, n) for a, n in zip(lat.axes, layout.TILE_CELLS, strict=True)]
+    counts = [np.bincount(np.concatenate([np.arange(f, f + n + 2) for _, n, f in t])) for t in tiles]
+    wanted = counts[0][:, None, None] * counts[1][None, :, None] * counts[2][None, None, :]
+    assert (sources[0] >= 0).sum(0).tolist() == wanted.reshape(-1).tolist()
+    assert chamber_start.tolist() == [0, len(slots), len(slots)]
+    assert sorted(slots[:, 1].tolist()) == list(range(len(slots)))
+    assert near[0].any()
+    assert not near[1].any()

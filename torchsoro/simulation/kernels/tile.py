@@ -1,0 +1,464 @@
+"""Sums over the fixed stencil of the total-Lagrangian lattice: from nodes to points, and from points to nodes.
+
+A cell has 2 x 2 x 2 points and touches 3 x 3 x 3 nodes, its own lowest and two more along each axis, with the weights
+of a quadratic B-spline that is a polynomial within the cell. The cells are dealt out in tiles of 256 points. A block of
+threads on a GPU, or a loop on a CPU, takes a tile at a time: it copies the tile's nodes to a ``pad`` of its own, finds
+what each point hands to the nodes, and sums that within the pad, axis by axis: over lines along z, over the sheets of
+such lines along y, and along x to the nodes. Each node then adds up the shares of the tiles that it belongs to. Every
+sum is taken in a fixed order, and nothing is added by two threads at once.
+
+On a GPU the pad is the block's shared memory and begins at 0, on a CPU a part of a buffer. What the threads
+of a block do is written as a loop over those from ``q0`` to ``q1``: one on a GPU, all on a CPU.
+"""
+
+import taichi as ti
+
+from torchsoro.simulation.kernels.lattice import axis_starts, nodes_per_axis, product
+from torchsoro.simulation.kernels.layout import (
+    ARRIVED,
+    AXES,
+    AXIS,
+    CHAMBER_START,
+    CHAMBERS,
+    HEAD,
+    NY,
+    NZ,
+    PAD,
+    PAD_AXES,
+    PAD_LINES,
+    PAD_NODES,
+    SHARED,
+    SLOT,
+    SLOT_START,
+    STEP_SIZE,
+    SWEPT,
+    TILE,
+    TILE_CELLS,
+    TILE_LINES,
+    TILE_NODES,
+    TILE_SHEETS,
+    TILE_Y,
+    TILE_Z,
+    TILES,
+    TX,
+    TY,
+    TZ,
+)
+
+# Points of a tile along x, y, z.
+WIDE, DEEP, HIGH = (2 * n for n in TILE_CELLS)
+# Where parts of a chamber's sum lie in the pad: after the bundles that go with slopes; likewise of one over tiles.
+ALONE = 9 * TILE
+PARTS = 16
+TOTALS = TILE + PARTS
+# Integers that a block keeps at hand: the head, a zero, and those of a tile.
+KEPT = HEAD + 14
+
+
+@ti.func
+def sync(gpu: ti.template()):
+    """Wait for the other threads of the block."""
+    if ti.static(gpu):
+        ti.simt.block.sync()
+
+
+@ti.func
+def thread(gpu: ti.template(), head: ti.template(), each):
+    """Number of a thread, read anew: else what follows from it would be kept, in slow memory, from the start."""
+    q = each
+    if ti.static(gpu):
+        q += head[HEAD]  # 0
+    return q
+
+
+@ti.func
+def meet(ints: ti.template(), arrivals, q):
+    """Wait for the other blocks, all of which must run at the same time, until so many have arrived in all."""
+    ti.simt.block.sync()
+    if q == 0:
+        ti.simt.grid.memfence()
+        ti.atomic_add(ints[ARRIVED], 1)
+        while ti.atomic_max(ints[ARRIVED], 0) < arrivals:  # a plain load may come from a cache
+            pass
+        ti.simt.grid.memfence()
+    ti.simt.block.sync()
+
+
+@ti.func
+def tile_count(head: ti.template()):
+    """Tiles of a simulation."""
+    return head[TX] * head[TY] * head[TZ]
+
+
+@ti.func
+def node_chunks(head: ti.template()):
+    """Blocks of threads that the nodes of a simulation take."""
+    return (product(nodes_per_axis(head)) + TILE - 1) // TILE
+
+
+@ti.func
+def chamber_slots(head: ti.template(), ints: ti.template()):
+    """Pairs of a tile and a chamber that has points in it, of a simulation."""
+    return ints[head[CHAMBER_START] + head[CHAMBERS]]
+
+
+@ti.func
+def tile_number(head: ti.template(), ints: ti.template(), item, k):
+    """One of the numbers of :func:`tile_box`, in its order."""
+    b, tile = item // tile_count(head), item % tile_count(head)
+    along = tile // (head[TY] * head[TZ])
+    if k % 3 == 1:
+        along = head[TX] + (tile // head[TZ]) % head[TY]
+    elif k % 3 == 2:
+        along = head[TX] + head[TY] + tile % head[TZ]
+    at = head[TILES] + 3 * along + k // 3
+    if k >= 9:
+        at = head[SLOT_START] + tile + ti.min(k - 9, 1)
+    number = ints[at]
+    if k == 11:
+        number = b
+    elif k == 12:
+        number = tile
+    return number
+
+
+@ti.func
+def tile_box(gpu: ti.template(), fresh, head: ti.template(), ints: ti.template(), item, each):
+    """What is to be known of a tile, number ``item`` of all simulations; a GPU keeps it at hand until ``fresh``.
+
+    Returns:
+        Lowest cell; cells along x, y, z; lowest node; where its pairs with chambers begin and end; the simulation, and
+        the tile's number in it.
+    """
+    box = ti.Vector([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
+    if ti.static(gpu):
+        if fresh == 1 and each < 13:
+            head[HEAD + 1 + each] = tile_number(head, ints, item, each)
+        sync(gpu)
+        for k in ti.static(range(13)):
+            box[k] = head[HEAD + 1 + k]
+    else:
+        for k in ti.static(range(13)):
+            box[k] = tile_number(head, ints, item, k)
+    cell, cells = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
+    return cell, cells, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
+
+
+@ti.func
+def point_place(cell, q):
+    """Number, along each axis, of the tile's point q."""
+    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
+    return ti.Vector([2 * cell[0] + x, 2 * cell[1] + y, 2 * cell[2] + z])
+
+
+@ti.func
+def point_of(head: ti.template(), cell, cells, q):
+    """The point that thread q works on; -1 if the tile has fewer."""
+    at = point_place(cell, q) - 2 * cell
+    p = ti.cast(-1, ti.i32)
+    if at[0] < 2 * cells[0] and at[1] < 2 * cells[1] and at[2] < 2 * cells[2]:
+        p = ((2 * cell[0] + at[0]) * head[NY] + 2 * cell[1] + at[1]) * head[NZ] + 2 * cell[2] + at[2]
+    return p
+
+
+@ti.func
+def field_start(number: ti.template()):
+    """Where a staged field begins in the pad."""
+    return ti.static(PAD_LINES if number == 2 else PAD_NODES + number * SLOT)
+
+
+@ti.func
+def near(place):
+    """A place in the pad, of which the compiler then knows that constants added to it do not overflow."""
+    return place & ti.static(2 ** PAD.bit_length() - 1)
+
+
+@ti.func
+def stage(
+    gpu: ti.template(),
+    head: ti.template(),
+    a: ti.template(),
+    at,
+    pad: ti.template(),
+    base,
+    number: ti.template(),
+    node,
+    q0,
+    q1,
+):
+    """Copy a vector field at the nodes of a tile to the pad, as its field of that number."""
+    m = nodes_per_axis(head)
+    nodes = product(m)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        for part in ti.static(range((SLOT + TILE - 1) // TILE)):
+            one = q + part * TILE
+            if one < SLOT:
+                c, i = one // TILE_NODES, one % TILE_NODES
+                # A tile with fewer cells than usual reads some nodes in vain.
+                x = ti.min(node[0] + i // ti.static(TILE_Y * TILE_Z), m[0] - 1)
+                y = ti.min(node[1] + i // TILE_Z % TILE_Y, m[1] - 1)
+                z = ti.min(node[2] + i % TILE_Z, m[2] - 1)
+                pad[base + field_start(number) + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
+
+
+@ti.func
+def stage_axes(
+    gpu: ti.template(),
+    head: ti.template(),
+    fixed: ti.template(),
+    pad: ti.template(),
+    base,
+    cell,
+    cells,
+    q0,
+    q1,
+):
+    """Copy weights and slopes of a tile's points along the axes to the pad; zeros for cells that it has not."""
+    starts = axis_starts(head)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        if q < ti.static(AXIS * (WIDE + DEEP + HIGH)):
+            p, start, first, count = q // AXIS, starts[0], cell[0], cells[0]
+            if p >= ti.static(WIDE + DEEP):
+                p, start, first, count = p - ti.static(WIDE + DEEP), starts[2], cell[2], cells[2]
+            elif p >= WIDE:
+                p, start, first, count = p - WIDE, starts[1], cell[1], cells[1]
+            number = fixed[STEP_SIZE] * 0
+            if p < 2 * count:
+                number = fixed[start + AXIS * (2 * first + p) + q % AXIS]
+            pad[base + PAD_AXES + q] = number
+
+
+@ti.func
+def point_axes(q):
+    """Where the weights of the tile's point q along the axes begin, and that of its cell's lowest node in a field."""
+    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
+    fx, fy, fz = AXIS * x, AXIS * (WIDE + y), AXIS * (WIDE + DEEP + z)
+    corner = ((x // 2) * TILE_Y + y // 2) * TILE_Z + z // 2
+    return near(PAD_AXES + fx), near(PAD_AXES + fy), near(PAD_AXES + fz), corner
+
+
+@ti.func
+def tile_gradient(pad: ti.template(), base, number: ti.template(), q):
+    """Gradient of a staged field by the reference place at the tile's point q."""
+    fx, fy, fz, first = point_axes(q)
+    corner = near(field_start(number) + first)
+    w = ti.Vector([pad[base + fz + k] for k in ti.static(range(3))])
+    s = ti.Vector([pad[base + fz + 3 + k] for k in ti.static(range(3))])
+    zero = w[0] * 0
+    G = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
+    for i in ti.static(range(3)):
+        wx, sx = pad[base + fx + i], pad[base + fx + 3 + i]
+        for j in ti.static(range(3)):
+            wy, sy = pad[base + fy + j], pad[base + fy + 3 + j]
+            for c in ti.static(range(3)):
+                place = base + corner + ti.static(c * TILE_NODES + (i * TILE_Y + j) * TILE_Z)
+                a0, a1, a2 = pad[place], pad[place + 1], pad[place + 2]
+                value = w[0] * a0 + w[1] * a1 + w[2] * a2
+                G[c, 0] += sx * wy * value
+                G[c, 1] += wx * sy * value
+                G[c, 2] += wx * wy * (s[0] * a0 + s[1] * a1 + s[2] * a2)
+    return G
+
+
+@ti.func
+def tile_value(pad: ti.template(), base, number: ti.template(), q):
+    """A staged field at the tile's point q."""
+    fx, fy, fz, first = point_axes(q)
+    corner = near(field_start(number) + first)
+    zero = pad[base + fx] * 0
+    u = ti.Vector([zero, zero, zero])
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                weight = pad[base + fx + i] * pad[base + fy + j] * pad[base + fz + k]
+                for c in ti.static(range(3)):
+                    u[c] += weight * pad[base + corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
+    return u
+
+
+@ti.func
+def hand_over(pad: ti.template(), base, q, m):
+    """Write the tensor that the tile's point q hands to the nodes."""
+    for i, j in ti.static(ti.ndrange(3, 3)):
+        pad[base + near(q) + (3 * i + j) * TILE] = m[i, j]
+
+
+@ti.func
+def hand_over_vector(pad: ti.template(), base, q, v):
+    """Write the vector that goes with it."""
+    for i in ti.static(range(3)):
+        pad[base + near(q) + (9 + i) * TILE] = v[i]
+
+
+@ti.func
+def neighbour_point(pad: ti.template(), base, axis, most: ti.template(), node, k, odd):
+    """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope.
+
+    ``axis`` is where the tile's weights along an axis begin, ``most`` how many cells a tile has along it.
+    """
+    cell = node - k
+    inside = cell >= 0 and cell < most
+    # Elsewhere, a point that is there is read for nothing, so that loads need not wait for branches.
+    p = ti.select(inside, 2 * cell + odd, 0)
+    at = near(axis + AXIS * p)
+    w, s = pad[base + at + k], pad[base + at + 3 + k]
+    return p, ti.select(inside, w, w * 0), ti.select(inside, s, s * 0)
+
+
+@ti.func
+def sum_tile(
+    gpu: ti.template(),
+    vectors: ti.template(),
+    head: ti.template(),
+    pad: ti.template(),
+    base,
+    with_vector,
+    out: ti.template(),
+    out_at,
+    alone: ti.template(),
+    alone_at,
+    q0,
+    q1,
+):
+    """Sum what the points of a tile hand to its nodes: tensors, and vectors too if ``with_vector``.
+
+    Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone_at``
+    is negative.
+    """
+    axis_x, axis_y, axis_z = PAD_AXES, PAD_AXES + AXIS * WIDE, PAD_AXES + AXIS * (WIDE + DEEP)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        if q < TILE_LINES:
+            node, column = q % TILE_Z, q // TILE_Z * HIGH
+            zero = pad[base + axis_x] * 0
+            along_x = ti.Vector([zero, zero, zero])
+            along_y = ti.Vector([zero, zero, zero])
+            along_z = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(pad, base, axis_z, TILE_CELLS[2], node, k, odd)
+                    at = base + near(column + p)
+                    for c in ti.static(range(3)):
+                        along_x[c] += w * pad[at + (3 * c) * TILE]
+                        along_y[c] += w * pad[at + (3 * c + 1) * TILE]
+                        along_z[c] += s * pad[at + (3 * c + 2) * TILE]
+                    if ti.static(vectors):
+                        if with_vector == 1:
+                            for c in ti.static(range(3)):
+                                along_z[c] += w * pad[at + (9 + c) * TILE]
+            for c in ti.static(range(3)):
+                pad[base + near(q) + ti.static(PAD_LINES + c * TILE_LINES)] = along_x[c]
+                pad[base + near(q) + ti.static(PAD_LINES + (3 + c) * TILE_LINES)] = along_y[c]
+                pad[base + near(q) + ti.static(PAD_LINES + (6 + c) * TILE_LINES)] = along_z[c]
+        elif with_vector == 0 and alone_at >= 0:
+            one = q - TILE_LINES
+            total = pad[base + ALONE + 4 * one]
+            for m in ti.static(range(1, 4)):
+                total += pad[base + ALONE + 4 * one + m]
+            pad[base + ALONE + TILE + one] = total
+    sync(gpu)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        if q < TILE_SHEETS:
+            iz, iy, px = q % TILE_Z, q // TILE_Z % TILE_Y, q // ti.static(TILE_Y * TILE_Z)
+            zero = pad[base + axis_x] * 0
+            slope = ti.Vector([zero, zero, zero])
+            flat = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(pad, base, axis_y, TILE_CELLS[1], iy, k, odd)
+                    at = base + near(PAD_LINES + (px * DEEP + p) * TILE_Z + iz)
+                    for c in ti.static(range(3)):
+                        slope[c] += w * pad[at + c * TILE_LINES]
+                        flat[c] += s * pad[at + (3 + c) * TILE_LINES] + w * pad[at + (6 + c) * TILE_LINES]
+            for c in ti.static(range(3)):
+                pad[base + near(q) + c * TILE_SHEETS] = slope[c]
+                pad[base + near(q) + (3 + c) * TILE_SHEETS] = flat[c]
+        elif q < TILE_SHEETS + 8 and with_vector == 0 and alone_at >= 0:
+            one = q - TILE_SHEETS
+            total = pad[base + ALONE + TILE + 8 * one]
+            for m in ti.static(range(1, 8)):
+                total += pad[base + ALONE + TILE + 8 * one + m]
+            pad[base + ALONE + 2 * TILE + one] = total
+    sync(gpu)
+    for each in range(q0, q1):
+        q = thread(gpu, head, each)
+        if q < TILE_NODES:
+            rest, ix = q % ti.static(TILE_Y * TILE_Z), q // ti.static(TILE_Y * TILE_Z)
+            zero = pad[base + axis_x] * 0
+            total = ti.Vector([zero, zero, zero])
+            for k in ti.static(range(3)):
+                for odd in ti.static(range(2)):
+                    p, w, s = neighbour_point(pad, base, axis_x, TILE_CELLS[0], ix, k, odd)
+                    at = base + near(p * ti.static(TILE_Y * TILE_Z) + rest)
+                    for c in ti.static(range(3)):
+                        total[c] += s * pad[at + c * TILE_SHEETS] + w * pad[at + (3 + c) * TILE_SHEETS]
+            for c in ti.static(range(3)):
+                out[out_at + c * TILE_NODES + q] = total[c]
+        elif q == TILE_NODES and with_vector == 0 and alone_at >= 0:
+            total = pad[base + ALONE + 2 * TILE]
+            for m in ti.static(range(1, 8)):
+                total += pad[base + ALONE + 2 * TILE + m]
+            alone[alone_at] = total
+    sync(gpu)
+
+
+@ti.func
+def sum_tiles(fixed: ti.template(), ints: ti.template(), a: ti.template(), at, sources, i, nodes):
+    """Sum at node i the shares of tiles; ``sources`` is where the table begins that says where these lie."""
+    zero = fixed[AXES] * 0
+    total = ti.Vector([zero, zero, zero])
+    for n in ti.static(range(SHARED)):
+        source = ints[sources + n * nodes + i]
+        place = at + ti.max(source, 0)
+        for c in ti.static(range(3)):
+            share = a[place + c * TILE_NODES]
+            total[c] += ti.select(source >= 0, share, zero)
+    return total
+
+
+@ti.func
+def sum_chambers(
+    gpu: ti.template(),
+    head: ti.template(),
+    ints: ti.template(),
+    fixed: ti.template(),
+    scratch: ti.template(),
+    pad: ti.template(),
+    base,
+    b,
+    q0,
+    q1,
+):
+    """Sum what the tiles of each chamber of simulation b hand over alone: at TOTALS of the pad, number by number."""
+    chambers, start = head[CHAMBERS], head[CHAMBER_START]
+    for k in range(chambers):
+        first, last = ints[start + k], ints[start + k + 1]
+        swept = head[SWEPT] + b * ints[start + chambers]
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
+            total = fixed[AXES] * 0
+            one = first + q
+            while one < last:
+                total += scratch[swept + one]
+                one += TILE
+            pad[base + q] = total
+        sync(gpu)
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
+            if q < PARTS:
+                total = pad[base + q]
+                for m in ti.static(range(1, TILE // PARTS)):
+                    total += pad[base + m * PARTS + q]
+                pad[base + TILE + q] = total
+        sync(gpu)
+        for each in range(q0, q1):
+            q = thread(gpu, head, each)
+            if q == 0:
+                total = pad[base + TILE]
+                for m in ti.static(range(1, PARTS)):
+                    total += pad[base + TILE + m]
+                pad[base + TOTALS + k] = total
+        sync(gpu)
