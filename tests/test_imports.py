@@ -20,7 +20,7 @@ PACKAGE = ROOT / "torchsoro"
 ORDER = """
 errors
 storage command_line
-simulation.laws
+simulation.laws simulation.axis
 simulation.kernels
 simulation.runtime
 simulation.ops

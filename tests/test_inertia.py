@@ -12,7 +12,7 @@ from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice
 
 
 def lattice(*points: int) -> Lattice:
-    return Lattice(points=points, low=(0.3, -1.0, 2.0), cell=0.5)
+    return Lattice.uniform(points, (0.3, -1.0, 2.0), 0.5)
 
 
 def porous(lat: Lattice, share: float, *, seed: int = 0) -> torch.Tensor:

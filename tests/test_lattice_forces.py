@@ -82,7 +82,7 @@ def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamb
     pressure = p.tensors["pressure"][0, 0, 0] - stiffness * (V / V0 - 1)
     (by_energy,) = torch.autograd.grad(energy, d, retain_graph=True)
     (area,) = torch.autograd.grad(V, d)
-    mass = lat.to_nodes(c[0, layout.MASS])
+    mass = lat.nodal_mass(c[:, layout.MASS])[0]
     there = mass > 0
     wanted = v + p.scene.dt * (p.tensors["gravity"][0, 0][:, None] - (by_energy - pressure.detach() * area) / mass)
 
