@@ -156,6 +156,15 @@ def test_finds_where_the_time_goes(benchmark):
     assert found["split"][0]["adjoint [us]"] > 0
 
 
+@pytest.mark.slow
+def test_sets_the_clock_against_the_kernels_own_time(benchmark):
+    one, many = benchmark.host(small(benchmark, formulation="total"))
+    assert (one["bodies"], many["bodies"]) == (1, 64)
+    for row in (one, many):
+        assert row["forward, ratio"] == pytest.approx(row["forward [us]"] / row["forward, kernels [us]"])
+        assert row["both, kernels [us]"] > row["forward, kernels [us]"] > 0
+
+
 def test_names_the_loops_of_the_kernels():
     tasks = {
         "substep_c80_0_kernel_0_serial": 1.0,
@@ -177,7 +186,7 @@ def test_names_the_loops_of_the_kernels():
 def test_paper_adds_what_is_required(benchmark):
     desk, paper = (small(benchmark, preset=preset) for preset in ("desk", "paper"))
     assert desk.sections == ("naive", "table", "where")
-    assert paper.sections == ("naive", "table", "where", "rollout", "bits", "five")
+    assert paper.sections == ("naive", "table", "where", "host", "rollout", "bits", "five")
     assert benchmark.Options(preset="paper", device="cpu").case("total").domain.count == 64_000
     whole = {"formulation": "total", "particles": 64_000, "steps": 75_000}
     results = {

@@ -37,8 +37,10 @@ Row = dict[str, Any]
 LOOPS = {
     "substep": ("nodes", "particles (g2p, p2g)"),
     "substep_adjoint": ("nodes", "particles (p2g, g2p)"),
-    "total_substep": ("points (gather, stress)", "lines", "sheets", "nodes"),
-    "total_substep_adjoint": ("nodes", "points (gather, stress)", "lines", "sheets"),
+    "total_substep": ("points (gather, stress, sums)", "nodes"),
+    "total_substep_adjoint": ("nodes", "points (gather, stress, sums)", "sums over all nodes and points"),
+    "total_march": ("all",),
+    "total_march_adjoint": ("all",),
 }
 
 
@@ -63,7 +65,8 @@ class Case:
 
     It rests for a third of the time and is then driven at 80 kPa and 5 Hz, as the paper's walker is. Its density falls
     from front to back, so that it travels. ``dt`` [s] is by default the paper's for its cell; with ``auto`` the
-    simulator chooses its own for the same duration. ``segment`` and ``budget`` [bytes] are the simulator's.
+    simulator chooses its own for the same duration. ``segment`` and ``budget`` [bytes] are the simulator's. ``bodies``
+    of this size are simulated at once, each a little denser than the one before.
     """
 
     count: int
@@ -75,6 +78,7 @@ class Case:
     auto: bool = False
     segment: int | None = None
     budget: int | None = None
+    bodies: int = 1
 
     @cached_property
     def domain(self) -> Domain:
@@ -83,8 +87,10 @@ class Case:
 
     @cached_property
     def gamma(self) -> Tensor:
-        """Density [N]."""
+        """Density [N], or [bodies, N] if there are several."""
         falling = 0.65 + 0.25 * torch.cos(math.pi / EDGE * self.domain.positions[:, 0])
+        if self.bodies > 1:
+            falling = falling + torch.linspace(0.0, 0.05, self.bodies).to(falling).unsqueeze(1)
         return torch.where(self.domain.wall, torch.ones_like(falling), falling).to(self.device, torch.float32)
 
     @cached_property
@@ -130,7 +136,7 @@ class Case:
         return self.simulator.step(body, self.prony, duration=duration, sample_every=rest or duration)
 
     def run(self, gamma: Tensor) -> Tensor:
-        """L: how far the centre of gravity travels along x after the rest [m]."""
+        """L: how far the centre of gravity travels along x after the rest [m]; the mean of several bodies."""
         rest, duration = self.times
         trajectory = self.simulator(
             self.body(gamma),
@@ -142,8 +148,8 @@ class Case:
             planes=[ground()],
             sample_every=rest or duration,
         )
-        x = trajectory.center_of_gravity[:, 0]
-        return x[-1] - x[1 if rest else 0]
+        x = trajectory.center_of_gravity[..., 0]
+        return (x[..., -1] - x[..., 1 if rest else 0]).mean()
 
     def forward(self) -> None:
         """A run without gradient."""
@@ -164,7 +170,7 @@ class Case:
 
     def kept(self) -> Case:
         """The same with all states kept, over no more steps than fit into the memory and into Taichi's indices."""
-        numbers = self.domain.count * (24 + 6 * self.elements)
+        numbers = self.bodies * self.domain.count * (24 + 6 * self.elements)
         room = torch.cuda.mem_get_info()[1] * 2 // 3 if self.device.type == "cuda" else 4 * 2**30
         fit = min(LARGEST // numbers, int(room / (1.2 * 4 * numbers))) - 1
         return dataclasses.replace(self, steps=min(self.steps, fit), budget=room)
@@ -250,12 +256,12 @@ def child(code: str, **environment: str) -> str:
     return done.stdout
 
 
-def trace(count: int, formulation: FormulationName, device: str, steps: int, elements: int) -> None:
+def trace(count: int, formulation: FormulationName, device: str, steps: int, elements: int, bodies: int = 1) -> None:
     """Print the milliseconds of each Taichi task in a forward run and in its gradient; for a process of its own."""
     from taichi.profiler.kernel_profiler import get_default_kernel_profiler
 
-    case = Case(count=count, formulation=formulation, device=torch.device(device), steps=steps, elements=elements)
-    case = case.recomputed()
+    fixed: Row = {"count": count, "formulation": formulation, "device": torch.device(device)}
+    case = Case(**fixed, steps=steps, elements=elements, bodies=bodies).recomputed()
     case.gradient()
     profiler, phases = get_default_kernel_profiler(), []
     gamma = case.gamma.clone().requires_grad_()

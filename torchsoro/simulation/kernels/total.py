@@ -395,6 +395,7 @@ def total_march(
     stiffens: ti.template(),
     first: ti.i32,
     last: ti.i32,
+    before: ti.i32,
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -405,6 +406,7 @@ def total_march(
     """Substeps from ``first`` to ``last`` on a GPU that runs ``most`` blocks of 256 threads at a time.
 
     The blocks stay until the last substep and wait for each other between the passes, so that a host need not keep up.
+    ``before`` is how often blocks have arrived at a barrier in earlier launches.
     """
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
@@ -416,7 +418,7 @@ def total_march(
         head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
-        arrivals = ti.cast(0, ti.i32)
+        arrivals = before
         if block < blocks:
             for t in range(first, last):
                 item = block

@@ -377,6 +377,7 @@ def total_march_adjoint(
     stiffens: ti.template(),
     first: ti.i32,
     last: ti.i32,
+    before: ti.i32,
     ints: Integers,
     fixed: Reals,
     supply: Reals,
@@ -398,7 +399,7 @@ def total_march_adjoint(
         head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
-        arrivals = ti.cast(0, ti.i32)
+        arrivals = before
         if block < blocks:
             for passed in range(last - first):
                 t = last - 1 - passed

@@ -79,7 +79,7 @@ def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
         _starts(pairs[:, 0], tile_count(lattice)),
         np.stack([pairs[:, 1], place], 1),
         sources,
-        (sources[1:] >= 0).any(1),
+        np.asarray((sources[1:] >= 0).any(1)),
     ]
 
 

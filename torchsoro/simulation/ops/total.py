@@ -78,9 +78,11 @@ def _integers(scene: Scene, chambers: int) -> list[Tensor]:
 
 
 @lru_cache
-def most_blocks(device: torch.device) -> int:
-    """Blocks that a GPU runs at the same time."""
-    return BLOCKS * torch.cuda.get_device_properties(device).multi_processor_count
+def most_blocks(device: torch.device, dtype: torch.dtype) -> int:
+    """Blocks that a GPU runs at the same time. With more, those that run would wait for others for ever."""
+    gpu = torch.cuda.get_device_properties(device)
+    shared = 1024 + layout.PAD * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
+    return min(BLOCKS, gpu.shared_memory_per_multiprocessor // shared) * gpu.multi_processor_count
 
 
 class TotalSegmentIntegrator:
@@ -122,8 +124,9 @@ class TotalSegmentIntegrator:
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
         in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND])
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
-        self.items = self.batch * max(tiles, chunks)
-        pads = 0 if self.gpu else self.items
+        items = self.batch * max(tiles, chunks)
+        self.blocks = min(most_blocks(like.device, like.dtype), items) if self.gpu else 0
+        pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, layout.SLOT), (self.batch, in_chambers), (pads, layout.PAD)
         self.scratch = Arena.zeros("scratch", like, *shapes)
         self.kept = Arena.zeros("kept", like, (0,), (0,))
@@ -223,11 +226,13 @@ class TotalSegmentIntegrator:
         flags = (self.loaded, self.scene.stiffens)
         if self.gpu:
             real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
-            launch = capture(on_gpu, real, most_blocks(buffers[0].device), *flags, 0, 0, *buffers)
+            launch = capture(on_gpu, real, most_blocks(buffers[0].device, buffers[1].dtype), *flags, 0, 0, 0, *buffers)
+            arrivals = 0
 
             def go(first: int, last: int) -> None:
-                buffers[0][layout.ARRIVED] = 0
-                launch(1, first, last)
+                nonlocal arrivals
+                launch(1, first, last, arrivals)
+                arrivals += 2 * self.blocks * (last - first)
 
             return go
         step = capture(on_cpu, *flags, 0, *buffers)
@@ -242,12 +247,11 @@ class TotalSegmentIntegrator:
         """The buffer of integers: clock, sizes, offset of each quantity in its buffer, then the index tables."""
         names = ("nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz")
         values = (*self.lattice.points, *self.lattice.shape, *tile_counts(self.lattice))
-        blocks = min(most_blocks(self.scene.kind.device), self.items) if self.gpu else 0
         sizes = {
             **dict(zip(names, values, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
-            **{"slots": self.slots, "blocks": blocks, "steps": self.steps},
+            **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps},
             **{name: int(value) for name, value in more.items()},
         }
         head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
