@@ -1,0 +1,186 @@
+"""Substeps of the total-Lagrangian form in lanes: points, nodes, and the threads that share them.
+
+Cells are dealt with in items, each a part of a layer of cells across x, which sums forces in a buffer of its own over the
+three planes of nodes that the layer touches; nodes then sum over the items of their plane in a fixed order. So nothing is
+added by two threads at once, and results do not depend on the number of threads.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from torchsoro.simulation.kernels.lane_nodes import advance
+from torchsoro.simulation.kernels.lane_points import NUMBERS, ROOM, enclosed, fast, gather, keep, point, scatter
+from torchsoro.simulation.kernels.lane_threads import look, meet
+from torchsoro.simulation.kernels.lanes import load, store
+
+NEVER = 2**62
+
+
+class Mesh(NamedTuple):
+    """Cells and nodes, the same for all simulations.
+
+    A plane of nodes takes ``plane`` numbers of a component, a component ``component`` numbers, a simulation (or sixteen
+    variations) three components for displacements and three for velocities; nodes begin at ``front``.
+    """
+
+    unit: int
+    row: int
+    plane: int
+    front: int
+    component: int
+    planes: int
+    patch: int
+    chambers: int
+    item_plane: np.ndarray
+    item_x: np.ndarray
+    item_begin: np.ndarray
+    block_at: np.ndarray
+    block_y: np.ndarray
+    block_z: np.ndarray
+    gas_begin: np.ndarray
+    gas_chamber: np.ndarray
+    item_gas: np.ndarray
+    X: np.ndarray
+    Y: np.ndarray
+    Z: np.ndarray
+    plane_begin: np.ndarray
+    plane_item: np.ndarray
+    plane_slot: np.ndarray
+    places: np.ndarray
+
+
+class Case(NamedTuple):
+    """What differs between simulations, and what acts over time; the last axis has sixteen lanes, or nodes."""
+
+    dt: float
+    groups: int
+    elements: int
+    history: int
+    flags: tuple[bool, bool, bool]
+    numbers: np.ndarray
+    gas: np.ndarray
+    maxwell: np.ndarray
+    softening: np.ndarray
+    inverse_mass: np.ndarray
+    moves: np.ndarray
+    drag_factor: np.ndarray
+    reach: np.ndarray
+    air: np.ndarray
+    pressure: np.ndarray
+    gravity: np.ndarray
+    share: np.ndarray
+    force: np.ndarray
+    plane_numbers: np.ndarray
+    plane_stick: np.ndarray
+    area: np.ndarray
+    spacing: float
+
+
+class Work(NamedTuple):
+    """States, and what threads hand each other."""
+
+    states: np.ndarray
+    histories: np.ndarray
+    pushed: np.ndarray
+    volumes: np.ndarray
+    seen: np.ndarray
+    seen_at: np.ndarray
+    forces: np.ndarray
+    areas: np.ndarray
+    swept: np.ndarray
+    collapsed: np.ndarray
+    sync: np.ndarray
+
+
+@fast
+def clear(a, begin, end):
+    """Fill a part of an array with zeros."""
+    for n in range(begin, end):
+        a[n] = 0
+
+
+@fast
+def points_forward(mesh, case, work, g, item, past, future, state, room, G, rates):
+    """Forces of an item on the nodes of its planes; whether any solid or gas collapsed."""
+    items = len(mesh.item_plane)
+    size = 9 * mesh.patch
+    out = (g * items + item) * size
+    forces = work.forces
+    clear(forces, out, out + size)
+    for c in range(mesh.chambers):
+        if mesh.item_gas[item, c]:
+            o = ((g * items + item) * mesh.chambers + c) * size
+            clear(work.areas, o, o + size)
+            s = 16 * ((g * items + item) * mesh.chambers + c)
+            clear(work.swept, s, s + 16)
+    corner = state + mesh.front + mesh.item_plane[item] * mesh.plane
+    x, collapsed = mesh.item_x[item], False
+    blocks, each = len(mesh.block_at), 16 * case.history
+    d = work.states
+    for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
+        y, z, at = mesh.block_y[b], mesh.block_z[b], mesh.block_at[b]
+        gather(
+            d, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit, mesh.X, x, mesh.Y, y, mesh.Z, z, room, G
+        )
+        if case.flags[2]:
+            gather(
+                d, corner + at + 3 * mesh.component, mesh.component, mesh.plane, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates,
+            )  # fmt: skip
+        for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
+            one = (g * items + item) * mesh.chambers + mesh.gas_chamber[pair]
+            base = (g * len(mesh.gas_chamber) + pair) * 128
+            swept = load(work.swept, 16 * one)
+            for k in range(8):
+                cof, ratio, gone = enclosed(G, 144 * k, case.gas, base + 16 * k)
+                keep(rates, 1152 + 144 * k, cof, load(case.gas, base + 16 * k))
+                swept = swept + ratio
+                collapsed = collapsed or gone
+            store(work.swept, 16 * one, swept)
+            scatter(
+                work.areas, one * size + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates[1152:],
+            )  # fmt: skip
+        n = (g * blocks + b) * 128 * NUMBERS
+        h = (g * blocks + b) * 8 * each
+        m, s = g * 48 * case.elements, case.softening[32 * g :]
+        for k in range(8):
+            gone = point(
+                G, rates, 144 * k, case.numbers, n + 16 * NUMBERS * k, work.histories, past + h + each * k,
+                work.histories, future + h + each * k, case.elements, case.maxwell, m, case.flags, s,
+            )  # fmt: skip
+            collapsed = collapsed or gone
+        scatter(
+            forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit, mesh.X, x, mesh.Y, y, mesh.Z, z, room, G
+        )
+    return collapsed
+
+
+@fast
+def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where_collapsed):
+    """A thread's share of all substeps; how many were done."""
+    items = len(mesh.item_plane)
+    blocks = len(mesh.block_at)
+    tasks, planes = case.groups * items, case.groups * mesh.planes
+    room, G, rates = np.zeros(ROOM, mesh.X.dtype), np.zeros(1152, mesh.X.dtype), np.zeros(2304, mesh.X.dtype)
+    state_size = case.groups * 6 * mesh.component
+    history_size = case.groups * blocks * 128 * case.history
+    for t in range(steps):
+        now, then = (t % ring) * state_size, ((t + 1) % ring) * state_size
+        past, future = (t % history_ring) * history_size, ((t + 1) % history_ring) * history_size
+        for task in range(tasks * rank // threads, tasks * (rank + 1) // threads):
+            g, item = task // items, task % items
+            if points_forward(mesh, case, work, g, item, past, future, now + g * 6 * mesh.component, room, G, rates):
+                work.collapsed[8 * rank] = min(work.collapsed[8 * rank], t)
+        meet(work.sync, threads)
+        if stop_where_collapsed:
+            for other in range(threads):
+                if look(work.collapsed, 8 * other) <= t:
+                    return t
+        for task in range(planes * rank // threads, planes * (rank + 1) // threads):
+            advance(mesh, case, work, task // mesh.planes, task % mesh.planes, t, ring, now, then)
+        meet(work.sync, threads)
+    return steps

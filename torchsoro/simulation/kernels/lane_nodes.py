@@ -1,0 +1,144 @@
+"""What the nodes of a plane do in lanes: sum forces, move, meet planes."""
+
+from __future__ import annotations
+
+from torchsoro.simulation.kernels.lane_contact import meets
+from torchsoro.simulation.kernels.lane_laws import law
+from torchsoro.simulation.kernels.lane_points import fast
+from torchsoro.simulation.kernels.lanes import load, select, store, total
+
+STIFFNESS, REFERENCE = 0, 1  # numbers of a chamber: mean air stiffness, reference volume
+
+
+@law
+def chamber_pressure(supply, stiffness, volume, reference):
+    """p_act - k (V/V0 - 1)."""
+    return supply - stiffness * (volume / reference - 1)
+
+
+@law
+def sum_items(values, mesh, first, stride, p, c, at):
+    """Component c at a place of plane p, summed over the items that touch the plane."""
+    found = load(values, first + at) * 0
+    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
+        found = found + load(
+            values, first + mesh.plane_item[e] * stride + (3 * mesh.plane_slot[e] + c) * mesh.patch + at
+        )
+    return found
+
+
+@law
+def sum_chamber(values, mesh, g, c):
+    """A sum over the items of a chamber; over the lanes, too, where these are cells."""
+    items = len(mesh.item_plane)
+    found = load(values, 0) * 0
+    for item in range(items):
+        if mesh.item_gas[item, c]:
+            found = found + load(values, 16 * ((g * items + item) * mesh.chambers + c))
+    if mesh.unit == 1:
+        found = found * 0 + total(found)
+    return found
+
+
+@law
+def force_at(mesh, case, work, g, p, c, at, t):
+    """Internal force on a component of the nodes at a place of plane p, group forces taken off."""
+    items = len(mesh.item_plane)
+    size = 9 * mesh.patch
+    found = sum_items(work.forces, mesh, g * items * size, size, p, c, at)
+    i = mesh.front + p * mesh.plane + at
+    for k in range(case.share.shape[0]):
+        force = load(case.force, 16 * (3 * ((t * case.groups + g) * case.share.shape[0] + k) + c))
+        found = found - load(case.share[k], i) * force
+    return found
+
+
+@law
+def touches(mesh, p, c):
+    """Whether a plane of nodes touches a chamber."""
+    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
+        if mesh.item_gas[mesh.plane_item[e], c]:
+            return True
+    return False
+
+
+@law
+def sum_areas(mesh, work, g, k, p, c, at):
+    """Component c of the area vector of chamber k at a place of plane p."""
+    items, size = len(mesh.item_plane), 9 * mesh.patch
+    found = load(work.areas, 0) * 0
+    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
+        item = mesh.plane_item[e]
+        if mesh.item_gas[item, k]:
+            o = ((g * items + item) * mesh.chambers + k) * size + (3 * mesh.plane_slot[e] + c) * mesh.patch
+            found = found + load(work.areas, o + at)
+    return found
+
+
+@fast
+def advance(mesh, case, work, g, p, t, ring, now, then):
+    """Move the nodes of plane p over substep t."""
+    dt = case.dt
+    own = g * 6 * mesh.component
+    d = work.states
+    slot = t % (work.pushed.size // (case.groups * 3 * mesh.component)) if work.pushed.size else 0
+    sample = work.seen_at[t + 1]
+    for at in range(0, mesh.plane, 16):
+        i = mesh.front + p * mesh.plane + at
+        node = g * mesh.component + i
+        free, light = load(case.moves, node), load(case.inverse_mass, node)
+        left = load(case.drag_factor, node)
+        f0, f1, f2 = (
+            force_at(mesh, case, work, g, p, 0, at, t),
+            force_at(mesh, case, work, g, p, 1, at, t),
+            force_at(mesh, case, work, g, p, 2, at, t),
+        )
+        for k in range(mesh.chambers):
+            one = (g * mesh.chambers + k) * 16
+            volume = sum_chamber(work.swept, mesh, g, k)
+            step = 16 * mesh.chambers * case.groups * t + one
+            if p == 0 and at == 0:
+                store(work.volumes, step if work.volumes.size > 16 * mesh.chambers * case.groups else one, volume)
+            if touches(mesh, p, k):
+                pressure = chamber_pressure(
+                    load(case.pressure, step), load(case.air, 2 * one), volume, load(case.air, 2 * one + 16)
+                )
+                f0 = f0 - pressure * sum_areas(mesh, work, g, k, p, 0, at)
+                f1 = f1 - pressure * sum_areas(mesh, work, g, k, p, 1, at)
+                f2 = f2 - pressure * sum_areas(mesh, work, g, k, p, 2, at)
+        a, b = now + own + i, then + own + i
+        n = mesh.component
+        d0, d1, d2 = load(d, a), load(d, a + n), load(d, a + 2 * n)
+        v0, v1, v2 = load(d, a + 3 * n), load(d, a + 4 * n), load(d, a + 5 * n)
+        pull = 48 * (t * case.groups + g)
+        moves = free > 0
+        u0 = select(moves, left * (v0 + dt * (load(case.gravity, pull) - light * f0)), v0)
+        u1 = select(moves, left * (v1 + dt * (load(case.gravity, pull + 16) - light * f1)), v1)
+        u2 = select(moves, left * (v2 + dt * (load(case.gravity, pull + 32) - light * f2)), v2)
+        planes = len(case.plane_stick)
+        o0, o1, o2 = u0 * 0, u1 * 0, u2 * 0
+        if planes > 0:
+            if work.pushed.size:
+                q = (slot * case.groups + g) * 3 * n + i
+                store(work.pushed, q, u0)
+                store(work.pushed, q + n, u1)
+                store(work.pushed, q + 2 * n, u2)
+            w0, w1, w2, o0, o1, o2 = meets(mesh, case, d, now + own, g, i, planes, light, u0, u1, u2)
+            u0, u1, u2 = select(moves, w0, u0), select(moves, w1, u1), select(moves, w2, u2)
+        d0 = select(moves, d0 + dt * (o0 + u0), d0)
+        d1 = select(moves, d1 + dt * (o1 + u1), d1)
+        d2 = select(moves, d2 + dt * (o2 + u2), d2)
+        store(d, b, d0)
+        store(d, b + n, d1)
+        store(d, b + 2 * n, d2)
+        store(d, b + 3 * n, u0)
+        store(d, b + 4 * n, u1)
+        store(d, b + 5 * n, u2)
+        if sample >= 0:
+            o = (sample * case.groups + g) * 6 * n + i
+            store(work.seen, o, d0)
+            store(work.seen, o + n, d1)
+            store(work.seen, o + 2 * n, d2)
+            store(work.seen, o + 3 * n, u0)
+            store(work.seen, o + 4 * n, u1)
+            store(work.seen, o + 5 * n, u2)

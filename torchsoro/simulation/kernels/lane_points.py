@@ -1,0 +1,257 @@
+"""What a block of sixteen lanes does: gradients of a nodal field at the points, stress, forces on the nodes.
+
+A block is one cell in sixteen variations, or sixteen cells whose lowest nodes follow each other in a plane of nodes. In
+both cases what lane l reads of node (i, j, k) of its cell lies at ``i sx + j sy + k unit`` from the block's own place, l
+numbers further, so that one text serves both: ``unit`` is 16 between two nodes along z, or 1. A cell has 2 x 2 x 2
+points, x slowest, and 3 x 3 x 3 nodes; sums are taken axis by axis.
+
+Weights of an axis are 6 numbers, of nodes 0, 1, 2 at the first and at the second point, and 6 slopes: scalars along x,
+lanes along y and z.
+"""
+
+from __future__ import annotations
+
+from numba import njit
+
+from torchsoro.simulation.kernels.lane_laws import (
+    OPTIONS,
+    contract,
+    excess,
+    law,
+    least_ratio,
+    piola,
+    pull_back,
+    viscous_piola,
+)
+from torchsoro.simulation.kernels.lanes import any_lane, larger, load, select, store
+
+fast = njit(**OPTIONS, cache=True)
+
+# Numbers of a point.
+VOLUME, BULK, SHEAR, VOID_FRACTION, STIFFENING, VISCOSITY, VOLUME_VISCOSITY = 0, 1, 2, 3, 4, 6, 7
+NUMBERS = 8
+# Numbers of a Maxwell element: g, b, a.
+MODULUS, GAIN, DECAY = 0, 1, 2
+MAXWELL = 3
+
+
+@law
+def gather(field, at, component, sx, sy, unit, X, x, Y, y, Z, z, room, G):
+    """Gradient of a nodal vector field: G [8, 9, 16], derivatives of each component by x, y, z."""
+    y00, y01, y02 = load(Y, y), load(Y, y + 16), load(Y, y + 32)
+    y10, y11, y12 = load(Y, y + 48), load(Y, y + 64), load(Y, y + 80)
+    s00, s01, s02 = load(Y, y + 96), load(Y, y + 112), load(Y, y + 128)
+    s10, s11, s12 = load(Y, y + 144), load(Y, y + 160), load(Y, y + 176)
+    for c in range(3):
+        for i in range(3):
+            b0 = at + c * component + i * sx
+            b1, b2 = b0 + sy, b0 + 2 * sy
+            a00, a01, a02 = load(field, b0), load(field, b0 + unit), load(field, b0 + 2 * unit)
+            a10, a11, a12 = load(field, b1), load(field, b1 + unit), load(field, b1 + 2 * unit)
+            a20, a21, a22 = load(field, b2), load(field, b2 + unit), load(field, b2 + 2 * unit)
+            for o in range(2):
+                w0, w1, w2 = load(Z, z + 48 * o), load(Z, z + 48 * o + 16), load(Z, z + 48 * o + 32)
+                t0, t1, t2 = load(Z, z + 48 * o + 96), load(Z, z + 48 * o + 112), load(Z, z + 48 * o + 128)
+                v0, v1, v2 = (
+                    w0 * a00 + w1 * a01 + w2 * a02,
+                    w0 * a10 + w1 * a11 + w2 * a12,
+                    w0 * a20 + w1 * a21 + w2 * a22,
+                )
+                d0, d1, d2 = (
+                    t0 * a00 + t1 * a01 + t2 * a02,
+                    t0 * a10 + t1 * a11 + t2 * a12,
+                    t0 * a20 + t1 * a21 + t2 * a22,
+                )
+                r = 16 * (12 * i + 3 * o)
+                store(room, r, y00 * v0 + y01 * v1 + y02 * v2)
+                store(room, r + 16, s00 * v0 + s01 * v1 + s02 * v2)
+                store(room, r + 32, y00 * d0 + y01 * d1 + y02 * d2)
+                store(room, r + 96, y10 * v0 + y11 * v1 + y12 * v2)
+                store(room, r + 112, s10 * v0 + s11 * v1 + s12 * v2)
+                store(room, r + 128, y10 * d0 + y11 * d1 + y12 * d2)
+        for yz in range(4):
+            r = 48 * yz
+            a0, a1, a2 = load(room, r), load(room, r + 192), load(room, r + 384)
+            b0, b1, b2 = load(room, r + 16), load(room, r + 208), load(room, r + 400)
+            c0, c1, c2 = load(room, r + 32), load(room, r + 224), load(room, r + 416)
+            for o in range(2):
+                w0, w1, w2 = X[x + 3 * o], X[x + 3 * o + 1], X[x + 3 * o + 2]
+                g = 16 * (9 * (4 * o + yz) + 3 * c)
+                store(G, g, X[x + 6 + 3 * o] * a0 + X[x + 7 + 3 * o] * a1 + X[x + 8 + 3 * o] * a2)
+                store(G, g + 16, w0 * b0 + w1 * b1 + w2 * b2)
+                store(G, g + 32, w0 * c0 + w1 * c1 + w2 * c2)
+
+
+@law
+def scatter(out, at, component, slot, sy, unit, X, x, Y, y, Z, z, room, P):
+    """Add what the points hand to the nodes, sum P grad N, with P as G of :func:`gather`.
+
+    Blocks of cells share nodes with themselves: what goes to a node from three lanes is added one after the other.
+    """
+    for c in range(3):
+        for i in range(3):
+            w0, w1, s0, s1 = X[x + i], X[x + 3 + i], X[x + 6 + i], X[x + 9 + i]
+            for yz in range(4):
+                p, q = 16 * (9 * yz + 3 * c), 16 * (9 * (4 + yz) + 3 * c)
+                r = 48 * yz
+                store(room, r, s0 * load(P, p) + s1 * load(P, q))
+                store(room, r + 16, w0 * load(P, p + 16) + w1 * load(P, q + 16))
+                store(room, r + 32, w0 * load(P, p + 32) + w1 * load(P, q + 32))
+            for j in range(3):
+                y0, y1 = load(Y, y + 16 * j), load(Y, y + 48 + 16 * j)
+                t0, t1 = load(Y, y + 96 + 16 * j), load(Y, y + 144 + 16 * j)
+                a0 = y0 * load(room, 0) + y1 * load(room, 96) + t0 * load(room, 16) + t1 * load(room, 112)
+                a1 = y0 * load(room, 48) + y1 * load(room, 144) + t0 * load(room, 64) + t1 * load(room, 160)
+                b0 = y0 * load(room, 32) + y1 * load(room, 128)
+                b1 = y0 * load(room, 80) + y1 * load(room, 176)
+                r = 16 * (12 + 27 * c + 9 * i + 3 * j)
+                for k in range(3):
+                    z0, z1 = load(Z, z + 16 * k), load(Z, z + 48 + 16 * k)
+                    d0, d1 = load(Z, z + 96 + 16 * k), load(Z, z + 144 + 16 * k)
+                    store(room, r + 16 * k, z0 * a0 + z1 * a1 + d0 * b0 + d1 * b1)
+    for k in range(3):
+        for i in range(3):
+            for c in range(3):
+                for j in range(3):
+                    o = at + i * slot + c * component + j * sy + k * unit
+                    store(out, o, load(out, o) + load(room, 16 * (12 + 27 * c + 9 * i + 3 * j + k)))
+
+
+ROOM = 16 * 93  # numbers that gather and scatter need for themselves
+
+
+@law
+def deformed(G, at):
+    """F = I + displacement gradient of a point."""
+    return (
+        load(G, at) + 1, load(G, at + 16), load(G, at + 32),
+        load(G, at + 48), load(G, at + 64) + 1, load(G, at + 80),
+        load(G, at + 96), load(G, at + 112), load(G, at + 128) + 1,
+    )  # fmt: skip
+
+
+@law
+def plain(G, at):
+    """The tensor of a point as it is."""
+    return (
+        load(G, at), load(G, at + 16), load(G, at + 32), load(G, at + 48), load(G, at + 64), load(G, at + 80),
+        load(G, at + 96), load(G, at + 112), load(G, at + 128),
+    )  # fmt: skip
+
+
+@law
+def keep(P, at, T, scale):
+    """Store a tensor times a number."""
+    store(P, at, scale * T[0])
+    store(P, at + 16, scale * T[1])
+    store(P, at + 32, scale * T[2])
+    store(P, at + 48, scale * T[3])
+    store(P, at + 64, scale * T[4])
+    store(P, at + 80, scale * T[5])
+    store(P, at + 96, scale * T[6])
+    store(P, at + 112, scale * T[7])
+    store(P, at + 128, scale * T[8])
+
+
+@law
+def volume_ratio(F):
+    """det F."""
+    return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
+
+
+@law
+def stiffening(F, ratio, least, numbers, n):
+    """Factor 1 + a x + b x^2 of the shear modulus at x = I1b - 3."""
+    x, _ = excess(F, larger(ratio, least))
+    return 1 + x * (load(numbers, n + 16 * STIFFENING) + load(numbers, n + 16 * STIFFENING + 16) * x)
+
+
+@law
+def softening(F, ratio, law_numbers, at, past, before, future, after):
+    """Share of the shear modulus that is left below the largest x so far, which is kept: 1 - d u / (1 + u)."""
+    x, _ = excess(F, ratio)
+    below = larger(load(past, before) - x, 0.0)
+    store(future, after, x + below)
+    return 1 - load(law_numbers, at) * below / (below + load(law_numbers, at + 16))
+
+
+@law
+def added(S, past, before, future, after, elements, maxwell, m):
+    """Q = sum g (Z + b S) over the Maxwell elements, and their states: Z becomes a Z - b (1 - a) S."""
+    Q0, Q1, Q2, Q3, Q4, Q5 = 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0]
+    for e in range(elements):
+        g, b, a = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16), load(maxwell, m + 48 * e + 32)
+        gb, fade = g * b, b - b * a
+        i, o = before + 96 * e, after + 96 * e
+        z0, z1, z2 = load(past, i), load(past, i + 16), load(past, i + 32)
+        z3, z4, z5 = load(past, i + 48), load(past, i + 64), load(past, i + 80)
+        Q0, Q1, Q2 = Q0 + g * z0 + gb * S[0], Q1 + g * z1 + gb * S[1], Q2 + g * z2 + gb * S[2]
+        Q3, Q4, Q5 = Q3 + g * z3 + gb * S[3], Q4 + g * z4 + gb * S[4], Q5 + g * z5 + gb * S[5]
+        store(future, o, a * z0 - fade * S[0])
+        store(future, o + 16, a * z1 - fade * S[1])
+        store(future, o + 32, a * z2 - fade * S[2])
+        store(future, o + 48, a * z3 - fade * S[3])
+        store(future, o + 64, a * z4 - fade * S[4])
+        store(future, o + 80, a * z5 - fade * S[5])
+    return Q0, Q1, Q2, Q3, Q4, Q5
+
+
+@law
+def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwell, m, flags, softens):
+    """First Piola stress times volume of a point, stored in place of its gradient; whether solid matter collapsed.
+
+    Args:
+        G: Displacement gradients, then stresses.
+        rates: Velocity gradients, read where there is viscosity.
+        at: Of the point in both.
+        numbers: Of the points, from ``n``.
+        past: History, from ``before``; ``future`` from ``after``: Z of each Maxwell element, then the largest x.
+        elements: Number of Maxwell elements, whose numbers are ``maxwell`` from ``m``.
+        flags: Whether anything stiffens, softens or is viscous.
+        softens: Depth and range of softening, lanes.
+    """
+    F = deformed(G, at)
+    volume, void_fraction = load(numbers, n), load(numbers, n + 16 * VOID_FRACTION)
+    bulk, shear = load(numbers, n + 16 * BULK), load(numbers, n + 16 * SHEAR)
+    factor = 0 * volume + 1
+    least = least_ratio(void_fraction)
+    solid = shear
+    if flags[0] or flags[1]:
+        ratio = volume_ratio(F)
+        if flags[0]:
+            factor = stiffening(F, ratio, least, numbers, n)
+        if flags[1]:
+            end = 96 * elements
+            left = softening(F, larger(ratio, least), softens, 0, past, before + end, future, after + end)
+            solid = shear * left
+    S = (factor, factor, factor, factor, factor, factor)
+    if elements > 0:
+        T = pull_back(F, least)
+        S = (factor * T[0], factor * T[1], factor * T[2], factor * T[3], factor * T[4], factor * T[5])
+    Q = added(S, past, before, future, after, elements, maxwell, m)
+    P, _, J = piola(F, Q, bulk, (solid, shear), factor, void_fraction)
+    if flags[2]:
+        eta, zeta = load(numbers, n + 16 * VISCOSITY), load(numbers, n + 16 * VOLUME_VISCOSITY)
+        V = viscous_piola(F, plain(rates, at), eta, zeta)
+        there = void_fraction < 1
+        P = (
+            P[0] + select(there, V[0], 0 * J), P[1] + select(there, V[1], 0 * J), P[2] + select(there, V[2], 0 * J),
+            P[3] + select(there, V[3], 0 * J), P[4] + select(there, V[4], 0 * J), P[5] + select(there, V[5], 0 * J),
+            P[6] + select(there, V[6], 0 * J), P[7] + select(there, V[7], 0 * J), P[8] + select(there, V[8], 0 * J),
+        )  # fmt: skip
+    keep(G, at, P, volume)
+    return any_lane(~(J > 0) & (void_fraction == 0) & (volume > 0))
+
+
+@law
+def enclosed(G, at, gas, n):
+    """Of a point that may be gas: area vectors V cof F to be handed on, V det F, and whether it collapsed."""
+    F = deformed(G, at)
+    V = load(gas, n)
+    cof = (
+        F[4] * F[8] - F[5] * F[7], F[5] * F[6] - F[3] * F[8], F[3] * F[7] - F[4] * F[6],
+        F[2] * F[7] - F[1] * F[8], F[0] * F[8] - F[2] * F[6], F[1] * F[6] - F[0] * F[7],
+        F[1] * F[5] - F[2] * F[4], F[2] * F[3] - F[0] * F[5], F[0] * F[4] - F[1] * F[3],
+    )  # fmt: skip
+    J = contract(cof, F) * (1 / 3)
+    return cof, V * J, any_lane(~(J > 0) & (V > 0))
