@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_laws import law
-from torchsoro.simulation.kernels.lanes import any_lane, larger, load, magnitude, select, square_root
+from torchsoro.simulation.kernels.lanes import any_lane, larger, load, magnitude, select, square_root, store
 
 GRAZING = 0.2  # slope below which a point that arrives is taken to graze the plane
 LOOK = 2.0  # cells in front of a plane at which a node is looked at
@@ -128,3 +128,135 @@ def meets(mesh, case, d, state, g, i, count, light, u0, u1, u2):
             zero = 0 * p0
             o0, o1, o2 = o0 + select(near, p0, zero), o1 + select(near, p1, zero), o2 + select(near, p2, zero)
     return u0, u1, u2, o0, o1, o2
+
+
+@law
+def response_adjoint(u0, u1, u2, n0, n1, n2, normal, sticks, friction, hold, b0, b1, b2):
+    """Adjoint of :func:`response`: gradients by the velocity, friction and hold."""
+    t0, t1, t2 = u0 - normal * n0, u1 - normal * n1, u2 - normal * n2
+    speed = square_root(larger(dot(t0, t1, t2, t0, t1, t2), 1e-30))
+    loss = friction * (hold - normal)
+    slides, zero = speed > loss, 0 * speed
+    e0, e1, e2 = t0 / speed, t1 / speed, t2 / speed
+    loss_bar = -dot(e0, e1, e2, b0, b1, b2)
+    along = dot(b0, b1, b2, n0, n1, n2)
+    f0, f1, f2 = b0 - along * n0, b1 - along * n1, b2 - along * n2
+    share, ahead = loss / speed, dot(e0, e1, e2, f0, f1, f2)
+    pressed = loss_bar * friction
+    h0 = f0 - share * (f0 - ahead * e0) - pressed * n0
+    h1 = f1 - share * (f1 - ahead * e1) - pressed * n1
+    h2 = f2 - share * (f2 - ahead * e2) - pressed * n2
+    friction_bar, hold_bar = loss_bar * (hold - normal), pressed
+    h0, h1, h2 = select(slides, h0, zero), select(slides, h1, zero), select(slides, h2, zero)
+    friction_bar, hold_bar = select(slides, friction_bar, zero), select(slides, hold_bar, zero)
+    if sticks:
+        h0, h1, h2, friction_bar, hold_bar = zero, zero, zero, zero, zero
+    tears = normal > hold
+    held = ((normal < 0) | (hold > 0)) & ~tears
+    return (
+        select(held, h0, b0), select(held, h1, b1), select(held, h2, b2),
+        select(held, friction_bar, zero), select(held, hold_bar, select(tears, -along, zero)),
+    )  # fmt: skip
+
+
+@law
+def lands_adjoint(u0, u1, u2, n0, n1, n2, gap, dt, sticks, friction, hold, b0, b1, b2, o0, o1, o2):
+    """Adjoint of :func:`lands`: gradients by the velocity, gap, friction and hold."""
+    normal, zero = dot(u0, u1, u2, n0, n1, n2), 0 * gap
+    way = larger(gap, 0.0)
+    arrives = normal * dt + way < 0
+    leaves = (normal > 0) & (hold >= 0) & ~arrives
+    pull = larger(hold, 0.0)
+    r0, r1, r2 = response(u0, u1, u2, n0, n1, n2, normal, sticks, friction, pull)
+    # What carries it onto the plane.
+    l0, l1, l2 = u0 - r0 - normal * n0, u1 - r1 - normal * n1, u2 - r2 - normal * n2
+    size = square_root(larger(dot(l0, l1, l2, l0, l1, l2), 1e-30))
+    grazes = -normal < GRAZING * size
+    speed = larger(larger(-normal, GRAZING * size), 1e-30)
+    back, on = 1 / speed, dot(o0, o1, o2, n0, n1, n2)
+    gap_bar = dot(l0 * back - n0, l1 * back - n1, l2 * back - n2, o0, o1, o2) / dt
+    rate = way * back / dt
+    m0, m1, m2 = rate * (o0 - on * n0), rate * (o1 - on * n1), rate * (o2 - on * n2)
+    speed_bar = -dot(m0, m1, m2, l0, l1, l2) * back
+    turned = select(grazes, speed_bar * GRAZING / size, zero)
+    m0, m1, m2 = m0 + turned * l0, m1 + turned * l1, m2 + turned * l2
+    straight = select(grazes, zero, speed_bar)
+    carried = arrives & (gap > 0)
+    m0, m1, m2 = select(carried, m0, zero), select(carried, m1, zero), select(carried, m2, zero)
+    straight, gap_bar = select(carried, straight, zero), select(carried, gap_bar, zero)
+    h0, h1, h2, friction_bar, hold_bar = response_adjoint(
+        u0, u1, u2, n0, n1, n2, normal, sticks, friction, pull, b0 - m0, b1 - m1, b2 - m2
+    )
+    h0, h1, h2 = h0 + m0 - straight * n0, h1 + m1 - straight * n1, h2 + m2 - straight * n2
+    felt = arrives | leaves
+    return (
+        select(felt, h0, b0), select(felt, h1, b1), select(felt, h2, b2),
+        gap_bar, select(felt, friction_bar, zero), select(felt, hold_bar, zero),
+    )  # fmt: skip
+
+
+@law
+def meets_adjoint(mesh, case, d, state, sums, g, i, light, moves, u0, u1, u2, b0, b1, b2, o0, o1, o2):
+    """Adjoint of :func:`meets`: gradients by the velocity, by the places of the surfaces, and by the mass."""
+    dt, n, zero = case.dt, mesh.component, 0 * u0
+    c0, c1, c2, mass_bar = zero, zero, zero, zero
+    planes = len(case.plane_stick)
+    for behind in range(planes):
+        k = planes - 1 - behind
+        q = 16 * PLANE * (g * planes + k)
+        node, gap, n0, n1, n2 = surface_gap(mesh, case, d, state, g, i, q)
+        near = (node < LOOK * case.spacing) & moves
+        if any_lane(near):
+            area = load(case.area, k * n + i)
+            reaches = gap < CONTACT_DISTANCE * case.spacing
+            hold = load(case.plane_numbers, q + 16 * ADHESION) * area * dt * light
+            hold = select(reaches, hold, zero - 1)
+            friction = load(case.plane_numbers, q + 16 * FRICTION)
+            r0, r1, r2, _, _, _ = meets(mesh, case, d, state, g, i, k, light, u0, u1, u2)
+            h0, h1, h2, gap_bar, friction_bar, hold_bar = lands_adjoint(
+                r0, r1, r2, n0, n1, n2, gap, dt, case.plane_stick[k], friction, hold, b0, b1, b2, o0, o1, o2
+            )
+            b0, b1, b2 = select(near, h0, b0), select(near, h1, b1), select(near, h2, b2)
+            gap_bar, friction_bar = select(near, gap_bar, zero), select(near, friction_bar, zero)
+            hold_bar = select(near & reaches, hold_bar, zero)
+            s = (g * planes + k) * PLANE * n + i
+            store(sums.planes, s + OFFSET * n, load(sums.planes, s + OFFSET * n) - gap_bar)
+            store(sums.planes, s + FRICTION * n, load(sums.planes, s + FRICTION * n) + friction_bar)
+            store(sums.planes, s + ADHESION * n, load(sums.planes, s + ADHESION * n) + hold_bar * area * dt * light)
+            mass_bar = mass_bar - hold_bar * hold * light
+            c0, c1, c2 = c0 + gap_bar * n0, c1 + gap_bar * n1, c2 + gap_bar * n2
+            for c in range(3):
+                r = (3 * g + c) * n + i
+                reach = load(case.reach, r)
+                way = magnitude(reach)
+                if any_lane(way > 0):
+                    stride = stride_of(mesh, c)
+                    gain = gap_bar * dot(
+                        inward(mesh, d, state, i, stride, 0, reach),
+                        inward(mesh, d, state, i, stride, 1, reach),
+                        inward(mesh, d, state, i, stride, 2, reach),
+                        n0, n1, n2,
+                    )  # fmt: skip
+                    gain = select(reach > 0, gain, select(reach < 0, -gain, zero))
+                    store(sums.reach, r, load(sums.reach, r) + gain)
+    return b0, b1, b2, c0, c1, c2, mass_bar
+
+
+@law
+def spread(mesh, case, surfaces, parity, g, i):
+    """What the surfaces of nodes and of the neighbours that reach to them add to the gradient by their places."""
+    n = mesh.component
+    s = (parity * case.groups + g) * 3 * n + i
+    a0, a1, a2 = load(surfaces, s), load(surfaces, s + n), load(surfaces, s + 2 * n)
+    own, zero = 0 * a0 + 1, 0 * a0
+    t0, t1, t2 = zero, zero, zero
+    for c in range(3):
+        r = (3 * g + c) * n + i
+        own = own - magnitude(load(case.reach, r))
+        stride = stride_of(mesh, c)
+        up, down = load(case.reach, r + stride), load(case.reach, r - stride)
+        from_up, from_down = select(up < 0, -up, zero), select(down > 0, down, zero)
+        t0 = t0 + from_up * load(surfaces, s + stride) + from_down * load(surfaces, s - stride)
+        t1 = t1 + from_up * load(surfaces, s + n + stride) + from_down * load(surfaces, s + n - stride)
+        t2 = t2 + from_up * load(surfaces, s + 2 * n + stride) + from_down * load(surfaces, s + 2 * n - stride)
+    return own * a0 + t0, own * a1 + t1, own * a2 + t2

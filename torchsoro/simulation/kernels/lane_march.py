@@ -12,11 +12,25 @@ from typing import NamedTuple
 import numpy as np
 
 from torchsoro.simulation.kernels.lane_nodes import advance
-from torchsoro.simulation.kernels.lane_points import NUMBERS, ROOM, enclosed, fast, gather, keep, point, scatter
+from torchsoro.simulation.kernels.lane_points import (
+    ATTACHED,
+    NUMBERS,
+    ROOM,
+    enclosed,
+    fast,
+    gather,
+    hand_on,
+    keep,
+    point,
+    scatter,
+    stretch,
+    value,
+)
 from torchsoro.simulation.kernels.lane_threads import look, meet
 from torchsoro.simulation.kernels.lanes import load, store
 
 NEVER = 2**62
+SCRATCH = ROOM + 5 * 1152  # numbers of a thread: for sums, and tensors of eight points of five kinds
 
 
 class Mesh(NamedTuple):
@@ -59,8 +73,9 @@ class Case(NamedTuple):
     groups: int
     elements: int
     history: int
-    flags: tuple[bool, bool, bool]
+    flags: tuple[bool, bool, bool, bool, bool]
     numbers: np.ndarray
+    attached: np.ndarray
     gas: np.ndarray
     maxwell: np.ndarray
     softening: np.ndarray
@@ -93,6 +108,7 @@ class Work(NamedTuple):
     swept: np.ndarray
     collapsed: np.ndarray
     sync: np.ndarray
+    scratch: np.ndarray
 
 
 @fast
@@ -153,6 +169,22 @@ def points_forward(mesh, case, work, g, item, past, future, state, room, G, rate
                 work.histories, future + h + each * k, case.elements, case.maxwell, m, case.flags, s,
             )  # fmt: skip
             collapsed = collapsed or gone
+        if case.flags[4]:
+            for k in range(8):
+                u = value(
+                    d, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
+                    mesh.X, x, mesh.Y, y, mesh.Z, z, k,
+                )  # fmt: skip
+                s0 = (g * blocks + b) * 128 * ATTACHED + 16 * ATTACHED * k
+                w0, w1, w2 = stretch(u, case.attached, s0)
+                spring = load(case.attached, s0)
+                store(rates, 1152 + 48 * k, -spring * w0)
+                store(rates, 1152 + 48 * k + 16, -spring * w1)
+                store(rates, 1152 + 48 * k + 32, -spring * w2)
+            hand_on(
+                forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, rates[1152:],
+            )  # fmt: skip
         scatter(
             forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit, mesh.X, x, mesh.Y, y, mesh.Z, z, room, G
         )
@@ -165,7 +197,8 @@ def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where
     items = len(mesh.item_plane)
     blocks = len(mesh.block_at)
     tasks, planes = case.groups * items, case.groups * mesh.planes
-    room, G, rates = np.zeros(ROOM, mesh.X.dtype), np.zeros(1152, mesh.X.dtype), np.zeros(2304, mesh.X.dtype)
+    own = work.scratch[rank * SCRATCH : (rank + 1) * SCRATCH]
+    room, G, rates = own[:ROOM], own[ROOM : ROOM + 1152], own[ROOM + 1152 :]
     state_size = case.groups * 6 * mesh.component
     history_size = case.groups * blocks * 128 * case.history
     for t in range(steps):

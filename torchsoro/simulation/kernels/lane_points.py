@@ -213,13 +213,13 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
     F = deformed(G, at)
     volume, void_fraction = load(numbers, n), load(numbers, n + 16 * VOID_FRACTION)
     bulk, shear = load(numbers, n + 16 * BULK), load(numbers, n + 16 * SHEAR)
-    factor = 0 * volume + 1
+    factor = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
     least = least_ratio(void_fraction)
     solid = shear
     if flags[0] or flags[1]:
         ratio = volume_ratio(F)
         if flags[0]:
-            factor = stiffening(F, ratio, least, numbers, n)
+            factor = factor * stiffening(F, ratio, least, numbers, n)
         if flags[1]:
             end = 96 * elements
             left = softening(F, larger(ratio, least), softens, 0, past, before + end, future, after + end)
@@ -255,3 +255,48 @@ def enclosed(G, at, gas, n):
     )  # fmt: skip
     J = contract(cof, F) * (1 / 3)
     return cof, V * J, any_lane(~(J > 0) & (V > 0))
+
+
+STIFFNESS, ANCHOR, ATTACHED = 0, 1, 4  # numbers of a spring: stiffness, way of its anchor from the particle's place
+
+
+@law
+def value(field, at, component, sx, sy, unit, X, x, Y, y, Z, z, k):
+    """A nodal vector field at point k of a block."""
+    ox, oy, oz = 3 * (k // 4), 48 * (k // 2 % 2), 48 * (k % 2)
+    u0, u1, u2 = 0 * load(Y, y), 0 * load(Y, y), 0 * load(Y, y)
+    for i in range(3):
+        for j in range(3):
+            weight = X[x + ox + i] * load(Y, y + oy + 16 * j)
+            for l in range(3):
+                w, o = weight * load(Z, z + oz + 16 * l), at + i * sx + j * sy + l * unit
+                u0, u1, u2 = (
+                    u0 + w * load(field, o),
+                    u1 + w * load(field, o + component),
+                    u2 + w * load(field, o + 2 * component),
+                )
+    return u0, u1, u2
+
+
+@law
+def hand_on(out, at, component, slot, sy, unit, X, x, Y, y, Z, z, V):
+    """Add vectors V [8, 3, 16] of the points to the nodes."""
+    for l in range(3):
+        for i in range(3):
+            for j in range(3):
+                o = at + i * slot + j * sy + l * unit
+                f0, f1, f2 = 0 * load(V, 0), 0 * load(V, 0), 0 * load(V, 0)
+                for k in range(8):
+                    w = X[x + 3 * (k // 4) + i] * load(Y, y + 48 * (k // 2 % 2) + 16 * j)
+                    w = w * load(Z, z + 48 * (k % 2) + 16 * l)
+                    f0, f1, f2 = f0 + w * load(V, 48 * k), f1 + w * load(V, 48 * k + 16), f2 + w * load(V, 48 * k + 32)
+                store(out, o, load(out, o) + f0)
+                store(out, o + component, load(out, o + component) + f1)
+                store(out, o + 2 * component, load(out, o + 2 * component) + f2)
+
+
+@law
+def stretch(u, attached, s):
+    """From a point that has moved by u to the anchor of its spring."""
+    s += 16 * ANCHOR
+    return load(attached, s) - u[0], load(attached, s + 16) - u[1], load(attached, s + 32) - u[2]

@@ -1,0 +1,467 @@
+"""The substep in lanes, backwards: points, nodes, and the threads that share them.
+
+The adjoint state lies in one buffer that each pass overwrites in place. A pass over nodes finishes the sums over substep
+t + 1 and begins substep t. What ``Sums`` collects is by point or by node, so that no two threads meet.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from torchsoro.simulation.kernels.lane_contact import PLANE, meets, meets_adjoint, spread
+from torchsoro.simulation.kernels.lane_laws import (
+    cofactor,
+    contract,
+    cross,
+    excess,
+    law,
+    least_ratio,
+    piola_adjoint,
+    plus,
+    pull_back,
+    pull_back_adjoint,
+    viscous_piola_adjoint,
+)
+from torchsoro.simulation.kernels.lane_march import SCRATCH, clear
+from torchsoro.simulation.kernels.lane_nodes import (
+    chamber_pressure,
+    sum_areas,
+    sum_chamber,
+    sum_items,
+    touches,
+)
+from torchsoro.simulation.kernels.lane_points import (
+    ATTACHED,
+    BULK,
+    NUMBERS,
+    ROOM,
+    SHEAR,
+    STIFFENING,
+    VISCOSITY,
+    VOID_FRACTION,
+    VOLUME,
+    VOLUME_VISCOSITY,
+    deformed,
+    fast,
+    gather,
+    hand_on,
+    keep,
+    plain,
+    scatter,
+    stretch,
+    value,
+)
+from torchsoro.simulation.kernels.lane_threads import meet
+from torchsoro.simulation.kernels.lanes import larger, load, select, store
+
+
+class Sums(NamedTuple):
+    """Adjoint states and sums of gradients."""
+
+    bar: np.ndarray
+    history_bar: np.ndarray
+    seen_bar: np.ndarray
+    pulls: np.ndarray
+    surfaces: np.ndarray
+    rates: np.ndarray
+    ratios: np.ndarray
+    volume_bar: np.ndarray
+    numbers: np.ndarray
+    attached: np.ndarray
+    gas: np.ndarray
+    maxwell: np.ndarray
+    softening: np.ndarray
+    mass: np.ndarray
+    drag_factor: np.ndarray
+    reach: np.ndarray
+    planes: np.ndarray
+    air: np.ndarray
+    pressure: np.ndarray
+
+
+@law
+def add(a, at, value):
+    """Add to sixteen numbers."""
+    store(a, at, load(a, at) + value)
+
+
+@law
+def point_adjoint(
+    G, B, rates, at, numbers, n, past, before, bars, after, elements, maxwell, m, flags, softens, sums, number_sums, e_sums, s_sums
+):
+    """Gradient by F of a point, stored in place of its gradient, from that by the stress, which is in B."""
+    F = deformed(G, at)
+    W = plain(B, at)
+    volume, void_fraction = load(numbers, n), load(numbers, n + 16 * VOID_FRACTION)
+    bulk, shear = load(numbers, n + 16 * BULK), load(numbers, n + 16 * SHEAR)
+    cof = cofactor(F)
+    ratio = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
+    least = least_ratio(void_fraction)
+    there = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
+    factor, left, solid = there, 0 * volume + 1, shear
+    x, shrink, linear, square = 0 * volume, 0 * volume, 0 * volume, 0 * volume
+    below, largest, depth, reach = 0 * volume, 0 * volume, 0 * volume, 0 * volume + 1
+    end = 96 * elements
+    if flags[0] or flags[1]:
+        x, shrink = excess(F, larger(ratio, least))
+        if flags[0]:
+            linear, square = load(numbers, n + 16 * STIFFENING), load(numbers, n + 16 * STIFFENING + 16)
+            factor = there * (1 + x * (linear + square * x))
+        if flags[1]:
+            depth, reach = load(softens, 0), load(softens, 16)
+            below = larger(load(past, before + end) - x, 0.0)
+            left = 1 - depth * below / (below + reach)
+            solid = shear * left
+    T = (0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor)
+    Q0, Q1, Q2, Q3, Q4, Q5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
+    if elements > 0:
+        T = pull_back(F, least)
+    S = (factor * T[0], factor * T[1], factor * T[2], factor * T[3], factor * T[4], factor * T[5])
+    for e in range(elements):
+        g, b = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16)
+        gb, i = g * b, before + 96 * e
+        Q0, Q1 = Q0 + g * load(past, i) + gb * S[0], Q1 + g * load(past, i + 16) + gb * S[1]
+        Q2, Q3 = Q2 + g * load(past, i + 32) + gb * S[2], Q3 + g * load(past, i + 48) + gb * S[3]
+        Q4, Q5 = Q4 + g * load(past, i + 64) + gb * S[4], Q5 + g * load(past, i + 80) + gb * S[5]
+    W = plus(-1.0, W, 0.0, W)
+    F_bar, R, bulk_bar, (solid_bar, void_bar), factor_bar, fraction_bar = piola_adjoint(
+        F, cof, ratio, (Q0, Q1, Q2, Q3, Q4, Q5), bulk, (solid, shear), factor, void_fraction, W
+    )
+    work = bulk * bulk_bar + solid * solid_bar + shear * void_bar
+    F_bar = plus(volume, F_bar, 0.0, F_bar)
+    factor_bar = there * volume * factor_bar
+    # S_bar gathers from all elements.
+    Z0, Z1, Z2, Z3, Z4, Z5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
+    for e in range(elements):
+        g, b, a = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16), load(maxwell, m + 48 * e + 32)
+        q0, q1, q2 = volume * R[0], volume * R[1], volume * R[2]
+        q3, q4, q5 = volume * R[3], volume * R[4], volume * R[5]
+        o, i = after + 96 * e, before + 96 * e
+        h0, h1, h2 = load(bars, o), load(bars, o + 16), load(bars, o + 32)
+        h3, h4, h5 = load(bars, o + 48), load(bars, o + 64), load(bars, o + 80)
+        lost = 1 - a
+        Z0, Z1, Z2 = (
+            Z0 + b * (g * q0 - lost * h0), Z1 + b * (g * q1 - lost * h1), Z2 + b * (g * q2 - lost * h2)
+        )  # fmt: skip
+        Z3, Z4, Z5 = (
+            Z3 + b * (g * q3 - lost * h3), Z4 + b * (g * q4 - lost * h4), Z5 + b * (g * q5 - lost * h5)
+        )  # fmt: skip
+        if flags[3]:
+            z0, z1, z2 = load(past, i), load(past, i + 16), load(past, i + 32)
+            z3, z4, z5 = load(past, i + 48), load(past, i + 64), load(past, i + 80)
+            by_stress = q0 * S[0] + q1 * S[1] + q2 * S[2] + q3 * S[3] + q4 * S[4] + q5 * S[5]
+            by_history = h0 * S[0] + h1 * S[1] + h2 * S[2] + h3 * S[3] + h4 * S[4] + h5 * S[5]
+            direct = q0 * z0 + q1 * z1 + q2 * z2 + q3 * z3 + q4 * z4 + q5 * z5
+            fading = h0 * z0 + h1 * z1 + h2 * z2 + h3 * z3 + h4 * z4 + h5 * z5
+            add(sums.maxwell, e_sums + 48 * e, direct + b * by_stress)
+            add(sums.maxwell, e_sums + 48 * e + 16, g * by_stress - lost * by_history)
+            add(sums.maxwell, e_sums + 48 * e + 32, fading + b * by_history)
+        store(bars, o, a * h0 + g * q0)
+        store(bars, o + 16, a * h1 + g * q1)
+        store(bars, o + 32, a * h2 + g * q2)
+        store(bars, o + 48, a * h3 + g * q3)
+        store(bars, o + 64, a * h4 + g * q4)
+        store(bars, o + 80, a * h5 + g * q5)
+    if elements > 0:
+        B6 = (factor * Z0, factor * Z1, factor * Z2, factor * Z3, factor * Z4, factor * Z5)
+        F_bar = plus(1.0, F_bar, 1.0, pull_back_adjoint(F, cof, ratio, least, B6))
+        factor_bar = factor_bar + there * (Z0 * T[0] + Z1 * T[1] + Z2 * T[2] + Z3 * T[3] + Z4 * T[4] + Z5 * T[5])
+    shear_bar = left * solid_bar + void_bar
+    if flags[0] or flags[1]:
+        x_bar = factor_bar * (linear + 2 * square * x)
+        if flags[0]:
+            add(sums.numbers, number_sums + 16 * STIFFENING, factor_bar * x)
+            add(sums.numbers, number_sums + 16 * STIFFENING + 16, factor_bar * x * x)
+        if flags[1]:
+            left_bar = volume * shear * solid_bar
+            sum_ = 1 / (below + reach)
+            later = load(bars, after + end)
+            add(sums.softening, s_sums, -left_bar * below * sum_)
+            add(sums.softening, s_sums + 16, left_bar * depth * below * sum_ * sum_)
+            below_bar = select(below > 0, later - left_bar * depth * reach * sum_ * sum_, 0 * x)
+            store(bars, after + end, below_bar)
+            x_bar = x_bar + later - below_bar
+        x_bar = select(x > 0, x_bar, 0 * x)
+        J = larger(ratio, least)
+        J_bar = select(ratio < least, 0 * x, -2 * (x + 3) * x_bar / (3 * J))
+        F_bar = plus(1.0, F_bar, 2 * shrink * x_bar, F)
+        F_bar = plus(1.0, F_bar, J_bar, cof)
+    if flags[2]:
+        eta, zeta = load(numbers, n + 16 * VISCOSITY), load(numbers, n + 16 * VOLUME_VISCOSITY)
+        V_bar = plus(there, W, 0.0, W)
+        by_F, by_rate, eta_bar, zeta_bar = viscous_piola_adjoint(F, plain(rates, at), eta, zeta, V_bar)
+        solid_lane = there > 0
+        zero = 0 * volume
+        eta_bar, zeta_bar = select(solid_lane, eta_bar, zero), select(solid_lane, zeta_bar, zero)
+        scale = select(solid_lane, volume, zero)
+        by_F = (
+            select(solid_lane, by_F[0], zero), select(solid_lane, by_F[1], zero), select(solid_lane, by_F[2], zero),
+            select(solid_lane, by_F[3], zero), select(solid_lane, by_F[4], zero), select(solid_lane, by_F[5], zero),
+            select(solid_lane, by_F[6], zero), select(solid_lane, by_F[7], zero), select(solid_lane, by_F[8], zero),
+        )  # fmt: skip
+        by_rate = (
+            select(solid_lane, by_rate[0], zero), select(solid_lane, by_rate[1], zero),
+            select(solid_lane, by_rate[2], zero), select(solid_lane, by_rate[3], zero),
+            select(solid_lane, by_rate[4], zero), select(solid_lane, by_rate[5], zero),
+            select(solid_lane, by_rate[6], zero), select(solid_lane, by_rate[7], zero),
+            select(solid_lane, by_rate[8], zero),
+        )  # fmt: skip
+        F_bar = plus(1.0, F_bar, scale, by_F)
+        keep(rates, at, by_rate, scale)
+        work = work + eta * eta_bar + zeta * zeta_bar
+        add(sums.numbers, number_sums + 16 * VISCOSITY, scale * eta_bar)
+        add(sums.numbers, number_sums + 16 * VOLUME_VISCOSITY, scale * zeta_bar)
+    add(sums.numbers, number_sums + 16 * VOLUME, work)
+    add(sums.numbers, number_sums + 16 * BULK, volume * bulk_bar)
+    add(sums.numbers, number_sums + 16 * SHEAR, volume * shear_bar)
+    add(sums.numbers, number_sums + 16 * VOID_FRACTION, volume * fraction_bar)
+    keep(G, at, F_bar, 0 * volume + 1)
+
+
+@fast
+def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room, G, B, rates):
+    """Gradients by the nodes' places of an item, from those by the forces."""
+    items, size = len(mesh.item_plane), 9 * mesh.patch
+    out = (g * items + item) * size
+    clear(work.forces, out, out + size)
+    if case.flags[2]:
+        clear(sums.rates, out, out + size)
+    for c in range(mesh.chambers):
+        if mesh.item_gas[item, c]:
+            o = ((g * items + item) * mesh.chambers + c) * size
+            clear(work.areas, o, o + size)
+            s = 16 * ((g * items + item) * mesh.chambers + c)
+            clear(work.swept, s, s + 16)
+    place = mesh.front + mesh.item_plane[item] * mesh.plane
+    corner, force = state + place, g * 3 * mesh.component + place
+    x = mesh.item_x[item]
+    blocks, each = len(mesh.block_at), 16 * case.history
+    for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
+        y, z, at = mesh.block_y[b], mesh.block_z[b], mesh.block_at[b]
+        gather(
+            work.states, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
+            mesh.X, x, mesh.Y, y, mesh.Z, z, room, G,
+        )  # fmt: skip
+        gather(
+            sums.pulls, force + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
+            mesh.X, x, mesh.Y, y, mesh.Z, z, room, B,
+        )  # fmt: skip
+        if case.flags[2]:
+            gather(
+                work.states, corner + at + 3 * mesh.component, mesh.component, mesh.plane, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates,
+            )  # fmt: skip
+        pairs = len(mesh.gas_chamber)
+        for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
+            chamber = mesh.gas_chamber[pair]
+            one = (g * items + item) * mesh.chambers + chamber
+            base = (g * pairs + pair) * 128
+            swept = load(work.swept, 16 * one)
+            step = 16 * ((t * case.groups + g) * mesh.chambers + chamber)
+            mine = 16 * (g * mesh.chambers + chamber)
+            pressure = chamber_pressure(
+                load(case.pressure, step), load(case.air, 2 * mine), load(work.volumes, step), load(case.air, 2 * mine + 16)
+            )
+            by_volume = load(sums.volume_bar, mine)
+            for k in range(8):
+                F, W, V = deformed(G, 144 * k), plain(B, 144 * k), load(case.gas, base + 16 * k)
+                cof = cofactor(F)
+                keep(rates, 1152 + 144 * k, cof, V)
+                pressed = contract(W, cof)
+                swept = swept + V * pressed
+                V_bar = pressure * pressed
+                if not last:
+                    V_bar = V_bar + by_volume * load(sums.ratios, base + 16 * k)
+                add(sums.gas, base + 16 * k, V_bar)
+                store(sums.ratios, base + 16 * k, contract(cof, F) * (1 / 3))
+                keep(rates, 2304 + 144 * k, cross(F, W), pressure * V)
+            store(work.swept, 16 * one, swept)
+            arguments = (mesh.X, x, mesh.Y, y, mesh.Z, z)
+            scatter(
+                work.areas, one * size + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+                *arguments, room, rates[1152:],
+            )  # fmt: skip
+            scatter(
+                work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit, *arguments, room, rates[2304:]
+            )
+        n = (g * blocks + b) * 128 * NUMBERS
+        h = (g * blocks + b) * 8 * each
+        e = (g * blocks + b) * 48 * case.elements
+        m, s = g * 48 * case.elements, case.softening[32 * g :]
+        for k in range(8):
+            point_adjoint(
+                G, B, rates, 144 * k, case.numbers, n + 16 * NUMBERS * k, work.histories, past + h + each * k,
+                sums.history_bar, h + each * k, case.elements, case.maxwell, m, case.flags, s,
+                sums, n + 16 * NUMBERS * k, e, (g * blocks + b) * 32,
+            )  # fmt: skip
+        scatter(
+            work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+            mesh.X, x, mesh.Y, y, mesh.Z, z, room, G,
+        )  # fmt: skip
+        if case.flags[4]:
+            for k in range(8):
+                u = value(
+                    work.states, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
+                    mesh.X, x, mesh.Y, y, mesh.Z, z, k,
+                )  # fmt: skip
+                p0, p1, p2 = value(
+                    sums.pulls, force + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
+                    mesh.X, x, mesh.Y, y, mesh.Z, z, k,
+                )  # fmt: skip
+                s0 = (g * blocks + b) * 128 * ATTACHED + 16 * ATTACHED * k
+                w0, w1, w2 = stretch(u, case.attached, s0)
+                spring = load(case.attached, s0)
+                add(sums.attached, s0, p0 * w0 + p1 * w1 + p2 * w2)
+                add(sums.attached, s0 + 16, spring * p0)
+                add(sums.attached, s0 + 32, spring * p1)
+                add(sums.attached, s0 + 48, spring * p2)
+                store(rates, 1152 + 48 * k, -spring * p0)
+                store(rates, 1152 + 48 * k + 16, -spring * p1)
+                store(rates, 1152 + 48 * k + 32, -spring * p2)
+            hand_on(
+                work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, rates[1152:],
+            )  # fmt: skip
+        if case.flags[2]:
+            scatter(
+                sums.rates, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
+                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates,
+            )  # fmt: skip
+
+
+@fast
+def gas_end(mesh, sums, g, item):
+    """The gradient by volumes of gas that the first substep still owes."""
+    pairs = len(mesh.gas_chamber)
+    for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
+        for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
+            by_volume = load(sums.volume_bar, 16 * (g * mesh.chambers + mesh.gas_chamber[pair]))
+            base = (g * pairs + pair) * 128
+            for k in range(8):
+                add(sums.gas, base + 16 * k, by_volume * load(sums.ratios, base + 16 * k))
+
+
+@fast
+def retreat(mesh, case, work, sums, g, p, t, steps):
+    """Finish the gradients by the nodes of plane p after t + 1 substeps, and go back to the forces in substep t."""
+    n, own, dt = mesh.component, g * 6 * mesh.component, case.dt
+    items, size = len(mesh.item_plane), 9 * mesh.patch
+    finishes, planes = t + 1 < steps, len(case.plane_stick)
+    if finishes and p == 0:
+        for k in range(mesh.chambers):
+            one = 16 * (g * mesh.chambers + k)
+            step = 16 * ((t + 1) * case.groups + g) * mesh.chambers + 16 * k
+            p_bar = sum_chamber(work.swept, mesh, g, k)
+            stiffness, reference = load(case.air, 2 * one), load(case.air, 2 * one + 16)
+            growth = load(work.volumes, step) / reference
+            volume_bar = -p_bar * stiffness / reference
+            store(sums.volume_bar, one, volume_bar)
+            store(sums.pressure, step, p_bar)
+            add(sums.air, 2 * one, -p_bar * (growth - 1))
+            add(sums.air, 2 * one + 16, -volume_bar * growth)
+    sample = work.seen_at[t + 1]
+    for at in range(0, mesh.plane, 16):
+        i = mesh.front + p * mesh.plane + at
+        node, a = g * n + i, own + i
+        d0, d1, d2 = load(sums.bar, a), load(sums.bar, a + n), load(sums.bar, a + 2 * n)
+        v0, v1, v2 = load(sums.bar, a + 3 * n), load(sums.bar, a + 4 * n), load(sums.bar, a + 5 * n)
+        if finishes:
+            first = g * items * size
+            d0 = d0 + sum_items(work.forces, mesh, first, size, p, 0, at)
+            d1 = d1 + sum_items(work.forces, mesh, first, size, p, 1, at)
+            d2 = d2 + sum_items(work.forces, mesh, first, size, p, 2, at)
+            for k in range(mesh.chambers):
+                if touches(mesh, p, k):
+                    one = 16 * (g * mesh.chambers + k)
+                    volume_bar = (
+                        -sum_chamber(work.swept, mesh, g, k) * load(case.air, 2 * one) / load(case.air, 2 * one + 16)
+                    )
+                    d0 = d0 + volume_bar * sum_areas(mesh, work, g, k, p, 0, at)
+                    d1 = d1 + volume_bar * sum_areas(mesh, work, g, k, p, 1, at)
+                    d2 = d2 + volume_bar * sum_areas(mesh, work, g, k, p, 2, at)
+            if planes > 0:
+                s0, s1, s2 = spread(mesh, case, sums.surfaces, (t + 1) % 2, g, i)
+                d0, d1, d2 = d0 + s0, d1 + s1, d2 + s2
+            if case.flags[2]:
+                v0 = v0 + sum_items(sums.rates, mesh, first, size, p, 0, at)
+                v1 = v1 + sum_items(sums.rates, mesh, first, size, p, 1, at)
+                v2 = v2 + sum_items(sums.rates, mesh, first, size, p, 2, at)
+        if sample >= 0:
+            o = (sample * case.groups + g) * 6 * n + i
+            d0, d1, d2 = d0 + load(sums.seen_bar, o), d1 + load(sums.seen_bar, o + n), d2 + load(sums.seen_bar, o + 2 * n)
+            o += 3 * n
+            v0, v1, v2 = v0 + load(sums.seen_bar, o), v1 + load(sums.seen_bar, o + n), v2 + load(sums.seen_bar, o + 2 * n)
+        store(sums.bar, a, d0)
+        store(sums.bar, a + n, d1)
+        store(sums.bar, a + 2 * n, d2)
+        if t >= 0:
+            moves, light = load(case.moves, node) > 0, load(case.inverse_mass, node)
+            left, zero = load(case.drag_factor, node), 0 * d0
+            state = (t * case.groups + g) * 6 * n
+            b0, b1, b2 = v0 + dt * d0, v1 + dt * d1, v2 + dt * d2
+            s = state + 3 * n + i
+            w0, w1, w2 = load(work.states, s), load(work.states, s + n), load(work.states, s + 2 * n)
+            s = ((t + 1) * case.groups + g) * 6 * n + 3 * n + i
+            u0, u1, u2 = load(work.states, s), load(work.states, s + n), load(work.states, s + 2 * n)
+            mass_bar = zero
+            if planes > 0:
+                s = (t * case.groups + g) * 3 * n + i
+                u0, u1, u2 = load(work.pushed, s), load(work.pushed, s + n), load(work.pushed, s + 2 * n)
+                b0, b1, b2, c0, c1, c2, mass_bar = meets_adjoint(
+                    mesh, case, work.states, state, sums, g, i, light, moves, u0, u1, u2, b0, b1, b2, dt * d0, dt * d1, dt * d2
+                )
+                s = (((t % 2) * case.groups + g) * 3) * n + i
+                store(sums.surfaces, s, select(moves, c0, zero))
+                store(sums.surfaces, s + n, select(moves, c1, zero))
+                store(sums.surfaces, s + 2 * n, select(moves, c2, zero))
+            pull = 48 * (t * case.groups + g)
+            g0, g1, g2 = load(case.gravity, pull), load(case.gravity, pull + 16), load(case.gravity, pull + 32)
+            whole = 1 / left
+            add(sums.drag_factor, node, select(moves, (u0 * b0 + u1 * b1 + u2 * b2) * whole, zero))
+            b0, b1, b2 = left * b0, left * b1, left * b2
+            pushed = (
+                (u0 * whole - w0 - dt * g0) * b0 + (u1 * whole - w1 - dt * g1) * b1 + (u2 * whole - w2 - dt * g2) * b2
+            )
+            add(sums.mass, node, select(moves, mass_bar - light * pushed, zero))
+            f = g * 3 * n + i
+            store(sums.pulls, f, dt * light * b0)
+            store(sums.pulls, f + n, dt * light * b1)
+            store(sums.pulls, f + 2 * n, dt * light * b2)
+            v0, v1, v2 = select(moves, b0, v0), select(moves, b1, v1), select(moves, b2, v2)
+            if sums.pulls.size > case.groups * 3 * n:
+                f += (t + 1) * case.groups * 3 * n
+                store(sums.pulls, f, dt * light * b0)
+                store(sums.pulls, f + n, dt * light * b1)
+                store(sums.pulls, f + 2 * n, dt * light * b2)
+        store(sums.bar, a + 3 * n, v0)
+        store(sums.bar, a + 4 * n, v1)
+        store(sums.bar, a + 5 * n, v2)
+
+
+@fast
+def march_back(mesh, case, work, rank, threads, sums, steps):
+    """A thread's share of all substeps, the last first."""
+    items, blocks = len(mesh.item_plane), len(mesh.block_at)
+    tasks, planes = case.groups * items, case.groups * mesh.planes
+    own = work.scratch[rank * SCRATCH : (rank + 1) * SCRATCH]
+    room, G, B = own[:ROOM], own[ROOM : ROOM + 1152], own[ROOM + 1152 : ROOM + 2304]
+    rates = own[ROOM + 2304 :]
+    state_size = case.groups * 6 * mesh.component
+    history_size = case.groups * blocks * 128 * case.history
+    for back in range(steps + 1):
+        t = steps - 1 - back
+        for task in range(planes * rank // threads, planes * (rank + 1) // threads):
+            retreat(mesh, case, work, sums, task // mesh.planes, task % mesh.planes, t, steps)
+        meet(work.sync, threads)
+        for task in range(tasks * rank // threads, tasks * (rank + 1) // threads):
+            g, item = task // items, task % items
+            if t >= 0:
+                state = t * state_size + g * 6 * mesh.component
+                points_backward(
+                    mesh, case, work, sums, g, item, t, t + 1 == steps, state, t * history_size, room, G, B, rates
+                )
+            else:
+                gas_end(mesh, sums, g, item)
+        meet(work.sync, threads)

@@ -1,0 +1,421 @@
+"""Time integration of a segment of the total-Lagrangian form on a CPU, sixteen lanes at a time, and its adjoint."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.kernels.lane_adjoint import Sums, march_back
+from torchsoro.simulation.kernels.lane_contact import PLANE
+from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, Work, march
+from torchsoro.simulation.kernels.lane_points import ATTACHED, MAXWELL, NUMBERS
+from torchsoro.simulation.kernels.lane_threads import SYNC
+from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.ops.lanes import Lanes, lay_out
+from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
+
+# Coefficients of the points in the order of ``lane_points``.
+_NUMBERS = (
+    *(layout.VOLUME, layout.BULK, layout.SHEAR, layout.VOID_FRACTION, layout.STIFFENING, layout.STIFFENING + 1),
+    *(layout.VISCOSITY, layout.VOLUME_VISCOSITY),
+)
+_PRONY = [layout.PRONY_MODULUS, layout.PRONY_GAIN, layout.PRONY_DECAY]  # of an element, likewise
+_layouts: WeakKeyDictionary[Scene, dict[tuple, Lanes]] = WeakKeyDictionary()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
+
+
+def _lanes_of(scene: Scene, batch: int, dtype: torch.dtype) -> Lanes:
+    assert scene.lattice is not None
+    known = _layouts.setdefault(scene, {})
+    if (batch, dtype) not in known:
+        known[batch, dtype] = lay_out(scene.lattice, scene.kind, batch, dtype)
+    return known[batch, dtype]
+
+
+def numbers(t: Tensor) -> np.ndarray:
+    """A tensor as a flat array, of one number at least."""
+    flat = t.detach().contiguous().reshape(-1)
+    return (flat if len(flat) else flat.new_zeros(16)).numpy()
+
+
+class LaneIntegrator:
+    """One segment in lanes: the counterpart of ``total.TotalSegmentIntegrator``.
+
+    Args:
+        scene: Constant data; its tensors by particle are by point of the lattice here.
+        inputs: The segment's tensors, likewise.
+        first: Number of the first substep in the whole run, for messages.
+        samples: Substeps to observe, counted within the segment.
+    """
+
+    def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
+        assert scene.lattice is not None
+        self.scene, self.inputs, self.first, self.samples = scene, inputs, first, samples
+        self.lattice = scene.lattice
+        self.steps = inputs.gravity.shape[0]
+        like = inputs.coefficients
+        self.batch, self.elements = like.shape[0], inputs.prony.shape[1]
+        self.lanes = _lanes_of(scene, self.batch, like.dtype)
+        self.mesh: Mesh = self.lanes.mesh
+        self.history = 6 * self.elements
+        self.nodal = self.lattice.nodal(like[:, layout.MASS], like[:, layout.DRAG], scene.dt)
+        self.case = self._case()
+
+    def _gas(self, values: Tensor) -> Tensor:
+        """Volumes of the gas in each pair of a block and a chamber [groups, pairs, 8, 16]."""
+        lanes = self.lanes
+        kinds = self.scene.kind.to(values.dtype).expand(self.batch, 1, -1)
+        kind = lanes.from_points(kinds, empty=-1.0)[:, :, :, 0]
+        V = lanes.from_points(values.unsqueeze(1))[:, :, :, 0]
+        block, chamber = lanes.pairs.unbind(1)
+        return torch.where(kind[:, block] == chamber[:, None, None], V[:, block], 0.0)
+
+    def _chamber(self) -> Tensor:
+        """Mean air stiffness and reference volume of each chamber [B, chambers, 2]."""
+        c = self.inputs.coefficients
+        rows = [c.new_zeros(self.batch, 0, layout.CHAMBER)]
+        for k in range(self.mesh.chambers):
+            gas = self.scene.kind == k
+            V = c[:, layout.VOLUME, gas]
+            stiffness = (V * c[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
+            rows.append(torch.stack([stiffness, V.sum(-1)], -1).unsqueeze(1))
+        return torch.cat(rows, 1)
+
+    def _coefficients(self) -> Tensor:
+        """Numbers of the points: gas counts as void, without a bulk modulus; what is absent as void without volume."""
+        c = self.inputs.coefficients[:, _NUMBERS].clone()
+        gas = self.scene.kind >= 0
+        c[:, 1, gas] = 0
+        c[:, 3, gas] = 1
+        c[:, 0, self.scene.kind == layout.ABSENT] = 0
+        c[:, 3, self.scene.kind == layout.ABSENT] = 1
+        found = self.lanes.from_points(c)
+        if self.lanes.absent:
+            found[:, :, :, 3] = torch.where(self.lanes._there[None], found[:, :, :, 3], 1.0)
+        return found
+
+    def _attached(self) -> Tensor:
+        """Stiffness of springs, and the way of each anchor from the particle's place [groups, blocks, 8, 4, 16]."""
+        c = self.inputs.coefficients
+        if not self.scene.springs:
+            return c.new_zeros(0)
+        places = self.lattice.places.T.to(c)
+        ways = c[:, layout.ANCHOR : layout.ANCHOR + 3] - places
+        there = self.scene.kind != layout.ABSENT
+        return self.lanes.from_points(torch.cat([c[:, layout.SPRING : layout.SPRING + 1], ways], 1) * there)
+
+    def _case(self) -> Case:
+        i, s, lanes = self.inputs, self.scene, self.lanes
+        like = i.coefficients
+        mass = self.nodal[:, :1]
+        there = mass > 0
+        inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
+        axis, sign, stick = (s.plane_kind[:, k].tolist() for k in range(3))
+        planes = like.new_zeros(self.batch, len(axis), PLANE)
+        for k, (a, side) in enumerate(zip(axis, sign, strict=True)):
+            planes[:, k, a] = side
+            planes[:, k, 3] = side * i.planes[:, k, 0]
+            planes[:, k, 4:6] = i.planes[:, k, 1:3]
+        share = self.lattice.to_nodes(s.share.to(like)) if len(s.share) else like.new_zeros(0, self.lattice.nodes)
+        wide = share.unsqueeze(0).expand(self.batch, -1, -1) if len(share) else share.unsqueeze(0)
+        shares = lanes.from_nodes(wide)[0] if len(share) else like.new_zeros(0, self.mesh.component)
+        prony = i.prony[..., _PRONY]
+        assert prony.shape[-1] == MAXWELL
+        chambers = self.mesh.chambers
+        softening = like.new_zeros(lanes.groups, 2, LANES)
+        softening[:, 1] = 1
+        return Case(
+            dt=float(s.dt),
+            groups=lanes.groups,
+            elements=self.elements,
+            history=self.history,
+            flags=(bool(s.stiffens), False, bool(s.viscous), False, bool(s.springs)),
+            numbers=numbers(self._coefficients()),
+            attached=numbers(self._attached()),
+            gas=numbers(self._gas(like[:, layout.VOLUME])),
+            maxwell=numbers(lanes.from_batch(prony)),
+            softening=numbers(softening),
+            inverse_mass=numbers(lanes.from_nodes(inverse)),
+            moves=numbers(lanes.from_nodes(there.to(like))),
+            drag_factor=numbers(lanes.from_nodes(self.nodal[:, 4:])),
+            reach=numbers(lanes.from_nodes(self.nodal[:, 1:4])),
+            air=numbers(lanes.from_batch(self._chamber())),
+            pressure=numbers(lanes.from_batch(i.pressure[:, :, :chambers], 1)),
+            gravity=numbers(lanes.from_batch(i.gravity, 1)),
+            share=shares.numpy(),
+            force=numbers(lanes.from_batch(i.force, 1)),
+            plane_numbers=numbers(lanes.from_batch(planes)),
+            plane_stick=np.array(stick, bool),
+            area=np.full(max(1, len(axis)) * self.mesh.component, s.cell**2, numbers(like).dtype),
+            spacing=float(s.cell),
+        )
+
+    def _march(self, work: Work, kernel, *settings) -> list:
+        """Run a kernel on all threads."""
+        threads = min(torch.get_num_threads(), len(work.collapsed) // 8)
+        if threads == 1:
+            return [kernel(self.mesh, self.case, work, 0, 1, *settings)]
+        pool = _pool(threads - 1)
+        others = [
+            pool.submit(kernel, self.mesh, self.case, work, rank, threads, *settings) for rank in range(1, threads)
+        ]
+        mine = kernel(self.mesh, self.case, work, 0, threads, *settings)
+        return [mine, *(o.result() for o in others)]
+
+    def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
+        """Advance the state [B, L] over the segment; as ``TotalSegmentIntegrator.forward``."""
+        mesh, lanes, nodes = self.mesh, self.lanes, self.lattice.nodes
+        ring, past = (self.steps + 1, self.steps + 1) if keep else (2, 1)
+        size, points = 6 * mesh.component, len(mesh.block_at) * 128 * self.history
+        states = start.new_empty(ring, lanes.groups, size)
+        histories = start.new_empty(past, lanes.groups, points)
+        states[0] = lanes.from_nodes(start[:, : 6 * nodes].view(self.batch, 6, nodes)).view(lanes.groups, size)
+        if not keep:
+            states[1] = states[0]
+        else:
+            # The kernels write the nodes' numbers, not what lies before and behind them.
+            for end in (slice(0, mesh.front), slice(mesh.front + mesh.planes * mesh.plane, None)):
+                states.view(ring, lanes.groups, 6, -1)[..., end] = 0
+        if self.history:
+            Z = start[:, 6 * nodes :].view(self.batch, self.history, self.lattice.count)
+            histories[0] = lanes.from_points(Z).view(lanes.groups, points)
+        at = np.full(self.steps + 1, -1)
+        inner = [k for k in self.samples if k > 0]
+        at[inner] = np.arange(len(inner))
+        seen = start.new_zeros(len(inner), lanes.groups, 6, mesh.component)
+        slots = self.steps if keep else 1
+        pushed = start.new_empty(slots if len(self.case.plane_stick) and keep else 0, lanes.groups, 3, mesh.component)
+        volumes = start.new_zeros(slots, lanes.groups, mesh.chambers, LANES)
+        threads = torch.get_num_threads()
+        work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
+        if 0 in self.samples:
+            observe(0, start)
+        done = min(self._march(work, march, self.steps, ring, past, True))
+        self.kept = (states, histories, pushed, volumes)
+        if done < self.steps:
+            self._diverged(done, states[done % ring])
+        for k, state in zip(inner, seen, strict=True):
+            flat = lanes.to_nodes(state).reshape(self.batch, -1)
+            if not bool(torch.isfinite(flat).all()) or bool(self._outside(flat).any()):
+                self._report(k, flat)
+            observe(k, flat)
+        return self._joined(states[self.steps % ring], histories[self.steps % past])
+
+    def _work(self, like, states, histories, pushed, volumes, seen, at, threads: int) -> Work:
+        mesh, groups = self.mesh, self.lanes.groups
+        items, size = len(mesh.item_plane), 9 * mesh.patch
+        tasks = groups * items
+        threads = max(1, min(threads, tasks))
+        return Work(
+            states=numbers(states),
+            histories=numbers(histories),
+            pushed=pushed.view(-1).numpy(),
+            volumes=numbers(volumes),
+            seen=numbers(seen),
+            seen_at=at,
+            forces=numbers(like.new_zeros(tasks, size)),
+            areas=numbers(like.new_zeros(tasks, mesh.chambers, size)),
+            swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
+            collapsed=np.full(8 * threads, NEVER),
+            sync=np.zeros(SYNC, np.int64),
+            scratch=np.zeros(threads * SCRATCH, numbers(like).dtype),
+        )
+
+    def _joined(self, state: Tensor, history: Tensor) -> Tensor:
+        """A state [B, L] from its lanes."""
+        lanes, mesh = self.lanes, self.mesh
+        motion = lanes.to_nodes(state.view(lanes.groups, 6, mesh.component)).reshape(self.batch, -1)
+        if not self.history:
+            return motion
+        blocks = len(mesh.block_at)
+        Z = lanes.to_points(history.view(lanes.groups, blocks, 8, self.history, LANES), self.lattice.count)
+        return torch.cat([motion, Z.reshape(self.batch, -1)], 1)
+
+    def record(self, states: Tensor) -> tuple[Tensor, ...]:
+        """The memory of ``forward(keep=True)``: states, histories, velocities before contact, volumes."""
+        return (*(t.view(-1) for t in self.kept), states.new_empty(0, dtype=torch.int64))
+
+    def restore(self, record: Sequence[Tensor]) -> None:
+        """Take over the record of another integrator of the same segment, for ``backward``."""
+        mesh, groups, steps = self.mesh, self.lanes.groups, self.steps
+        states, histories, pushed, volumes, _ = record
+        points = len(mesh.block_at) * 128 * self.history
+        self.kept = (
+            states.view(steps + 1, groups, 6 * mesh.component),
+            histories.view(steps + 1, groups, points),
+            pushed.view(-1, groups, 3, mesh.component),
+            volumes.view(steps, groups, mesh.chambers, LANES),
+        )
+
+    def state(self, k: int) -> Tensor:
+        """Displacements and velocities of the nodes after k substeps [B, 6 nodes], from what is kept."""
+        lanes = self.lanes
+        kept = self.kept[0][k].view(lanes.groups, 6, self.mesh.component)
+        return lanes.to_nodes(kept).reshape(self.batch, -1)
+
+    def backward(self, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> tuple[Tensor, dict[str, Tensor]]:
+        """Carry the gradient by the last state back to the first; as ``TotalSegmentIntegrator.backward``.
+
+        Args:
+            bar: Gradient by the last state [B, L].
+            add: Called with each sample and a tensor [B, L], to which it adds the gradient by the state there.
+            wanted: Names of the tensors whose gradients are wanted.
+
+        Returns:
+            The gradient by the first state, and those by the tensors of ``Inputs``.
+        """
+        i, lanes, mesh, steps = self.inputs, self.lanes, self.mesh, self.steps
+        nodes, groups, blocks = self.lattice.nodes, lanes.groups, len(mesh.block_at)
+        states, histories, pushed, volumes = self.kept
+        at = np.full(steps + 1, -1)
+        at[list(self.samples)] = np.arange(len(self.samples))
+        seen = bar.new_zeros(len(self.samples), groups, 6, mesh.component)
+        for k, row in zip(self.samples, seen, strict=True):
+            given = torch.zeros_like(bar)
+            add(k, given)
+            row.copy_(self._motion_bar(given))
+        moving = self._motion_bar(bar)
+        Z_bar = bar[:, 6 * nodes :].view(self.batch, self.history, self.lattice.count)
+        history = lanes.from_points(Z_bar) if self.history else bar.new_zeros(16)
+        if lanes.variations:  # lanes that repeat the last simulation have no part in it
+            live = (torch.arange(groups * LANES) < self.batch).view(groups, 1, 1, 1, LANES)
+            history = torch.where(live, history, 0.0) if self.history else history
+        pulls = bar.new_zeros(1 + (steps if {"gravity", "force"} & wanted else 0), groups, 3, mesh.component)
+        flags = (*self.case.flags[:3], "prony" in wanted, self.case.flags[4])
+        self.case = self.case._replace(flags=flags)
+        items, planes = len(mesh.item_plane), len(self.case.plane_stick)
+        sums = Sums(
+            *(numbers(t) for t in (moving, history, seen, pulls)),
+            *(np.zeros(max(n, 16), self.case.numbers.dtype) for n in (
+                2 * groups * 3 * mesh.component,
+                groups * items * 9 * mesh.patch if flags[2] else 0,
+                len(self.case.gas),
+                16 * groups * mesh.chambers,
+                len(self.case.numbers),
+                len(self.case.attached),
+                len(self.case.gas),
+                groups * blocks * 48 * self.elements,
+                groups * blocks * 32,
+                groups * mesh.component,
+                groups * mesh.component,
+                3 * groups * mesh.component,
+                groups * planes * PLANE * mesh.component,
+                len(self.case.air),
+                16 * steps * groups * mesh.chambers,
+            )),
+        )  # fmt: skip
+        work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, torch.get_num_threads())
+        self._march(work, march_back, sums, steps)
+        return self._gathered(moving, history, pulls, sums, wanted)
+
+    def _motion_bar(self, bar: Tensor) -> Tensor:
+        """Gradient by displacements and velocities in lanes [groups, 6, component]; none where lanes repeat."""
+        lanes, nodes = self.lanes, self.lattice.nodes
+        found = lanes.from_nodes(bar[:, : 6 * nodes].view(self.batch, 6, nodes))
+        spare = lanes.groups * LANES - self.batch
+        if lanes.variations and spare:
+            found[-1].view(6, -1, LANES)[..., LANES - spare :] = 0
+        return found
+
+    def _gathered(self, moving, history, pulls, sums: Sums, wanted: frozenset[str]):
+        """Gradients in the layout of the inputs."""
+        i, lanes, mesh, s = self.inputs, self.lanes, self.mesh, self.scene
+        groups, blocks, points = lanes.groups, len(mesh.block_at), self.lattice.count
+        c = i.coefficients
+
+        def tensor(a: np.ndarray, *shape: int) -> Tensor:
+            return torch.from_numpy(a[: math.prod(shape)]).view(shape)
+
+        by_point = lanes.to_points(tensor(sums.numbers, groups, blocks, 8, NUMBERS, LANES), points)
+        found = torch.zeros_like(c)
+        gas = s.kind >= 0
+        by_point[:, 1, gas] = 0
+        by_point[:, 3, gas] = 0
+        found[:, _NUMBERS] = by_point
+        if len(lanes.pairs):
+            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES)
+            wide = c.new_zeros(groups, blocks, 8, 1, LANES)
+            wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
+            found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
+            found += self._chamber_adjoint(lanes.to_batch(tensor(sums.air, groups, mesh.chambers, 2, LANES)))
+        if s.springs:
+            attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
+            found[:, layout.SPRING : layout.ANCHOR + 3] += attached
+        nodal = torch.cat(
+            [
+                lanes.to_nodes(tensor(a, groups, n, mesh.component))
+                for a, n in ((sums.mass, 1), (sums.reach, 3), (sums.drag_factor, 1))
+            ],
+            1,
+        )
+        mass_bar, drag_bar = self.lattice.nodal_adjoint(c[:, layout.MASS], c[:, layout.DRAG], s.dt, nodal)
+        found[:, layout.MASS] += mass_bar
+        found[:, layout.DRAG] += drag_bar
+        prony_bar = torch.zeros_like(i.prony)
+        if self.elements and "prony" in wanted:
+            by_element = tensor(sums.maxwell, groups, blocks, self.elements, MAXWELL, LANES).sum(1)
+            prony_bar[..., _PRONY] = lanes.to_batch(by_element)
+        planes = s.plane_kind.shape[0]
+        planes_bar = torch.zeros_like(i.planes)
+        if planes:
+            by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
+            by_plane = by_node.sum(-1).view(self.batch, planes, PLANE)
+            planes_bar = torch.cat([by_plane[..., 3:4] * s.plane_kind[:, 1:2], by_plane[..., 4:]], -1)
+        gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
+        if {"gravity", "force"} & wanted:
+            mass = self.nodal[:, :1]
+            for t in range(self.steps):
+                pull = lanes.to_nodes(pulls[t + 1])
+                gravity_bar[t] = (mass * pull).sum(-1)
+                if len(s.share):
+                    force_bar[t] = torch.einsum("bcn,gn->bgc", pull, self.lattice.to_nodes(s.share.to(c)))
+        pressure_bar = torch.zeros_like(i.pressure)
+        if mesh.chambers:
+            by_step = tensor(sums.pressure, self.steps, groups, mesh.chambers, LANES)
+            pressure_bar[: self.steps, :, : mesh.chambers] = lanes.to_batch(by_step, 1)
+        history_bar = history.view(groups, blocks, 8, self.history, LANES) if self.history else None
+        state_bar = lanes.to_nodes(moving).reshape(self.batch, -1)
+        if history_bar is not None:
+            state_bar = torch.cat([state_bar, lanes.to_points(history_bar, points).reshape(self.batch, -1)], 1)
+        return state_bar, {
+            "coefficients": found,
+            "prony": prony_bar,
+            "pressure": pressure_bar,
+            "gravity": gravity_bar,
+            "force": force_bar,
+            "planes": planes_bar,
+            "origin": torch.zeros_like(i.origin),
+        }
+
+    def _chamber_adjoint(self, bar: Tensor) -> Tensor:
+        """Gradient by the coefficients, from that by :meth:`_chamber`."""
+        found, chamber = torch.zeros_like(self.inputs.coefficients), self._chamber()
+        for c in range(self.mesh.chambers):
+            gas = self.scene.kind == c
+            V, K = self.inputs.coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
+            k, whole = chamber[:, c, :1], chamber[:, c, 1:]
+            k_bar, whole_bar = bar[:, c, :1], bar[:, c, 1:]
+            found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
+            found[:, layout.BULK, gas] = k_bar * V / whole
+        return found
+
+    def _outside(self, state: Tensor) -> Tensor:
+        return torch.zeros(1, dtype=torch.bool)
+
+    def _report(self, step: int, state: Tensor) -> None:
+        raise RuntimeError(f"diverged at {step}")
+
+    def _diverged(self, step: int, state: Tensor) -> None:
+        raise RuntimeError(f"diverged at {step}")

@@ -1,0 +1,255 @@
+"""Bodies as lanes of the CPU's kernels see them: which lane deals with which cell, point, node and simulation."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.kernels.lane_march import Mesh
+from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice, spline
+
+PARTS = 16  # items of a body, at least: as many threads have something to do
+
+
+class _Table(NamedTuple):
+    """Of an axis: lowest node of each cell [cells], and weights and slopes of its nodes [cells, 12]."""
+
+    first: np.ndarray
+    numbers: np.ndarray
+
+
+def _tables(lattice: Lattice) -> list[_Table]:
+    found = []
+    for count in lattice.points:
+        weight, _, slope = (a.numpy() for a in spline(count, QUADRATURE))
+        cells = np.arange(count // 2)
+        rows = [m[2 * cells + o, cells + k] for m in (weight, slope / lattice.cell) for o in range(2) for k in range(3)]
+        found.append(_Table(cells, np.stack(rows, 1)))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Lanes:
+    """How bodies of one lattice are laid out.
+
+    Attributes:
+        mesh: For the kernels.
+        batch: Number of simulations.
+        groups: Number of bodies that the kernels see: one for each simulation, or for each sixteen.
+        points: Of each block, point and lane the point of the lattice, -1 where there is none [blocks, 8, 16].
+        nodes: Place of each node in a component, of the first lane [nodes].
+        pairs: Block and chamber of each pair that has gas [pairs, 2].
+        variations: Whether lanes are simulations, else cells of one.
+    """
+
+    mesh: Mesh
+    batch: int
+    groups: int
+    points: Tensor
+    nodes: Tensor
+    pairs: Tensor
+    variations: bool
+    absent: bool
+
+    @cached_property
+    def _row(self) -> Tensor:
+        """Simulation of each group and lane, where lanes are simulations [groups, 16]; the last fills what is left."""
+        return torch.arange(self.groups * LANES).clamp(max=self.batch - 1).view(self.groups, LANES)
+
+    @cached_property
+    def _flat(self) -> Tensor:
+        return self.points.clamp(min=0).reshape(-1)
+
+    @cached_property
+    def _there(self) -> Tensor:
+        return self.points >= 0
+
+    @cached_property
+    def _where(self) -> tuple[Tensor, Tensor]:
+        """Points that are there, and their places [block, 8, lane], flat."""
+        flat = self.points.reshape(-1)
+        places = (flat >= 0).nonzero().squeeze(1)
+        return flat[places], places
+
+    def from_points(self, values: Tensor, empty: float = 0.0) -> Tensor:
+        """Values by point [B, K, points] as [groups, blocks, 8, K, 16]."""
+        batch, count, _ = values.shape
+        if self.variations:
+            at = self.points[:, :, 0].reshape(-1)
+            wide = values[:, :, at].view(batch, count, -1, 8).permute(2, 3, 1, 0)
+            return wide[..., self._row.reshape(-1)].unflatten(-1, (self.groups, LANES)).movedim(-2, 0).contiguous()
+        wide = values[:, :, self._flat].view(batch, count, -1, 8, LANES).permute(0, 2, 3, 1, 4)
+        return torch.where(self._there[None, :, :, None, :], wide, empty).contiguous()
+
+    def to_points(self, lanes: Tensor, count: int) -> Tensor:
+        """The opposite of :meth:`from_points`, zero where no block has a point; ``count`` is the number of points."""
+        inner = lanes.shape[3]
+        found = lanes.new_zeros(self.batch, inner, count)
+        if self.variations:
+            rows = lanes.permute(0, 4, 3, 1, 2).reshape(self.groups * LANES, inner, -1)[: self.batch]
+            return found.index_copy_(2, self.points[:, :, 0].reshape(-1), rows)
+        at, places = self._where
+        rows = lanes.permute(0, 3, 1, 2, 4).reshape(self.batch, inner, -1)[:, :, places]
+        return found.index_copy_(2, at, rows)
+
+    def from_nodes(self, values: Tensor) -> Tensor:
+        """Values by node [B, K, nodes] as [groups, K, component]."""
+        batch, count, _ = values.shape
+        found = values.new_zeros(self.groups, count, self.mesh.component)
+        if self.variations:
+            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
+            rows = values[self._row.reshape(-1)].unflatten(0, (self.groups, LANES))
+            return found.index_copy_(2, at, rows.permute(0, 2, 3, 1).reshape(self.groups, count, -1))
+        return found.index_copy_(2, self.nodes, values)
+
+    def to_nodes(self, lanes: Tensor) -> Tensor:
+        """The opposite of :meth:`from_nodes`."""
+        if self.variations:
+            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
+            rows = lanes[:, :, at].unflatten(-1, (-1, LANES)).permute(0, 3, 1, 2)
+            return rows.reshape(-1, *rows.shape[2:])[: self.batch]
+        return lanes[:, :, self.nodes]
+
+    def from_batch(self, values: Tensor, axis: int = 0) -> Tensor:
+        """Numbers of a simulation, with the batch along an axis, as [..., groups, ..., 16]."""
+        if self.variations:
+            wide = values.index_select(axis, self._row.reshape(-1)).unflatten(axis, (self.groups, LANES))
+            return wide.movedim(axis + 1, -1).contiguous()
+        return values.unsqueeze(-1).expand(*values.shape, LANES).contiguous()
+
+    def to_batch(self, lanes: Tensor, axis: int = 0) -> Tensor:
+        """Gradients by such numbers: those of a lane, or the sum over lanes."""
+        if self.variations:
+            return lanes.movedim(-1, axis + 1).flatten(axis, axis + 1).narrow(axis, 0, self.batch)
+        return lanes.sum(-1)
+
+
+def _efficiency(cells: np.ndarray, row: int, first: list[np.ndarray]) -> float:
+    """Share of lanes that have a cell, where lanes are cells."""
+    blocks = sum(len(_blocks(layer, row, first)) for layer in np.split(cells, np.flatnonzero(np.diff(cells[:, 0])) + 1))
+    return len(cells) / (LANES * blocks)
+
+
+def _blocks(layer: np.ndarray, row: int, first: list[np.ndarray]) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
+    """Blocks of the cells of a layer: place of the first lane in the plane, and each lane that has a cell with it."""
+    corner = first[1][layer[:, 1]] * row + first[2][layer[:, 2]]
+    order = np.argsort(corner)
+    found: list[tuple[int, list[tuple[int, np.ndarray]]]] = []
+    for n in order:
+        if not found or corner[n] - found[-1][0] >= LANES:
+            found.append((int(corner[n]), []))
+        found[-1][1].append((int(corner[n] - found[-1][0]), layer[n]))
+    return found
+
+
+def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
+    """Deal the cells of a lattice, and the simulations of a batch, to blocks of sixteen lanes.
+
+    Args:
+        lattice: Of the bodies.
+        kind: Of each point [points]: -1 for solid, else the number of a chamber, or ABSENT.
+        batch: Number of simulations.
+        dtype: Of the kernels' numbers.
+    """
+    real = {torch.float32: np.float32, torch.float64: np.float64}[dtype]
+    px, py, pz = lattice.points
+    cx, cy, cz = px // 2, py // 2, pz // 2
+    kinds = kind.cpu().numpy().reshape(cx, 2, cy, 2, cz, 2).transpose(0, 2, 4, 1, 3, 5).reshape(cx, cy, cz, 8)
+    numbers = np.arange(px * py * pz).reshape(cx, 2, cy, 2, cz, 2).transpose(0, 2, 4, 1, 3, 5).reshape(cx, cy, cz, 8)
+    cells = np.argwhere((kinds != layout.ABSENT).any(-1))
+    tables = _tables(lattice)
+    first = [t.first for t in tables]
+    nx, ny, nz = lattice.shape
+    full = LANES * math.ceil(batch / LANES)
+    variations = batch / full >= _efficiency(cells, nz, first)
+    unit = LANES if variations else 1
+    row = nz * unit
+    plane = LANES * math.ceil(ny * row / LANES)
+    front = LANES * math.ceil(plane / LANES)
+    component = LANES * math.ceil((front + (nx + 1) * plane + 2 * row + 2 * unit + LANES) / LANES)
+    patch = LANES * math.ceil((plane + 2 * row + 2 * unit + LANES) / LANES)
+
+    blocks: list[tuple[int, np.ndarray, bytes, bytes]] = []
+    Y: dict[bytes, int] = {}
+    Z: dict[bytes, int] = {}
+    items: list[tuple[int, int, int]] = []  # layer, first block, last
+    layers = np.split(cells, np.flatnonzero(np.diff(cells[:, 0])) + 1)
+    parts = math.ceil(PARTS / max(1, len(layers)))
+    for layer in layers:
+        begin = len(blocks)
+        if variations:
+            found = [(int(first[1][y]) * row + int(first[2][z]) * unit, [(lane, np.array((x, y, z))) for lane in range(LANES)]) for x, y, z in layer]
+        else:
+            found = _blocks(layer, row, first)
+        for at, lanes in found:
+            where = np.full((8, LANES), -1)
+            y, z = np.zeros((12, LANES), real), np.zeros((12, LANES), real)
+            for lane, cell in lanes:
+                there = kinds[tuple(cell)] != layout.ABSENT
+                where[:, lane] = np.where(there, numbers[tuple(cell)], -1)
+                y[:, lane], z[:, lane] = tables[1].numbers[cell[1]], tables[2].numbers[cell[2]]
+            blocks.append((at, where, y.tobytes(), z.tobytes()))
+            Y.setdefault(y.tobytes(), len(Y)), Z.setdefault(z.tobytes(), len(Z))
+        count = len(blocks) - begin
+        cuts = [begin + count * k // min(parts, count) for k in range(min(parts, count) + 1)]
+        items += [(int(layer[0, 0]), a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+
+    points = np.stack([where for _, where, _, _ in blocks])
+    flat = kind.cpu().numpy()
+    of = np.where(points >= 0, flat[np.maximum(points, 0)], -1)
+    chambers = int(flat.max()) + 1 if (flat >= 0).any() else 0
+    pairs = [(b, c) for b in range(len(blocks)) for c in range(chambers) if (of[b] == c).any()]
+    item_gas = np.zeros((len(items), max(chambers, 1)), bool)
+    for i, (_, a, b) in enumerate(items):
+        for block, c in pairs:
+            item_gas[i, c] |= a <= block < b
+    entries = defaultdict(list)
+    for i, (layer, _, _) in enumerate(items):
+        for slot in range(3):
+            entries[int(first[0][layer]) + slot].append((i, slot))
+    listed = [entries[p] for p in range(nx)]
+    grid = np.stack(np.meshgrid(np.arange(nx) * plane, np.arange(ny) * row, np.arange(nz) * unit, indexing="ij")).sum(0)
+    nodes = torch.from_numpy(front + grid.reshape(-1))
+    places = torch.zeros(3, component, dtype=dtype)
+    where = lattice.node_places.to(dtype).T
+    for lane in range(unit):
+        places[:, nodes + lane] = where
+    whole = np.int64
+    mesh = Mesh(
+        unit=unit, row=row, plane=plane, front=front, component=component, planes=nx, patch=patch, chambers=chambers,
+        item_plane=np.array([first[0][i[0]] for i in items], whole),
+        item_x=np.array([12 * i[0] for i in items], whole),
+        item_begin=np.array([*(i[1] for i in items), len(blocks)], whole),
+        block_at=np.array([b[0] for b in blocks], whole),
+        block_y=np.array([192 * Y[b[2]] for b in blocks], whole),
+        block_z=np.array([192 * Z[b[3]] for b in blocks], whole),
+        gas_begin=np.searchsorted([b for b, _ in pairs], np.arange(len(blocks) + 1)).astype(whole),
+        gas_chamber=np.array([c for _, c in pairs], whole),
+        item_gas=item_gas,
+        X=tables[0].numbers.astype(real).reshape(-1),
+        Y=np.frombuffer(b"".join(Y), real).copy(),
+        Z=np.frombuffer(b"".join(Z), real).copy(),
+        plane_begin=np.cumsum([0, *(len(e) for e in listed)]).astype(whole),
+        plane_item=np.array([i for e in listed for i, _ in e], whole),
+        plane_slot=np.array([s for e in listed for _, s in e], whole),
+        places=places.numpy().reshape(-1),
+    )  # fmt: skip
+    return Lanes(
+        mesh=mesh,
+        batch=batch,
+        groups=full // LANES if variations else batch,
+        points=torch.from_numpy(points),
+        nodes=nodes,
+        pairs=torch.tensor(pairs, dtype=torch.int64).reshape(-1, 2),
+        variations=bool(variations),
+        absent=bool((points < 0).any()),
+    )
