@@ -13,6 +13,8 @@ import taichi as ti
 import torch
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
+from torchsoro.simulation.threads import set_threads
+
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -61,6 +63,8 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
         raise ValueError(f"device = {str(device)!r}: wanted 'cpu' or 'cuda'")
     if kind == "cuda" and not torch.cuda.is_available():
         raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
+    if threads is not None:
+        set_threads(threads)
     if _started == kind and threads is None:
         return
     options: dict[str, Any] = {} if threads is None else {"cpu_max_num_threads": threads}

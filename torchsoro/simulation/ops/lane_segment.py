@@ -21,6 +21,7 @@ from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
+from torchsoro.simulation.threads import thread_count
 
 # Coefficients of the points in the order of ``lane_points``.
 _NUMBERS = (
@@ -42,6 +43,11 @@ def _lanes_of(scene: Scene, batch: int, dtype: torch.dtype) -> Lanes:
     if (batch, dtype) not in known:
         known[batch, dtype] = lay_out(scene.lattice, scene.kind, batch, dtype)
     return known[batch, dtype]
+
+
+def in_lanes(scene: Scene, like: Tensor) -> bool:
+    """Whether a scene's simulations on the device of a tensor run in lanes."""
+    return scene.lattice is not None and scene.lanes and not like.is_cuda
 
 
 def numbers(t: Tensor) -> np.ndarray:
@@ -164,7 +170,7 @@ class LaneIntegrator:
 
     def _march(self, work: Work, kernel, *settings) -> list:
         """Run a kernel on all threads."""
-        threads = min(torch.get_num_threads(), len(work.collapsed) // 8)
+        threads = len(work.collapsed) // 8
         if threads == 1:
             return [kernel(self.mesh, self.case, work, 0, 1, *settings)]
         pool = _pool(threads - 1)
@@ -175,7 +181,7 @@ class LaneIntegrator:
         return [mine, *(o.result() for o in others)]
 
     def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
-        """Advance the state [B, L] over the segment; as ``TotalSegmentIntegrator.forward``."""
+        """Advance the state [B, L] over the segment; returns the last one [1, B, L]."""
         mesh, lanes, nodes = self.mesh, self.lanes, self.lattice.nodes
         ring, past = (self.steps + 1, self.steps + 1) if keep else (2, 1)
         size, points = 6 * mesh.component, len(mesh.block_at) * 128 * self.history
@@ -198,7 +204,7 @@ class LaneIntegrator:
         slots = self.steps if keep else 1
         pushed = start.new_empty(slots if len(self.case.plane_stick) and keep else 0, lanes.groups, 3, mesh.component)
         volumes = start.new_zeros(slots, lanes.groups, mesh.chambers, LANES)
-        threads = torch.get_num_threads()
+        threads = thread_count()
         work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
         if 0 in self.samples:
             observe(0, start)
@@ -211,7 +217,7 @@ class LaneIntegrator:
             if not bool(torch.isfinite(flat).all()) or bool(self._outside(flat).any()):
                 self._report(k, flat)
             observe(k, flat)
-        return self._joined(states[self.steps % ring], histories[self.steps % past])
+        return self._joined(states[self.steps % ring], histories[self.steps % past]).unsqueeze(0)
 
     def _work(self, like, states, histories, pushed, volumes, seen, at, threads: int) -> Work:
         mesh, groups = self.mesh, self.lanes.groups
@@ -247,8 +253,8 @@ class LaneIntegrator:
         """The memory of ``forward(keep=True)``: states, histories, velocities before contact, volumes."""
         return (*(t.view(-1) for t in self.kept), states.new_empty(0, dtype=torch.int64))
 
-    def restore(self, record: Sequence[Tensor]) -> None:
-        """Take over the record of another integrator of the same segment, for ``backward``."""
+    def restore(self, record: Sequence[Tensor]) -> LaneIntegrator:
+        """Take over the record of another integrator of the same segment, for ``backward``; item k is a state."""
         mesh, groups, steps = self.mesh, self.lanes.groups, self.steps
         states, histories, pushed, volumes, _ = record
         points = len(mesh.block_at) * 128 * self.history
@@ -258,23 +264,25 @@ class LaneIntegrator:
             pushed.view(-1, groups, 3, mesh.component),
             volumes.view(steps, groups, mesh.chambers, LANES),
         )
+        return self
 
-    def state(self, k: int) -> Tensor:
+    def __getitem__(self, k: int) -> Tensor:
         """Displacements and velocities of the nodes after k substeps [B, 6 nodes], from what is kept."""
         lanes = self.lanes
         kept = self.kept[0][k].view(lanes.groups, 6, self.mesh.component)
         return lanes.to_nodes(kept).reshape(self.batch, -1)
 
-    def backward(self, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> tuple[Tensor, dict[str, Tensor]]:
-        """Carry the gradient by the last state back to the first; as ``TotalSegmentIntegrator.backward``.
+    def backward(self, states: object, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> dict[str, Tensor]:
+        """Carry the gradient by the last state back to the first, in place; as ``TotalSegmentIntegrator.backward``.
 
         Args:
-            bar: Gradient by the last state [B, L].
+            states: Not needed: those of ``forward`` or ``restore`` are used.
+            bar: Gradient by the last state [B, L], then by the first.
             add: Called with each sample and a tensor [B, L], to which it adds the gradient by the state there.
             wanted: Names of the tensors whose gradients are wanted.
 
         Returns:
-            The gradient by the first state, and those by the tensors of ``Inputs``.
+            Gradients by the tensors of ``Inputs``.
         """
         i, lanes, mesh, steps = self.inputs, self.lanes, self.mesh, self.steps
         nodes, groups, blocks = self.lattice.nodes, lanes.groups, len(mesh.block_at)
@@ -283,7 +291,7 @@ class LaneIntegrator:
         at[list(self.samples)] = np.arange(len(self.samples))
         seen = bar.new_zeros(len(self.samples), groups, 6, mesh.component)
         for k, row in zip(self.samples, seen, strict=True):
-            given = torch.zeros_like(bar)
+            given = torch.zeros_like(bar[:, : 6 * nodes])
             add(k, given)
             row.copy_(self._motion_bar(given))
         moving = self._motion_bar(bar)
@@ -316,9 +324,11 @@ class LaneIntegrator:
                 16 * steps * groups * mesh.chambers,
             )),
         )  # fmt: skip
-        work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, torch.get_num_threads())
+        work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, thread_count())
         self._march(work, march_back, sums, steps)
-        return self._gathered(moving, history, pulls, sums, wanted)
+        first, found = self._gathered(moving, history, pulls, sums, wanted)
+        bar.copy_(first)
+        return found
 
     def _motion_bar(self, bar: Tensor) -> Tensor:
         """Gradient by displacements and velocities in lanes [groups, 6, component]; none where lanes repeat."""
@@ -345,11 +355,11 @@ class LaneIntegrator:
         by_point[:, 3, gas] = 0
         found[:, _NUMBERS] = by_point
         if len(lanes.pairs):
-            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES)
+            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(groups, -1, 8, LANES)
             wide = c.new_zeros(groups, blocks, 8, 1, LANES)
             wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
             found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
-            found += self._chamber_adjoint(lanes.to_batch(tensor(sums.air, groups, mesh.chambers, 2, LANES)))
+            found += self._chamber_adjoint(lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES)))
         if s.springs:
             attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
             found[:, layout.SPRING : layout.ANCHOR + 3] += attached
@@ -384,7 +394,7 @@ class LaneIntegrator:
         pressure_bar = torch.zeros_like(i.pressure)
         if mesh.chambers:
             by_step = tensor(sums.pressure, self.steps, groups, mesh.chambers, LANES)
-            pressure_bar[: self.steps, :, : mesh.chambers] = lanes.to_batch(by_step, 1)
+            pressure_bar[: self.steps, :, : mesh.chambers] = lanes.summed(by_step, 1)
         history_bar = history.view(groups, blocks, 8, self.history, LANES) if self.history else None
         state_bar = lanes.to_nodes(moving).reshape(self.batch, -1)
         if history_bar is not None:

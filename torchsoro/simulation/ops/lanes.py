@@ -132,6 +132,10 @@ class Lanes:
             return lanes.movedim(-1, axis + 1).flatten(axis, axis + 1).narrow(axis, 0, self.batch)
         return lanes.sum(-1)
 
+    def summed(self, lanes: Tensor, axis: int = 0) -> Tensor:
+        """Gradients by such numbers that kernels have summed over the lanes of a simulation."""
+        return self.to_batch(lanes, axis) if self.variations else lanes[..., 0]
+
 
 def _efficiency(cells: np.ndarray, row: int, first: list[np.ndarray]) -> float:
     """Share of lanes that have a cell, where lanes are cells."""

@@ -23,6 +23,7 @@ from torch._C._functorch import peek_interpreter_stack
 from torch.autograd import forward_ad
 
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.lane_segment import LaneIntegrator, in_lanes
 from torchsoro.simulation.ops.observation import observe, observe_adjoint
 from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
 from torchsoro.simulation.ops.segment import SegmentIntegrator, empty_record
@@ -55,8 +56,10 @@ _BACKWARD = _define(
 
 def _integrator(
     scene: Scene, inputs: Inputs, first: int, samples: Sequence[int]
-) -> SegmentIntegrator | TotalSegmentIntegrator:
-    kind = SegmentIntegrator if scene.lattice is None else TotalSegmentIntegrator
+) -> SegmentIntegrator | TotalSegmentIntegrator | LaneIntegrator:
+    kind: type = SegmentIntegrator
+    if scene.lattice is not None:
+        kind = LaneIntegrator if in_lanes(scene, inputs.coefficients) else TotalSegmentIntegrator
     return kind(scene, inputs, first=first, samples=tuple(samples))
 
 
@@ -91,6 +94,9 @@ def _forward_fake(*arguments) -> tuple[Tensor, ...]:
     if keep:
         steps, batch = inputs.gravity.shape[0], state.shape[0]
         size = torch.library.get_ctx().new_dynamic_size
+        if in_lanes(scene, state):
+            record[:4] = (state.new_empty(size()) for _ in range(4))
+            return torch.empty_like(state), *observed, *record
         record[:2] = state.new_empty(steps + 1, *state.shape), state.new_empty(size())
         if scene.lattice is None:
             record[2] = state.new_empty(size() if scene.blend > 0 else 0)
@@ -133,11 +139,10 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     state, weight, inputs, scene, (first, samples, keep, wanted) = _parts((*arguments[: len(_TENSORS)], *settings))
     end_bar, *seen_bar = bars
     integrator = _integrator(scene, inputs, first, samples if keep else ())
-    if keep:
-        states = integrator.restore(record)
-    else:
-        states = integrator.forward(state, keep=True, observe=lambda k, s: None)
+    if not keep:
+        record = integrator.record(integrator.forward(state, keep=True, observe=lambda k, s: None))
         integrator.samples = tuple(samples)
+    states = integrator.restore(record)
     bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
     weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(inputs.coefficients)
     pressure_bar = torch.zeros_like(inputs.pressure)

@@ -37,6 +37,7 @@ class Scene:
         stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
         probes: int64 [P], particles whose motion is recorded.
         lattice: Of the total-Lagrangian form; None for the updated form.
+        lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
 
@@ -53,6 +54,7 @@ class Scene:
     stiffens: bool
     probes: Tensor
     lattice: Lattice | None = None
+    lanes: bool = True
     handle: int = field(init=False, default_factory=_handles.__next__)
 
     def __post_init__(self) -> None:
