@@ -19,6 +19,7 @@ from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, 
 from torchsoro.simulation.kernels.lane_points import ATTACHED, MAXWELL, NUMBERS
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.threads import thread_count
@@ -182,7 +183,7 @@ class LaneIntegrator:
 
     def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
         """Advance the state [B, L] over the segment; returns the last one [1, B, L]."""
-        mesh, lanes, nodes = self.mesh, self.lanes, self.lattice.nodes
+        mesh, lanes, nodes, groups = self.mesh, self.lanes, self.lattice.nodes, self.lanes.groups
         ring, past = (self.steps + 1, self.steps + 1) if keep else (2, 1)
         size, points = 6 * mesh.component, len(mesh.block_at) * 128 * self.history
         states = start.new_empty(ring, lanes.groups, size)
@@ -191,9 +192,7 @@ class LaneIntegrator:
         if not keep:
             states[1] = states[0]
         else:
-            # The kernels write the nodes' numbers, not what lies before and behind them.
-            for end in (slice(0, mesh.front), slice(mesh.front + mesh.planes * mesh.plane, None)):
-                states.view(ring, lanes.groups, 6, -1)[..., end] = 0
+            self._clear_ends(states.view(ring, groups, 6, -1))
         if self.history:
             Z = start[:, 6 * nodes :].view(self.batch, self.history, self.lattice.count)
             histories[0] = lanes.from_points(Z).view(lanes.groups, points)
@@ -203,7 +202,8 @@ class LaneIntegrator:
         seen = start.new_zeros(len(inner), lanes.groups, 6, mesh.component)
         slots = self.steps if keep else 1
         pushed = start.new_empty(slots if len(self.case.plane_stick) and keep else 0, lanes.groups, 3, mesh.component)
-        volumes = start.new_zeros(slots, lanes.groups, mesh.chambers, LANES)
+        self._clear_ends(pushed)
+        volumes = start.new_zeros(slots, groups, mesh.chambers, LANES)
         threads = thread_count()
         work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
         if 0 in self.samples:
@@ -211,13 +211,26 @@ class LaneIntegrator:
         done = min(self._march(work, march, self.steps, ring, past, True))
         self.kept = (states, histories, pushed, volumes)
         if done < self.steps:
-            self._diverged(done, states[done % ring])
+            last = lanes.to_nodes(states[done % ring].view(groups, 6, -1)).reshape(self.batch, -1)
+            report(self.scene, self.inputs, self.first + done, last)
         for k, state in zip(inner, seen, strict=True):
             flat = lanes.to_nodes(state).reshape(self.batch, -1)
-            if not bool(torch.isfinite(flat).all()) or bool(self._outside(flat).any()):
-                self._report(k, flat)
+            self._check(k, flat)
             observe(k, flat)
-        return self._joined(states[self.steps % ring], histories[self.steps % past]).unsqueeze(0)
+        end = self._joined(states[self.steps % ring], histories[self.steps % past])
+        if self.steps not in self.samples:
+            self._check(self.steps, end)
+        return end.unsqueeze(0)
+
+    def _check(self, step: int, state: Tensor) -> None:
+        """Raise ``SimulationDiverged`` if a state is not finite or outside of the box."""
+        if not bool(torch.isfinite(state).all()) or bool(outside(self.scene, self.inputs, state).any()):
+            report(self.scene, self.inputs, self.first + step, state)
+
+    def _clear_ends(self, field: Tensor) -> None:
+        """Zero what lies before and behind the nodes [..., component], which the kernels read but do not write."""
+        field[..., : self.mesh.front] = 0
+        field[..., self.mesh.front + self.mesh.planes * self.mesh.plane :] = 0
 
     def _work(self, like, states, histories, pushed, volumes, seen, at, threads: int) -> Work:
         mesh, groups = self.mesh, self.lanes.groups
@@ -420,12 +433,3 @@ class LaneIntegrator:
             found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
             found[:, layout.BULK, gas] = k_bar * V / whole
         return found
-
-    def _outside(self, state: Tensor) -> Tensor:
-        return torch.zeros(1, dtype=torch.bool)
-
-    def _report(self, step: int, state: Tensor) -> None:
-        raise RuntimeError(f"diverged at {step}")
-
-    def _diverged(self, step: int, state: Tensor) -> None:
-        raise RuntimeError(f"diverged at {step}")

@@ -13,8 +13,8 @@ import taichi as ti
 import torch
 from torch import Tensor
 
-from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.kernels import layout, total, total_adjoint
+from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
@@ -157,9 +157,9 @@ class TotalSegmentIntegrator:
                 if before is not None:
                     states[now % 2] = before
                     march(now, collapsed)
-                self._report(collapsed, states[collapsed % ring])
-            if not bool(torch.isfinite(after).all()) or bool(self._outside(after).any()):
-                self._report(stop, after)
+                report(self.scene, self.inputs, self.first + collapsed, states[collapsed % ring])
+            if not bool(torch.isfinite(after).all()) or bool(outside(self.scene, self.inputs, after).any()):
+                report(self.scene, self.inputs, self.first + stop, after)
             if stop in self.samples:
                 observe(stop, after)
             now = stop
@@ -287,60 +287,3 @@ class TotalSegmentIntegrator:
             found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
             found[:, layout.BULK, gas] = k_bar * V / whole
         return found
-
-    def _nodes(self, state: Tensor) -> Tensor:
-        """Displacements [B, 3, nodes] m."""
-        return state[:, : 3 * self.lattice.nodes].view(self.batch, 3, self.lattice.nodes)
-
-    def _places(self, state: Tensor) -> Tensor:
-        """Current positions of the particles [B, 3, points] m."""
-        return self.lattice.to_points(self._nodes(state), "mark") + self.lattice.places.T.to(state)
-
-    def _outside(self, state: Tensor) -> Tensor:
-        """Points outside of the analysis box, void excepted [B, points]."""
-        x = self._places(state)
-        low, high = (x.new_tensor(c).view(1, 3, 1) for c in (self.scene.low, self.scene.high))
-        matter = (self.scene.kind != layout.ABSENT) & (self.inputs.coefficients[:, layout.VOID_FRACTION] < 1)
-        return matter & ~((x > low) & (x < high)).all(1)
-
-    def _report(self, step: int, state: Tensor) -> None:
-        """Raise ``SimulationDiverged`` for the first point that violates a bound after so many substeps."""
-        F = self.lattice.gradient(self._nodes(state)).permute(0, 3, 1, 2) + torch.eye(3).to(state)
-        J = torch.linalg.det(F)
-        solid = (self.scene.kind == -1) & (self.inputs.coefficients[:, layout.VOID_FRACTION] == 0)
-        x = self._places(state)
-        there = self.scene.kind != layout.ABSENT
-        smaller = "a smaller time step, a lower pressure or a higher void fraction"
-        lowest = torch.where(solid, J, torch.inf)
-        lowest = torch.zeros_like(solid).view(-1).index_fill(0, lowest.view(-1).argmin(), True).view_as(solid)
-        cases = (
-            (~torch.isfinite(J) & there, "the state is not finite", "J", J, smaller),
-            ((J <= 0) & solid, "the volume ratio is not positive", "J", J, smaller),
-            (
-                (J <= 0) & (self.scene.kind >= 0),
-                "the chamber is tangled inside",
-                "J",
-                J,
-                "a larger fictitious shear modulus in the chamber (Gas.shear) or a lower pressure",
-            ),
-            (
-                self._outside(state),
-                "about to leave the analysis box",
-                "farthest coordinate in m",
-                x.abs().amax(1),
-                "a larger analysis box, or a shorter run",
-            ),
-            (lowest, "the volume ratio is hardly positive", "J", J, smaller),
-        )
-        for bad, quantity, label, value, remedy in cases:
-            if bool(bad.any()):
-                b, p = (int(n) for n in bad.nonzero()[0])
-                index = self.lattice.index
-                raise SimulationDiverged(
-                    step=self.first + step,
-                    time=(self.first + step) * self.scene.dt,
-                    particle=p if index is None else int((index == p).nonzero()[0]),
-                    quantity=f"{quantity} ({label} = {float(value[b, p]):.4g})",
-                    batch=b,
-                    remedy=remedy,
-                )
