@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchsoro.simulation.kernels.lane_contact import PLANE, meets, meets_adjoint, spread
+from torchsoro.simulation.kernels.lane_contact import meets_adjoint, spread
 from torchsoro.simulation.kernels.lane_laws import (
     cofactor,
     contract,
@@ -89,7 +89,25 @@ def add(a, at, value):
 
 @law
 def point_adjoint(
-    G, B, rates, at, numbers, n, past, before, bars, after, elements, maxwell, m, flags, softens, sums, number_sums, e_sums, s_sums
+    G,
+    B,
+    rates,
+    at,
+    numbers,
+    n,
+    past,
+    before,
+    bars,
+    after,
+    elements,
+    maxwell,
+    m,
+    flags,
+    softens,
+    sums,
+    number_sums,
+    e_sums,
+    s_sums,
 ):
     """Gradient by F of a point, stored in place of its gradient, from that by the stress, which is in B."""
     F = deformed(G, at)
@@ -102,7 +120,7 @@ def point_adjoint(
     there = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
     factor, left, solid = there, 0 * volume + 1, shear
     x, shrink, linear, square = 0 * volume, 0 * volume, 0 * volume, 0 * volume
-    below, largest, depth, reach = 0 * volume, 0 * volume, 0 * volume, 0 * volume + 1
+    below, _largest, depth, reach = 0 * volume, 0 * volume, 0 * volume, 0 * volume + 1
     end = 96 * elements
     if flags[0] or flags[1]:
         x, shrink = excess(F, larger(ratio, least))
@@ -221,6 +239,57 @@ def point_adjoint(
 
 
 @fast
+def gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates):
+    """Through the area vectors of a block's gas, at a pressure that is known."""
+    x, items, size, pairs = mesh.item_x[item], len(mesh.item_plane), 9 * mesh.patch, len(mesh.gas_chamber)
+    for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
+        chamber = mesh.gas_chamber[pair]
+        one = (g * items + item) * mesh.chambers + chamber
+        base = (g * pairs + pair) * 128
+        swept = load(work.swept, 16 * one)
+        step = 16 * ((t * case.groups + g) * mesh.chambers + chamber)
+        mine = 16 * (g * mesh.chambers + chamber)
+        stiffness, reference = load(case.air, 2 * mine), load(case.air, 2 * mine + 16)
+        pressure = chamber_pressure(load(case.pressure, step), stiffness, load(work.volumes, step), reference)
+        by_volume = load(sums.volume_bar, mine)
+        for k in range(8):
+            F, W, V = deformed(G, 144 * k), plain(B, 144 * k), load(case.gas, base + 16 * k)
+            cof = cofactor(F)
+            keep(rates, 1152 + 144 * k, cof, V)
+            pressed = contract(W, cof)
+            swept = swept + V * pressed
+            V_bar = pressure * pressed
+            if not last:
+                V_bar = V_bar + by_volume * load(sums.ratios, base + 16 * k)
+            add(sums.gas, base + 16 * k, V_bar)
+            store(sums.ratios, base + 16 * k, contract(cof, F) * (1 / 3))
+            keep(rates, 2304 + 144 * k, cross(F, W), pressure * V)
+        store(work.swept, 16 * one, swept)
+        scatter(mesh, b, x, work.areas, one * size, room, rates[1152:])
+        scatter(mesh, b, x, work.forces, (g * items + item) * size, room, rates[2304:])
+
+
+@fast
+def springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates):
+    """Through the springs of a block."""
+    x, out = mesh.item_x[item], (g * len(mesh.item_plane) + item) * 9 * mesh.patch
+    for k in range(8):
+        u = value(mesh, b, x, work.states, corner, k)
+        p0, p1, p2 = value(mesh, b, x, sums.pulls, force, k)
+        at = (g * len(mesh.block_at) + b) * 128 * ATTACHED + 16 * ATTACHED * k
+        w0, w1, w2 = stretch(u, case.attached, at)
+        spring = load(case.attached, at)
+        add(sums.attached, at, p0 * w0 + p1 * w1 + p2 * w2)
+        add(sums.attached, at + 16, spring * p0)
+        add(sums.attached, at + 32, spring * p1)
+        add(sums.attached, at + 48, spring * p2)
+        store(rates, 1152 + 48 * k, -spring * p0)
+        store(rates, 1152 + 48 * k + 16, -spring * p1)
+        store(rates, 1152 + 48 * k + 32, -spring * p2)
+    hand_on(mesh, b, x, work.forces, out, rates[1152:])
+
+
+@fast
 def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room, G, B, rates):
     """Gradients by the nodes' places of an item, from those by the forces."""
     items, size = len(mesh.item_plane), 9 * mesh.patch
@@ -239,53 +308,12 @@ def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room,
     x = mesh.item_x[item]
     blocks, each = len(mesh.block_at), 16 * case.history
     for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
-        y, z, at = mesh.block_y[b], mesh.block_z[b], mesh.block_at[b]
-        gather(
-            work.states, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
-            mesh.X, x, mesh.Y, y, mesh.Z, z, room, G,
-        )  # fmt: skip
-        gather(
-            sums.pulls, force + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
-            mesh.X, x, mesh.Y, y, mesh.Z, z, room, B,
-        )  # fmt: skip
+        gather(mesh, b, x, work.states, corner, room, G)
+        gather(mesh, b, x, sums.pulls, force, room, B)
         if case.flags[2]:
-            gather(
-                work.states, corner + at + 3 * mesh.component, mesh.component, mesh.plane, mesh.row, mesh.unit,
-                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates,
-            )  # fmt: skip
-        pairs = len(mesh.gas_chamber)
-        for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
-            chamber = mesh.gas_chamber[pair]
-            one = (g * items + item) * mesh.chambers + chamber
-            base = (g * pairs + pair) * 128
-            swept = load(work.swept, 16 * one)
-            step = 16 * ((t * case.groups + g) * mesh.chambers + chamber)
-            mine = 16 * (g * mesh.chambers + chamber)
-            pressure = chamber_pressure(
-                load(case.pressure, step), load(case.air, 2 * mine), load(work.volumes, step), load(case.air, 2 * mine + 16)
-            )
-            by_volume = load(sums.volume_bar, mine)
-            for k in range(8):
-                F, W, V = deformed(G, 144 * k), plain(B, 144 * k), load(case.gas, base + 16 * k)
-                cof = cofactor(F)
-                keep(rates, 1152 + 144 * k, cof, V)
-                pressed = contract(W, cof)
-                swept = swept + V * pressed
-                V_bar = pressure * pressed
-                if not last:
-                    V_bar = V_bar + by_volume * load(sums.ratios, base + 16 * k)
-                add(sums.gas, base + 16 * k, V_bar)
-                store(sums.ratios, base + 16 * k, contract(cof, F) * (1 / 3))
-                keep(rates, 2304 + 144 * k, cross(F, W), pressure * V)
-            store(work.swept, 16 * one, swept)
-            arguments = (mesh.X, x, mesh.Y, y, mesh.Z, z)
-            scatter(
-                work.areas, one * size + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
-                *arguments, room, rates[1152:],
-            )  # fmt: skip
-            scatter(
-                work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit, *arguments, room, rates[2304:]
-            )
+            gather(mesh, b, x, work.states, corner + 3 * mesh.component, room, rates)
+        if mesh.gas_begin[b] < mesh.gas_begin[b + 1]:
+            gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates)
         n = (g * blocks + b) * 128 * NUMBERS
         h = (g * blocks + b) * 8 * each
         e = (g * blocks + b) * 48 * case.elements
@@ -296,39 +324,11 @@ def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room,
                 sums.history_bar, h + each * k, case.elements, case.maxwell, m, case.flags, s,
                 sums, n + 16 * NUMBERS * k, e, (g * blocks + b) * 32,
             )  # fmt: skip
-        scatter(
-            work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
-            mesh.X, x, mesh.Y, y, mesh.Z, z, room, G,
-        )  # fmt: skip
+        scatter(mesh, b, x, work.forces, out, room, G)
         if case.flags[4]:
-            for k in range(8):
-                u = value(
-                    work.states, corner + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
-                    mesh.X, x, mesh.Y, y, mesh.Z, z, k,
-                )  # fmt: skip
-                p0, p1, p2 = value(
-                    sums.pulls, force + at, mesh.component, mesh.plane, mesh.row, mesh.unit,
-                    mesh.X, x, mesh.Y, y, mesh.Z, z, k,
-                )  # fmt: skip
-                s0 = (g * blocks + b) * 128 * ATTACHED + 16 * ATTACHED * k
-                w0, w1, w2 = stretch(u, case.attached, s0)
-                spring = load(case.attached, s0)
-                add(sums.attached, s0, p0 * w0 + p1 * w1 + p2 * w2)
-                add(sums.attached, s0 + 16, spring * p0)
-                add(sums.attached, s0 + 32, spring * p1)
-                add(sums.attached, s0 + 48, spring * p2)
-                store(rates, 1152 + 48 * k, -spring * p0)
-                store(rates, 1152 + 48 * k + 16, -spring * p1)
-                store(rates, 1152 + 48 * k + 32, -spring * p2)
-            hand_on(
-                work.forces, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
-                mesh.X, x, mesh.Y, y, mesh.Z, z, rates[1152:],
-            )  # fmt: skip
+            springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates)
         if case.flags[2]:
-            scatter(
-                sums.rates, out + at, mesh.patch, 3 * mesh.patch, mesh.row, mesh.unit,
-                mesh.X, x, mesh.Y, y, mesh.Z, z, room, rates,
-            )  # fmt: skip
+            scatter(mesh, b, x, sums.rates, out, room, rates)
 
 
 @fast
@@ -390,9 +390,17 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                 v2 = v2 + sum_items(sums.rates, mesh, first, size, p, 2, at)
         if sample >= 0:
             o = (sample * case.groups + g) * 6 * n + i
-            d0, d1, d2 = d0 + load(sums.seen_bar, o), d1 + load(sums.seen_bar, o + n), d2 + load(sums.seen_bar, o + 2 * n)
+            d0, d1, d2 = (
+                d0 + load(sums.seen_bar, o),
+                d1 + load(sums.seen_bar, o + n),
+                d2 + load(sums.seen_bar, o + 2 * n),
+            )
             o += 3 * n
-            v0, v1, v2 = v0 + load(sums.seen_bar, o), v1 + load(sums.seen_bar, o + n), v2 + load(sums.seen_bar, o + 2 * n)
+            v0, v1, v2 = (
+                v0 + load(sums.seen_bar, o),
+                v1 + load(sums.seen_bar, o + n),
+                v2 + load(sums.seen_bar, o + 2 * n),
+            )
         store(sums.bar, a, d0)
         store(sums.bar, a + n, d1)
         store(sums.bar, a + 2 * n, d2)
@@ -410,7 +418,24 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                 s = (t * case.groups + g) * 3 * n + i
                 u0, u1, u2 = load(work.pushed, s), load(work.pushed, s + n), load(work.pushed, s + 2 * n)
                 b0, b1, b2, c0, c1, c2, mass_bar = meets_adjoint(
-                    mesh, case, work.states, state, sums, g, i, light, moves, u0, u1, u2, b0, b1, b2, dt * d0, dt * d1, dt * d2
+                    mesh,
+                    case,
+                    work.states,
+                    state,
+                    sums,
+                    g,
+                    i,
+                    light,
+                    moves,
+                    u0,
+                    u1,
+                    u2,
+                    b0,
+                    b1,
+                    b2,
+                    dt * d0,
+                    dt * d1,
+                    dt * d2,
                 )
                 s = (((t % 2) * case.groups + g) * 3) * n + i
                 store(sums.surfaces, s, select(moves, c0, zero))

@@ -13,7 +13,7 @@ NORMAL, OFFSET, FRICTION, ADHESION, PLANE = 0, 3, 4, 5, 6  # numbers of a plane
 
 @law
 def dot(a0, a1, a2, b0, b1, b2):
-    """a . b."""
+    """A . b."""
     return a0 * b0 + a1 * b1 + a2 * b2
 
 
@@ -103,17 +103,14 @@ def meets(mesh, case, d, state, g, i, count, light, u0, u1, u2):
     for k in range(count):
         q = 16 * PLANE * (g * planes + k)
         n = mesh.component
-        node = (
-            dot(
-                load(d, state + i) + load(mesh.places, i),
-                load(d, state + i + n) + load(mesh.places, i + n),
-                load(d, state + i + 2 * n) + load(mesh.places, i + 2 * n),
-                load(case.plane_numbers, q),
-                load(case.plane_numbers, q + 16),
-                load(case.plane_numbers, q + 32),
-            )
-            - load(case.plane_numbers, q + 16 * OFFSET)
-        )
+        node = dot(
+            load(d, state + i) + load(mesh.places, i),
+            load(d, state + i + n) + load(mesh.places, i + n),
+            load(d, state + i + 2 * n) + load(mesh.places, i + 2 * n),
+            load(case.plane_numbers, q),
+            load(case.plane_numbers, q + 16),
+            load(case.plane_numbers, q + 32),
+        ) - load(case.plane_numbers, q + 16 * OFFSET)
         near = node < LOOK * case.spacing
         if any_lane(near):
             _, gap, n0, n1, n2 = surface_gap(mesh, case, d, state, g, i, q)
@@ -121,9 +118,7 @@ def meets(mesh, case, d, state, g, i, count, light, u0, u1, u2):
             hold = load(case.plane_numbers, q + 16 * ADHESION) * area * dt * light
             hold = select(gap < CONTACT_DISTANCE * case.spacing, hold, 0 * hold - 1)
             friction = load(case.plane_numbers, q + 16 * FRICTION)
-            r0, r1, r2, p0, p1, p2 = lands(
-                u0, u1, u2, n0, n1, n2, gap, dt, case.plane_stick[k], friction, hold
-            )
+            r0, r1, r2, p0, p1, p2 = lands(u0, u1, u2, n0, n1, n2, gap, dt, case.plane_stick[k], friction, hold)
             u0, u1, u2 = select(near, r0, u0), select(near, r1, u1), select(near, r2, u2)
             zero = 0 * p0
             o0, o1, o2 = o0 + select(near, p0, zero), o1 + select(near, p1, zero), o2 + select(near, p2, zero)

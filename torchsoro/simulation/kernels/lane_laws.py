@@ -39,7 +39,7 @@ def inverse_cube_root(x):
 
 @law
 def cofactor(F):
-    """det F F^-T."""
+    """Det F F^-T."""
     return (
         F[4] * F[8] - F[5] * F[7],
         F[5] * F[6] - F[3] * F[8],
@@ -80,7 +80,7 @@ def contract(A, B):
 
 @law
 def plus(a, A, b, B):
-    """a A + b B."""
+    """A A + b B."""
     return (
         a * A[0] + b * B[0], a * A[1] + b * B[1], a * A[2] + b * B[2],
         a * A[3] + b * B[3], a * A[4] + b * B[4], a * A[5] + b * B[5],
@@ -116,7 +116,7 @@ def right_cauchy_green(F):
 
 @law
 def symmetric_cofactor(C):
-    """det C C^-1."""
+    """Det C C^-1."""
     return (
         C[1] * C[2] - C[4] * C[4],
         C[0] * C[2] - C[5] * C[5],
@@ -144,7 +144,7 @@ def fade(ratio, least):
 
 @law
 def excess(F, J):
-    """x = I1b - 3, at least 0, and J^(-2/3)."""
+    """X = I1b - 3, at least 0, and J^(-2/3)."""
     root = inverse_cube_root(J)
     return larger(root * root * contract(F, F) - 3, 0.0), root * root
 
@@ -189,7 +189,9 @@ def pull_back_adjoint(F, cof, ratio, least, B):
     )
     spread = B[0] + B[1] + B[2]
     J_bar = select(
-        ratio < least, slope * (spread * back - trace * along), share * (3 * trace * along * back - spread * back * back)
+        ratio < least,
+        slope * (spread * back - trace * along),
+        share * (3 * trace * along * back - spread * back * back),
     )
     return plus(2 * share, times(F, D), J_bar, cof)
 
@@ -273,9 +275,7 @@ def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
     )
     by_bulk, by_shear = pressure_bar * volumetric, alpha_bar * shrink
     void_work = stretch - slope * along
-    void_bar = select(
-        void_fraction < 1, shear[1] * void_work - (bulk * by_bulk + shear[0] * by_shear), 0 * void_work
-    )
+    void_bar = select(void_fraction < 1, shear[1] * void_work - (bulk * by_bulk + shear[0] * by_shear), 0 * void_work)
     return (
         F_bar,
         Q_bar,

@@ -36,16 +36,28 @@ MAXWELL = 3
 
 
 @law
-def gather(field, at, component, sx, sy, unit, X, x, Y, y, Z, z, room, G):
-    """Gradient of a nodal vector field: G [8, 9, 16], derivatives of each component by x, y, z."""
+def gather(mesh, b, x, field, at, room, G):
+    """Gradient of a nodal vector field: G [8, 9, 16], derivatives of each component by x, y, z.
+
+    Args:
+        mesh: Cells and nodes.
+        b: Number of the block.
+        x: Where the weights along x begin.
+        field: Nodal field, whose plane of the block's lowest nodes begins at ``at``.
+        at: See ``field``.
+        room: For the function's own use.
+        G: Filled.
+    """
+    X, Y, Z, y, z, unit = mesh.X, mesh.Y, mesh.Z, mesh.block_y[b], mesh.block_z[b], mesh.unit
+    at += mesh.block_at[b]
     y00, y01, y02 = load(Y, y), load(Y, y + 16), load(Y, y + 32)
     y10, y11, y12 = load(Y, y + 48), load(Y, y + 64), load(Y, y + 80)
     s00, s01, s02 = load(Y, y + 96), load(Y, y + 112), load(Y, y + 128)
     s10, s11, s12 = load(Y, y + 144), load(Y, y + 160), load(Y, y + 176)
     for c in range(3):
         for i in range(3):
-            b0 = at + c * component + i * sx
-            b1, b2 = b0 + sy, b0 + 2 * sy
+            b0 = at + c * mesh.component + i * mesh.plane
+            b1, b2 = b0 + mesh.row, b0 + 2 * mesh.row
             a00, a01, a02 = load(field, b0), load(field, b0 + unit), load(field, b0 + 2 * unit)
             a10, a11, a12 = load(field, b1), load(field, b1 + unit), load(field, b1 + 2 * unit)
             a20, a21, a22 = load(field, b2), load(field, b2 + unit), load(field, b2 + 2 * unit)
@@ -83,41 +95,45 @@ def gather(field, at, component, sx, sy, unit, X, x, Y, y, Z, z, room, G):
 
 
 @law
-def scatter(out, at, component, slot, sy, unit, X, x, Y, y, Z, z, room, P):
+def scatter(mesh, b, x, out, at, room, P):
     """Add what the points hand to the nodes, sum P grad N, with P as G of :func:`gather`.
 
-    Blocks of cells share nodes with themselves: what goes to a node from three lanes is added one after the other.
+    Blocks of cells share nodes with themselves: what goes to a node from three lanes is added one after the other. ``out`` is a patch of three planes from ``at`` on.
     """
+    X, Y, Z, y, z, unit = mesh.X, mesh.Y, mesh.Z, mesh.block_y[b], mesh.block_z[b], mesh.unit
+    at += mesh.block_at[b]
     for c in range(3):
         for i in range(3):
             w0, w1, s0, s1 = X[x + i], X[x + 3 + i], X[x + 6 + i], X[x + 9 + i]
-            for yz in range(4):
-                p, q = 16 * (9 * yz + 3 * c), 16 * (9 * (4 + yz) + 3 * c)
-                r = 48 * yz
-                store(room, r, s0 * load(P, p) + s1 * load(P, q))
-                store(room, r + 16, w0 * load(P, p + 16) + w1 * load(P, q + 16))
-                store(room, r + 32, w0 * load(P, p + 32) + w1 * load(P, q + 32))
+            p = 48 * c
+            a00, a01 = s0 * load(P, p) + s1 * load(P, p + 576), s0 * load(P, p + 144) + s1 * load(P, p + 720)
+            a10, a11 = s0 * load(P, p + 288) + s1 * load(P, p + 864), s0 * load(P, p + 432) + s1 * load(P, p + 1008)
+            p += 16
+            b00, b01 = w0 * load(P, p) + w1 * load(P, p + 576), w0 * load(P, p + 144) + w1 * load(P, p + 720)
+            b10, b11 = w0 * load(P, p + 288) + w1 * load(P, p + 864), w0 * load(P, p + 432) + w1 * load(P, p + 1008)
+            p += 16
+            c00, c01 = w0 * load(P, p) + w1 * load(P, p + 576), w0 * load(P, p + 144) + w1 * load(P, p + 720)
+            c10, c11 = w0 * load(P, p + 288) + w1 * load(P, p + 864), w0 * load(P, p + 432) + w1 * load(P, p + 1008)
             for j in range(3):
                 y0, y1 = load(Y, y + 16 * j), load(Y, y + 48 + 16 * j)
                 t0, t1 = load(Y, y + 96 + 16 * j), load(Y, y + 144 + 16 * j)
-                a0 = y0 * load(room, 0) + y1 * load(room, 96) + t0 * load(room, 16) + t1 * load(room, 112)
-                a1 = y0 * load(room, 48) + y1 * load(room, 144) + t0 * load(room, 64) + t1 * load(room, 160)
-                b0 = y0 * load(room, 32) + y1 * load(room, 128)
-                b1 = y0 * load(room, 80) + y1 * load(room, 176)
-                r = 16 * (12 + 27 * c + 9 * i + 3 * j)
+                a0, a1 = y0 * a00 + y1 * a10 + t0 * b00 + t1 * b10, y0 * a01 + y1 * a11 + t0 * b01 + t1 * b11
+                b0, b1 = y0 * c00 + y1 * c10, y0 * c01 + y1 * c11
+                r = 16 * (27 * c + 9 * i + 3 * j)
                 for k in range(3):
                     z0, z1 = load(Z, z + 16 * k), load(Z, z + 48 + 16 * k)
                     d0, d1 = load(Z, z + 96 + 16 * k), load(Z, z + 144 + 16 * k)
                     store(room, r + 16 * k, z0 * a0 + z1 * a1 + d0 * b0 + d1 * b1)
+    # Neighbours overlap: what is written is not read again before it has arrived.
     for k in range(3):
-        for i in range(3):
-            for c in range(3):
-                for j in range(3):
-                    o = at + i * slot + c * component + j * sy + k * unit
-                    store(out, o, load(out, o) + load(room, 16 * (12 + 27 * c + 9 * i + 3 * j + k)))
+        for j in range(3):
+            for i in range(3):
+                for c in range(3):
+                    o = at + (3 * i + c) * mesh.patch + j * mesh.row + k * unit
+                    store(out, o, load(out, o) + load(room, 16 * (27 * c + 9 * i + 3 * j + k)))
 
 
-ROOM = 16 * 93  # numbers that gather and scatter need for themselves
+ROOM = 16 * 84  # numbers that gather and scatter need for themselves
 
 
 @law
@@ -155,7 +171,7 @@ def keep(P, at, T, scale):
 
 @law
 def volume_ratio(F):
-    """det F."""
+    """Det F."""
     return F[0] * (F[4] * F[8] - F[5] * F[7]) + F[1] * (F[5] * F[6] - F[3] * F[8]) + F[2] * (F[3] * F[7] - F[4] * F[6])
 
 
@@ -261,38 +277,41 @@ STIFFNESS, ANCHOR, ATTACHED = 0, 1, 4  # numbers of a spring: stiffness, way of 
 
 
 @law
-def value(field, at, component, sx, sy, unit, X, x, Y, y, Z, z, k):
-    """A nodal vector field at point k of a block."""
+def value(mesh, b, x, field, at, k):
+    """A nodal vector field at point k of a block; see :func:`gather`."""
+    X, Y, Z, y, z = mesh.X, mesh.Y, mesh.Z, mesh.block_y[b], mesh.block_z[b]
+    at += mesh.block_at[b]
     ox, oy, oz = 3 * (k // 4), 48 * (k // 2 % 2), 48 * (k % 2)
     u0, u1, u2 = 0 * load(Y, y), 0 * load(Y, y), 0 * load(Y, y)
     for i in range(3):
         for j in range(3):
             weight = X[x + ox + i] * load(Y, y + oy + 16 * j)
-            for l in range(3):
-                w, o = weight * load(Z, z + oz + 16 * l), at + i * sx + j * sy + l * unit
-                u0, u1, u2 = (
-                    u0 + w * load(field, o),
-                    u1 + w * load(field, o + component),
-                    u2 + w * load(field, o + 2 * component),
-                )
+            for n in range(3):
+                w = weight * load(Z, z + oz + 16 * n)
+                o = at + i * mesh.plane + j * mesh.row + n * mesh.unit
+                u0 = u0 + w * load(field, o)
+                u1 = u1 + w * load(field, o + mesh.component)
+                u2 = u2 + w * load(field, o + 2 * mesh.component)
     return u0, u1, u2
 
 
 @law
-def hand_on(out, at, component, slot, sy, unit, X, x, Y, y, Z, z, V):
-    """Add vectors V [8, 3, 16] of the points to the nodes."""
-    for l in range(3):
+def hand_on(mesh, b, x, out, at, V):
+    """Add vectors V [8, 3, 16] of the points to the nodes; see :func:`scatter`."""
+    X, Y, Z, y, z = mesh.X, mesh.Y, mesh.Z, mesh.block_y[b], mesh.block_z[b]
+    at += mesh.block_at[b]
+    for n in range(3):
         for i in range(3):
             for j in range(3):
-                o = at + i * slot + j * sy + l * unit
+                o = at + 3 * i * mesh.patch + j * mesh.row + n * mesh.unit
                 f0, f1, f2 = 0 * load(V, 0), 0 * load(V, 0), 0 * load(V, 0)
                 for k in range(8):
                     w = X[x + 3 * (k // 4) + i] * load(Y, y + 48 * (k // 2 % 2) + 16 * j)
-                    w = w * load(Z, z + 48 * (k % 2) + 16 * l)
+                    w = w * load(Z, z + 48 * (k % 2) + 16 * n)
                     f0, f1, f2 = f0 + w * load(V, 48 * k), f1 + w * load(V, 48 * k + 16), f2 + w * load(V, 48 * k + 32)
                 store(out, o, load(out, o) + f0)
-                store(out, o + component, load(out, o + component) + f1)
-                store(out, o + 2 * component, load(out, o + 2 * component) + f2)
+                store(out, o + mesh.patch, load(out, o + mesh.patch) + f1)
+                store(out, o + 2 * mesh.patch, load(out, o + 2 * mesh.patch) + f2)
 
 
 @law

@@ -66,7 +66,9 @@ def _splat(builder: Any, value: Any) -> Any:
     if isinstance(value, ir.Constant):
         return ir.Constant(kind, [value.constant] * LANES)
     one = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.IntType(32)(0))
-    return builder.shuffle_vector(one, ir.Constant(kind, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES))
+    return builder.shuffle_vector(
+        one, ir.Constant(kind, ir.Undefined), ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    )
 
 
 @lower_cast(types.Number, Vector)
@@ -130,7 +132,13 @@ def _comparison(op: Any, text: str) -> None:
     lower_builtin(op, Vector, Vector)(lower)
 
 
-for _op, _name in ((operator.lt, "<"), (operator.le, "<="), (operator.gt, ">"), (operator.ge, ">="), (operator.eq, "==")):
+for _op, _name in (
+    (operator.lt, "<"),
+    (operator.le, "<="),
+    (operator.gt, ">"),
+    (operator.ge, ">="),
+    (operator.eq, "=="),
+):
     _comparison(_op, _name)
 
 

@@ -57,6 +57,18 @@ def numbers(t: Tensor) -> np.ndarray:
     return (flat if len(flat) else flat.new_zeros(16)).numpy()
 
 
+def aligned(count: int, dtype: np.dtype) -> np.ndarray:
+    """Zeros that begin with a cache line."""
+    wide = np.zeros(count + LANES, dtype)
+    first = -wide.ctypes.data % 64 // wide.itemsize
+    return wide[first : first + count]
+
+
+def kept_memory(like: Tensor, *shape: int) -> Tensor:
+    """Memory that is not initialised, in huge pages where there are any: first use of a small page takes a microsecond."""
+    return torch.from_numpy(np.empty(shape, numbers(like).dtype))
+
+
 class LaneIntegrator:
     """One segment in lanes: the counterpart of ``total.TotalSegmentIntegrator``.
 
@@ -186,8 +198,8 @@ class LaneIntegrator:
         mesh, lanes, nodes, groups = self.mesh, self.lanes, self.lattice.nodes, self.lanes.groups
         ring, past = (self.steps + 1, self.steps + 1) if keep else (2, 1)
         size, points = 6 * mesh.component, len(mesh.block_at) * 128 * self.history
-        states = start.new_empty(ring, lanes.groups, size)
-        histories = start.new_empty(past, lanes.groups, points)
+        states = kept_memory(start, ring, lanes.groups, size)
+        histories = kept_memory(start, past, lanes.groups, points)
         states[0] = lanes.from_nodes(start[:, : 6 * nodes].view(self.batch, 6, nodes)).view(lanes.groups, size)
         if not keep:
             states[1] = states[0]
@@ -201,7 +213,8 @@ class LaneIntegrator:
         at[inner] = np.arange(len(inner))
         seen = start.new_zeros(len(inner), lanes.groups, 6, mesh.component)
         slots = self.steps if keep else 1
-        pushed = start.new_empty(slots if len(self.case.plane_stick) and keep else 0, lanes.groups, 3, mesh.component)
+        touching = slots if len(self.case.plane_stick) and keep else 0
+        pushed = kept_memory(start, touching, groups, 3, mesh.component)
         self._clear_ends(pushed)
         volumes = start.new_zeros(slots, groups, mesh.chambers, LANES)
         threads = thread_count()
@@ -249,7 +262,7 @@ class LaneIntegrator:
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),
-            scratch=np.zeros(threads * SCRATCH, numbers(like).dtype),
+            scratch=aligned(threads * SCRATCH, numbers(like).dtype),
         )
 
     def _joined(self, state: Tensor, history: Tensor) -> Tensor:
@@ -297,7 +310,7 @@ class LaneIntegrator:
         Returns:
             Gradients by the tensors of ``Inputs``.
         """
-        i, lanes, mesh, steps = self.inputs, self.lanes, self.mesh, self.steps
+        _i, lanes, mesh, steps = self.inputs, self.lanes, self.mesh, self.steps
         nodes, groups, blocks = self.lattice.nodes, lanes.groups, len(mesh.block_at)
         states, histories, pushed, volumes = self.kept
         at = np.full(steps + 1, -1)
@@ -368,7 +381,9 @@ class LaneIntegrator:
         by_point[:, 3, gas] = 0
         found[:, _NUMBERS] = by_point
         if len(lanes.pairs):
-            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(groups, -1, 8, LANES)
+            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(
+                groups, -1, 8, LANES
+            )
             wide = c.new_zeros(groups, blocks, 8, 1, LANES)
             wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
             found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import defaultdict
 from dataclasses import dataclass
@@ -103,7 +104,7 @@ class Lanes:
 
     def from_nodes(self, values: Tensor) -> Tensor:
         """Values by node [B, K, nodes] as [groups, K, component]."""
-        batch, count, _ = values.shape
+        _batch, count, _ = values.shape
         found = values.new_zeros(self.groups, count, self.mesh.component)
         if self.variations:
             at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
@@ -191,7 +192,13 @@ def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> L
     for layer in layers:
         begin = len(blocks)
         if variations:
-            found = [(int(first[1][y]) * row + int(first[2][z]) * unit, [(lane, np.array((x, y, z))) for lane in range(LANES)]) for x, y, z in layer]
+            found = [
+                (
+                    int(first[1][y]) * row + int(first[2][z]) * unit,
+                    [(lane, np.array((x, y, z))) for lane in range(LANES)],
+                )
+                for x, y, z in layer
+            ]
         else:
             found = _blocks(layer, row, first)
         for at, lanes in found:
@@ -205,7 +212,7 @@ def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> L
             Y.setdefault(y.tobytes(), len(Y)), Z.setdefault(z.tobytes(), len(Z))
         count = len(blocks) - begin
         cuts = [begin + count * k // min(parts, count) for k in range(min(parts, count) + 1)]
-        items += [(int(layer[0, 0]), a, b) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
+        items += [(int(layer[0, 0]), a, b) for a, b in itertools.pairwise(cuts)]
 
     points = np.stack([where for _, where, _, _ in blocks])
     flat = kind.cpu().numpy()
