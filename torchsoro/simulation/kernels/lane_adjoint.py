@@ -1,7 +1,7 @@
 """The substep in lanes, backwards: points, nodes, and the threads that share them.
 
-The adjoint state lies in one buffer that each pass overwrites in place. A pass over nodes finishes the sums over substep
-t + 1 and begins substep t. What ``Sums`` collects is by point or by node, so that no two threads meet.
+The adjoint state lies in one buffer that each pass overwrites in place. A pass over nodes finishes the sums over
+substep t + 1 and begins substep t. What ``Sums`` collects is by point or by node, so that no two threads meet.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Substeps of the total-Lagrangian form in lanes: points, nodes, and the threads that share them.
 
-Cells are dealt with in items, each a part of a layer of cells across x, which sums forces in a buffer of its own over the
-three planes of nodes that the layer touches; nodes then sum over the items of their plane in a fixed order. So nothing is
-added by two threads at once, and results do not depend on the number of threads.
+Cells are dealt with in items, each a part of a layer of cells across x, which sums forces in a buffer of its own over
+the three planes of nodes that the layer touches; nodes then sum over the items of their plane in a fixed order. So
+nothing is added by two threads at once, and results do not depend on the number of threads.
 """
 
 from __future__ import annotations

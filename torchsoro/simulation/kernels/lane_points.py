@@ -1,9 +1,9 @@
 """What a block of sixteen lanes does: gradients of a nodal field at the points, stress, forces on the nodes.
 
-A block is one cell in sixteen variations, or sixteen cells whose lowest nodes follow each other in a plane of nodes. In
-both cases what lane l reads of node (i, j, k) of its cell lies at ``i sx + j sy + k unit`` from the block's own place, l
-numbers further, so that one text serves both: ``unit`` is 16 between two nodes along z, or 1. A cell has 2 x 2 x 2
-points, x slowest, and 3 x 3 x 3 nodes; sums are taken axis by axis.
+A block is one cell in sixteen variations, or sixteen cells whose lowest nodes follow each other in a plane of nodes.
+In both cases what lane l reads of node (i, j, k) of its cell lies at ``i plane + j row + k unit`` from the block's own
+place, l numbers further, so that one text serves both: ``unit`` is 16 between two nodes along z, or 1. A cell has
+2 x 2 x 2 points, x slowest, and 3 x 3 x 3 nodes; sums are taken axis by axis.
 
 Weights of an axis are 6 numbers, of nodes 0, 1, 2 at the first and at the second point, and 6 slopes: scalars along x,
 lanes along y and z.
@@ -98,7 +98,8 @@ def gather(mesh, b, x, field, at, room, G):
 def scatter(mesh, b, x, out, at, room, P):
     """Add what the points hand to the nodes, sum P grad N, with P as G of :func:`gather`.
 
-    Blocks of cells share nodes with themselves: what goes to a node from three lanes is added one after the other. ``out`` is a patch of three planes from ``at`` on.
+    Blocks of cells share nodes with themselves: what goes to a node from three lanes is added one after the other.
+    ``out`` is a patch of three planes from ``at`` on.
     """
     X, Y, Z, y, z, unit = mesh.X, mesh.Y, mesh.Z, mesh.block_y[b], mesh.block_z[b], mesh.unit
     at += mesh.block_at[b]
@@ -220,9 +221,15 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
         G: Displacement gradients, then stresses.
         rates: Velocity gradients, read where there is viscosity.
         at: Of the point in both.
-        numbers: Of the points, from ``n``.
-        past: History, from ``before``; ``future`` from ``after``: Z of each Maxwell element, then the largest x.
-        elements: Number of Maxwell elements, whose numbers are ``maxwell`` from ``m``.
+        numbers: Of the points.
+        n: Where the point's begin.
+        past: History: Z of each Maxwell element, then the largest x.
+        before: Where the point's begins.
+        future: The same after the substep.
+        after: Where the point's begins.
+        elements: Number of Maxwell elements.
+        maxwell: Their numbers.
+        m: Where those of the simulation begin.
         flags: Whether anything stiffens, softens or is viscous.
         softens: Depth and range of softening, lanes.
     """

@@ -1,4 +1,4 @@
-"""A barrier for threads that march through a simulation together, some microseconds between one meeting and the next."""
+"""A barrier for threads that march through a simulation together, meeting every few microseconds."""
 
 from __future__ import annotations
 

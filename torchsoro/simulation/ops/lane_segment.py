@@ -21,6 +21,7 @@ from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
+from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.threads import thread_count
 
@@ -62,11 +63,6 @@ def aligned(count: int, dtype: np.dtype) -> np.ndarray:
     wide = np.zeros(count + LANES, dtype)
     first = -wide.ctypes.data % 64 // wide.itemsize
     return wide[first : first + count]
-
-
-def kept_memory(like: Tensor, *shape: int) -> Tensor:
-    """Memory that is not initialised, in huge pages where there are any: first use of a small page takes a microsecond."""
-    return torch.from_numpy(np.empty(shape, numbers(like).dtype))
 
 
 class LaneIntegrator:
