@@ -19,7 +19,7 @@ from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
-from torchsoro.simulation.kernels.simd_cells import remove_stale_code
+from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
 from torchsoro.simulation.material import Prony
 

@@ -2,7 +2,7 @@
 
 A kernel that is written with it is the same text for one lane as for sixteen, and does not depend on what a compiler
 recognises in loops. Numbers mix with vectors as in formulas: ``2 * x + y``. There are no branches by lane: ``select``
-takes one of two values. Operations may be fused and reordered when they are compiled, never at run time.
+takes one of two values. A product and a sum may become one instruction; nothing else is reordered.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.core.typeconv import Conversion
+from numba.core.typeconv.castgraph import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
 LANES = 16
-FLAGS = ("nsz", "arcp", "contract", "reassoc")
+FLAGS = ("nsz", "arcp", "contract")
 
 
 class Vector(types.Type):

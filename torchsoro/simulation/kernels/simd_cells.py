@@ -8,10 +8,6 @@ are those of ``stress``, with ln J and J^(-2/3) as series.
 
 from __future__ import annotations
 
-import contextlib
-import functools
-from pathlib import Path
-
 import numpy as np
 from numba import njit
 
@@ -22,20 +18,6 @@ OPTIONS = {"fastmath": True, "boundscheck": False, "error_model": "numpy", "nogi
 fast = njit(**OPTIONS)
 inlined = njit(**OPTIONS, forceinline=True)  # what a lane's loop calls, which then is still done for all lanes at once
 f32 = np.float32
-
-
-@functools.cache
-def remove_stale_code() -> None:
-    """Remove compiled code that is older than a source, once in a process, before the first kernel is called.
-
-    Numba by itself compares the file of the outermost function only.
-    """
-    here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in (here.parent / "laws.py", *here.glob("*.py")))
-    for index in here.glob("__pycache__/*.nbi"):
-        with contextlib.suppress(OSError):
-            if index.stat().st_mtime < newest:
-                index.unlink()
 
 
 @fast

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.lane_adjoint import Sums, march_back
 from torchsoro.simulation.kernels.lane_contact import PLANE
 from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, Work, march
@@ -77,6 +78,7 @@ class LaneIntegrator:
 
     def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
         assert scene.lattice is not None
+        remove_stale_code()
         self.scene, self.inputs, self.first, self.samples = scene, inputs, first, samples
         self.lattice = scene.lattice
         self.steps = inputs.gravity.shape[0]

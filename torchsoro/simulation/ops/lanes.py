@@ -209,7 +209,8 @@ def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> L
                 where[:, lane] = np.where(there, numbers[tuple(cell)], -1)
                 y[:, lane], z[:, lane] = tables[1].numbers[cell[1]], tables[2].numbers[cell[2]]
             blocks.append((at, where, y.tobytes(), z.tobytes()))
-            Y.setdefault(y.tobytes(), len(Y)), Z.setdefault(z.tobytes(), len(Z))
+            Y.setdefault(y.tobytes(), len(Y))
+            Z.setdefault(z.tobytes(), len(Z))
         count = len(blocks) - begin
         cuts = [begin + count * k // min(parts, count) for k in range(min(parts, count) + 1)]
         items += [(int(layer[0, 0]), a, b) for a, b in itertools.pairwise(cuts)]

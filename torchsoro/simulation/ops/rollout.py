@@ -142,7 +142,7 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     if not keep:
         record = integrator.record(integrator.forward(state, keep=True, observe=lambda k, s: None))
         integrator.samples = tuple(samples)
-    states = integrator.restore(record)
+    states: Any = integrator.restore(record)
     bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
     weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(inputs.coefficients)
     pressure_bar = torch.zeros_like(inputs.pressure)
