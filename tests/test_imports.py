@@ -22,6 +22,7 @@ errors
 storage command_line
 simulation.laws simulation.axis
 simulation.kernels
+simulation.threads
 simulation.runtime
 simulation.ops
 simulation

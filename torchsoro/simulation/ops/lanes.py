@@ -16,7 +16,7 @@ from torch import Tensor
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.kernels.lane_march import Mesh
 from torchsoro.simulation.kernels.lanes import LANES
-from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice, spline
+from torchsoro.simulation.ops.lattice import Lattice
 
 PARTS = 16  # items of a body, at least: as many threads have something to do
 
@@ -29,13 +29,7 @@ class _Table(NamedTuple):
 
 
 def _tables(lattice: Lattice) -> list[_Table]:
-    found = []
-    for count in lattice.points:
-        weight, _, slope = (a.numpy() for a in spline(count, QUADRATURE))
-        cells = np.arange(count // 2)
-        rows = [m[2 * cells + o, cells + k] for m in (weight, slope / lattice.cell) for o in range(2) for k in range(3)]
-        found.append(_Table(cells, np.stack(rows, 1)))
-    return found
+    return [_Table(a.first, np.concatenate([t.reshape(a.cells, 6) for t in a.table], 1)) for a in lattice.axes]
 
 
 @dataclass(frozen=True, eq=False)
