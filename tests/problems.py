@@ -182,6 +182,7 @@ def problem(
     share[:, kind == layout.ABSENT] = 0
     # The ground sticks or slides, and holds a little; a wall is adhesive and slides, another holds what is near it.
     planes = torch.tensor([[5.0, 0.3, 0.1 * total], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
+    planes = torch.cat([planes, torch.zeros(3, 1), torch.eye(3)[[2, 0, 1]]], 1).double()
     tensors = {
         "coefficients": coefficients,
         "prony": rand(batch, elements, layout.PRONY),
@@ -210,7 +211,7 @@ def problem(
         high=(reach, reach, reach),
         kind=kind,
         share=share.to(dtype),
-        plane_kind=torch.tensor([[2, 1, int(stick)], [0, -1, 0], [1, 1, 0]], dtype=torch.int32),
+        plane_kind=torch.tensor([[2, 1, int(stick), 0], [0, -1, 0, 0], [1, 1, 0, 0]], dtype=torch.int32),
         springs=True,
         viscous=True,
         stiffens=True,

@@ -98,8 +98,8 @@ def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int
 
 
 def drawn_planes(robot: Robot) -> tuple[tuple[int, float, int], ...]:
-    """The robot's planes as pictures take them: axis, place, free side."""
-    return tuple((plane.axis, float(plane.offset), plane.side) for plane in robot.planes)
+    """The robot's planes as pictures take them, oblique ones left out: axis, place, free side."""
+    return tuple((plane.axis, float(plane.offset), plane.side) for plane in robot.planes if plane.axis is not None)
 
 
 def deliver(

@@ -4,81 +4,148 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from torchsoro.simulation.kernels import layout
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plane:
-    """An axis-aligned plane; the body stays on its free side.
+    """A plane; the body stays on its free side.
 
     In the updated formulation contact acts on grid nodes on and behind the plane. The grid is laid so that a layer of
     nodes lies on the first plane of each axis, wherever that is; a further plane of the same axis should be a whole
-    number of cells away. In the total one it acts on the surface of the body, at any distance of planes.
+    number of cells away. In the total one it acts on the surface of the body, at any distance and slope of planes.
 
     Attributes:
-        axis: 0, 1 or 2: the plane's normal is x, y or z.
-        offset: Where it cuts the axis [m], a number or a tensor [...]; in the updated formulation its gradient
-            is that of shifting the grid, and a further plane of the same axis has none.
-        side: +1 if the body lies on the positive side, else -1.
+        axis: 0, 1 or 2: the plane's normal is x, y or z. None for a plane with a ``normal``.
+        normal: [..., 3] of any length, to the body's side, numbers or a tensor; total formulation only.
+        offset: Where it cuts the axis [m], or how far it is from the origin along its normal; a number or a tensor
+            [...]. In the updated formulation its gradient is that of shifting the grid, and a further plane of the same
+            axis has none.
+        side: +1 if the body lies on the positive side of an axis, else -1.
         friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
         adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
             [...].
+        reach: Distance within which adhesion also pulls surfaces that do not touch [m], number or tensor [...] without
+            gradient; total formulation only.
+        landing: "inelastic", or "elastic"; total formulation only. Nodes that land inelastically stop on the plane and
+            lose their energy: a share of the blow that shrinks with the cells. Elastically they meet springs behind the
+            plane, with half of a node's mass over the square of the step, and keep energy, but for friction, stick and
+            adhesion; under a load they stand a little behind the plane, and without damping they do not come to rest.
 
     Raises:
-        ValueError: for an axis, side, friction or adhesion out of range.
+        ValueError: for an axis, normal, side, friction, adhesion, reach or landing out of range.
     """
 
-    axis: int
+    axis: int | None = None
+    normal: Sequence[float] | Tensor | None = None
     offset: float | Tensor = 0.0
     side: int = 1
     friction: str | float | Tensor = "stick"
     adhesion: float | Tensor = 0.0
+    reach: float | Tensor = 0.0
+    landing: Literal["inelastic", "elastic"] = "inelastic"
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.axis not in (0, 1, 2):
-            raise ValueError(f"axis = {self.axis!r}: wanted 0 (x), 1 (y) or 2 (z)")
+        if self.normal is None:
+            if self.axis not in (0, 1, 2):
+                raise ValueError(f"axis = {self.axis!r}: wanted 0 (x), 1 (y) or 2 (z), or a normal")
+        elif self.axis is not None or self.side != 1:
+            raise ValueError(
+                f"axis = {self.axis!r}, side = {self.side!r}: wanted neither beside a normal, which points to the body"
+            )
+        else:
+            normal = torch.as_tensor(self.normal).detach()
+            if normal.shape[-1:] != (3,) or not bool(torch.isfinite(normal).all() & (normal != 0).any(-1).all()):
+                raise ValueError(f"normal = {self.normal}: wanted [..., 3], finite and not zero")
         if self.side not in (1, -1):
             raise ValueError(f"side = {self.side!r}: wanted +1 or -1")
+        if self.landing not in ("inelastic", "elastic"):
+            raise ValueError(f"landing = {self.landing!r}: wanted 'inelastic' or 'elastic'")
         if isinstance(self.friction, str) and self.friction != "stick":
             raise ValueError(f"friction = {self.friction!r}: wanted 'stick' or a coefficient of at least 0")
-        for name in ("friction", "adhesion", "offset"):
+        for name in ("friction", "adhesion", "reach", "offset"):
             value = getattr(self, name)
             if not isinstance(value, str):
                 least = -torch.inf if name == "offset" else 0.0
                 number = torch.as_tensor(value).detach()
                 if not bool((torch.isfinite(number) & (number >= least)).all()):
                     raise ValueError(f"{name} = {value}: wanted finite{'' if name == 'offset' else ' and at least 0'}")
+        if isinstance(self.reach, Tensor) and self.reach.requires_grad:
+            raise ValueError("reach: requires a gradient, but adhesion begins at once within its reach; wanted none")
 
     @property
     def sticks(self) -> bool:
         """Whether the plane holds what is pressed on it."""
         return isinstance(self.friction, str)
 
-    def numbers(self) -> tuple[float | Tensor, float | Tensor, float | Tensor]:
-        """Offset, Coulomb coefficient (0 where it sticks) and adhesion, as kernels take them."""
-        return self.offset, 0.0 if isinstance(self.friction, str) else self.friction, self.adhesion
+    @classmethod
+    def through(cls, point: Sequence[float] | Tensor, *, normal: Sequence[float] | Tensor, **settings) -> Plane:
+        """The plane through a point [..., 3] m with a normal [..., 3]; further arguments as of the class."""
+        at, n = torch.as_tensor(point), torch.as_tensor(normal)
+        offset = (at * n).sum(-1) / torch.linalg.vector_norm(n, dim=-1) if n.shape[-1:] == at.shape[-1:] == (3,) else at
+        return cls(normal=normal, offset=offset, **settings)
+
+    def numbers(self) -> tuple[float | Tensor, ...]:
+        """What kernels take of a plane: ``PLANE`` numbers, in the order of ``kernels.layout``."""
+        normal: Sequence[float] | Tensor = [float(a == self.axis) for a in range(3)]
+        if self.normal is not None:
+            n = torch.as_tensor(self.normal)
+            n = n if n.is_floating_point() else n.double()
+            normal = (n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)).unbind(-1)
+        friction = 0.0 if isinstance(self.friction, str) else self.friction
+        return self.offset, friction, self.adhesion, self.reach, *normal
+
+    def integers(self) -> list[int]:
+        """The ``PLANE_INTEGERS`` integers, likewise; the axis of a plane with a normal is -1."""
+        found = {
+            layout.PLANE_AXIS: -1 if self.axis is None else self.axis,
+            layout.PLANE_SIGN: self.side,
+            layout.PLANE_STICK: int(self.sticks),
+            layout.PLANE_ELASTIC: int(self.landing == "elastic"),
+        }
+        return [found[place] for place in range(layout.PLANE_INTEGERS)]
 
 
-def ground(height: float | Tensor = 0.0, *, friction: str | float | Tensor = "stick") -> Plane:
+def ground(
+    height: float | Tensor = 0.0,
+    *,
+    friction: str | float | Tensor = "stick",
+    landing: Literal["inelastic", "elastic"] = "inelastic",
+) -> Plane:
     """A floor with its normal upward (z).
 
     Args:
         height: Its height [m].
         friction: See :class:`Plane`.
+        landing: See :class:`Plane`.
     """
-    return Plane(axis=2, offset=height, friction=friction)
+    return Plane(axis=2, offset=height, friction=friction, landing=landing)
 
 
-def check_offsets(planes: Sequence[Plane]) -> None:
-    """Refuse gradients by the offsets of planes of an axis that do not shift the grid of the updated formulation.
+def check_updated(planes: Sequence[Plane]) -> None:
+    """Refuse what the updated formulation does not have: oblique or elastic planes, reach, and some gradients.
 
     Raises:
-        ValueError: if the offset of a plane requires a gradient, and a plane before it has the same axis.
+        ValueError: for a plane with a normal, a reach or an elastic landing; or if the offset of a plane requires a
+            gradient, and a plane before it has the same axis.
     """
     for k, plane in enumerate(planes):
+        given = {
+            "normal": plane.normal is not None,
+            "landing": plane.landing != "inelastic",
+            "reach": bool((torch.as_tensor(plane.reach) != 0).any()),
+        }
+        for name in (name for name, there in given.items() if there):
+            raise ValueError(
+                f"planes: plane {k} has {name} = {getattr(plane, name)}, which the updated formulation has not; wanted "
+                "an axis, inelastic landing and no reach, or the total-Lagrangian formulation"
+            )
         shifts = all(other.axis != plane.axis for other in planes[:k])
         if not shifts and isinstance(plane.offset, Tensor) and plane.offset.requires_grad:
             raise ValueError(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsoro.simulation.assembly import on_lattice
 from torchsoro.simulation.checkpoints import NODE_SHARE
-from torchsoro.simulation.contact import Plane, check_offsets
+from torchsoro.simulation.contact import Plane, check_updated
 from torchsoro.simulation.courant import Courant, total_courant, updated_courant
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached
@@ -105,8 +105,8 @@ class Updated:
         return updated_courant(attached, prony, dt, cell)
 
     def check_planes(self, planes: Sequence[Plane]) -> None:
-        """Only the first plane of each axis shifts the grid, which is the gradient by its offset."""
-        check_offsets(planes)
+        """Planes are of the grid; the first one of each axis shifts it, which is the gradient by its offset."""
+        check_updated(planes)
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
         """Histories do not depend on the step."""

@@ -12,8 +12,14 @@ register go through it together, a law
 
 from math import sqrt
 
-# One over the slope below which a point that arrives is taken to graze the plane.
+# One over the slope below which a point that arrives is taken to graze the plane: what it loses along the plane may be
+# much more than its normal speed, and its place, so the gradient, would depend on the gap without bound.
 STEEPEST = 5
+# Stiffness of an elastic plane for a node, in the node's mass over the square of the step.
+PUSH = 0.5
+# How far in front of a plane a node is looked at, and within what distance it touches, in cells.
+LOOK = 2
+TOUCH = 1 / 1024
 
 
 def response(u0, u1, u2, n0, n1, n2, stick, friction, hold):
@@ -78,3 +84,185 @@ def response_adjoint(u0, u1, u2, n0, n1, n2, stick, friction, hold, r0_bar, r1_b
             friction_bar = loss_bar * (hold - normal)
             hold_bar = pressed
     return u0_bar, u1_bar, u2_bar, friction_bar, hold_bar
+
+
+def plane_approach(v, gap, dt, push):
+    """A node's way along the normal of a plane in a step, and what the plane gives to its velocity.
+
+    A node that would end behind the plane ends on it and at rest. So where it comes to rest is a continuous function of
+    where it came from, and has a gradient; to stop it only once it arrives would multiply that gradient at every
+    landing. It loses its share of a blow's energy. With ``push`` above 0 it meets a spring behind the plane instead,
+    which keeps energy.
+
+    Args:
+        v: Velocity along the normal before contact [m/s].
+        gap: Distance from the plane, negative behind it [m].
+        dt: Step [s].
+        push: Stiffness of the spring behind the plane, in the node's mass over the square of the step; 0 for none.
+
+    Returns:
+        The way over dt [m/s], the gain in velocity [m/s], and 1 if the node lands inelastically in this step.
+    """
+    ahead = max(gap, gap * 0)
+    way, gain, lands = v, v * 0, v * 0
+    if push > 0:
+        gain = push * max(-gap, gap * 0) / dt
+        way = v + gain
+    elif v * dt + ahead < 0:
+        way, gain, lands = -ahead / dt, -v, lands + 1
+    return way, gain, lands
+
+
+def plane_approach_adjoint(v, gap, dt, push, way_bar, gain_bar):
+    """Adjoint of :func:`plane_approach`: gradients by velocity and gap."""
+    ahead = max(gap, gap * 0)
+    v_bar, gap_bar = way_bar, gap * 0
+    if push > 0:
+        if gap < 0:
+            gap_bar = -push * (way_bar + gain_bar) / dt
+    elif v * dt + ahead < 0:
+        v_bar = -gain_bar
+        if gap > 0:
+            gap_bar = -way_bar / dt
+    return v_bar, gap_bar
+
+
+def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push):
+    """Velocity of a node after a step towards, on or off a plane, and what else it moves by in this step.
+
+    What presses the node on the plane, the plane's push and adhesion, makes it stick, or takes at most ``friction``
+    times that from what slides. Adhesion holds a node that touches until it is torn off, and pulls one that is within
+    reach. What a node loses along the plane it loses from when it arrives.
+
+    Args:
+        u0: Velocity before, x [m/s].
+        u1: Likewise y.
+        u2: Likewise z.
+        n0: Unit normal of the plane to its free side, x.
+        n1: Likewise y.
+        n2: Likewise z.
+        gap: Distance from the plane, negative behind it [m].
+        dt: Step [s].
+        stick: 1 if nothing slides that is pressed on.
+        friction: Coulomb coefficient.
+        hold: Largest pull-off speed that adhesion cancels in a step [m/s].
+        reach: Distance within which adhesion pulls [m].
+        touch: Distance within which it holds [m].
+        push: See :func:`plane_approach`.
+
+    Returns:
+        The velocity after, and what is added to it for this step's motion only, three numbers each [m/s].
+    """
+    along = u0 * n0 + u1 * n1 + u2 * n2
+    t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    v, held = along, hold * 0
+    if gap < touch:
+        held = hold
+    elif gap < reach:
+        v = along - hold
+    way, gain, lands = plane_approach(v, gap, dt, push)
+    after = v + gain
+    back = min(max(after, after * 0), held)
+    pressed = gain + held - back
+    speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    rest = v * 0 + 1
+    if pressed > 0:
+        rest = v * 0
+        if stick == 0 and speed > friction * pressed:
+            rest = 1 - friction * pressed / speed
+    early = v * 0
+    if lands > 0 and gap > 0:
+        early = gap / (dt * max(-v, speed * (1 - rest) / STEEPEST)) * (1 - rest)
+    normal, extra = after - back, way - after
+    return (
+        rest * t0 + normal * n0,
+        rest * t1 + normal * n1,
+        rest * t2 + normal * n2,
+        early * t0 + extra * n0,
+        early * t1 + extra * n1,
+        early * t2 + extra * n2,
+    )
+
+
+def plane_contact_adjoint(
+    u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push,
+    r0_bar, r1_bar, r2_bar, o0_bar, o1_bar, o2_bar,
+):  # fmt: skip
+    """Adjoint of :func:`plane_contact`: gradients by velocity (three), normal (three), gap, friction and hold."""
+    along = u0 * n0 + u1 * n1 + u2 * n2
+    t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    v, held = along, hold * 0
+    if gap < touch:
+        held = hold
+    elif gap < reach:
+        v = along - hold
+    way, gain, lands = plane_approach(v, gap, dt, push)
+    after = v + gain
+    back = min(max(after, after * 0), held)
+    pressed = gain + held - back
+    speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    rest = v * 0 + 1
+    slides = pressed > 0 and stick == 0 and speed > friction * pressed
+    if slides:
+        rest = 1 - friction * pressed / speed
+    elif pressed > 0:
+        rest = v * 0
+    lost, pace, share = speed * (1 - rest), v * 0 + 1, v * 0
+    if lands > 0 and gap > 0:
+        pace = max(-v, lost / STEEPEST)
+        share = gap / (dt * pace)
+    early = share * (1 - rest)
+    normal, extra = after - back, way - after
+
+    normal_bar = r0_bar * n0 + r1_bar * n1 + r2_bar * n2
+    extra_bar = o0_bar * n0 + o1_bar * n1 + o2_bar * n2
+    early_bar = o0_bar * t0 + o1_bar * t1 + o2_bar * t2
+    rest_bar = r0_bar * t0 + r1_bar * t1 + r2_bar * t2 - share * early_bar
+    v_bar, gap_bar, speed_bar = v * 0, v * 0, v * 0
+    if lands > 0 and gap > 0:
+        share_bar = early_bar * (1 - rest)
+        gap_bar = share_bar / (dt * pace)
+        pace_bar = -share_bar * share / pace
+        if -v >= lost / STEEPEST:
+            v_bar = -pace_bar
+        else:
+            speed_bar = pace_bar * (1 - rest) / STEEPEST
+            rest_bar -= pace_bar * speed / STEEPEST
+    pressed_bar, friction_bar = v * 0, v * 0
+    if slides:
+        loss_bar = -rest_bar / speed
+        speed_bar += rest_bar * (1 - rest) / speed
+        pressed_bar = loss_bar * friction
+        friction_bar = loss_bar * pressed
+    after_bar, held_bar = normal_bar - extra_bar, pressed_bar
+    back_bar = -normal_bar - pressed_bar
+    if after > held:
+        held_bar += back_bar
+    elif after > 0:
+        after_bar += back_bar
+    by_v, by_gap = plane_approach_adjoint(v, gap, dt, push, extra_bar, pressed_bar + after_bar)
+    v_bar += after_bar + by_v
+    gap_bar += by_gap
+    turned = v * 0
+    if speed > 0:
+        turned = speed_bar / speed
+    t0_bar = rest * r0_bar + early * o0_bar + turned * t0
+    t1_bar = rest * r1_bar + early * o1_bar + turned * t1
+    t2_bar = rest * r2_bar + early * o2_bar + turned * t2
+    along_bar = v_bar - (t0_bar * n0 + t1_bar * n1 + t2_bar * n2)
+    hold_bar = v * 0
+    if gap < touch:
+        hold_bar = held_bar
+    elif gap < reach:
+        hold_bar = -v_bar
+    return (
+        t0_bar + along_bar * n0,
+        t1_bar + along_bar * n1,
+        t2_bar + along_bar * n2,
+        along_bar * u0 - along * t0_bar + normal * r0_bar + extra * o0_bar,
+        along_bar * u1 - along * t1_bar + normal * r1_bar + extra * o1_bar,
+        along_bar * u2 - along * t2_bar + normal * r2_bar + extra * o2_bar,
+        gap_bar,
+        friction_bar,
+        hold_bar,
+    )

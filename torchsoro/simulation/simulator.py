@@ -24,6 +24,7 @@ from torchsoro.simulation.assembly import (
 from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.formulation import Formulation, FormulationName, formulation_of
+from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.ops.rollout import refuse_transforms, rollout
@@ -219,7 +220,7 @@ class Simulator(nn.Module):
         """Constant data of the run, by particle."""
         body = attached.body
         kind = body.chamber.to(device=probes.device, dtype=torch.int32)
-        contact = [[plane.axis, plane.side, int(plane.sticks)] for plane in planes]
+        contact = [plane.integers() for plane in planes]
         return Scene(
             dt=dt,
             cell=self.cell,
@@ -228,7 +229,7 @@ class Simulator(nn.Module):
             high=self.high,
             kind=kind,
             share=attached.share,
-            plane_kind=kind.new_tensor(contact).reshape(-1, 3),
+            plane_kind=kind.new_tensor(contact).reshape(-1, layout.PLANE_INTEGERS),
             springs=attached.spring is not None,
             viscous=_present(body, body.viscosity, body.volume_viscosity),
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),

@@ -34,10 +34,12 @@ COEFFICIENTS = 14
 PRONY_DECAY, PRONY_GAIN, PRONY_MODULUS = 0, 1, 2
 PRONY = 3
 
-# Per-plane numbers: offset along its axis, Coulomb coefficient, adhesive traction; and its integers.
-PLANE_OFFSET, PLANE_FRICTION, PLANE_ADHESION = 0, 1, 2
-PLANE = 3
-PLANE_AXIS, PLANE_SIGN, PLANE_STICK = 0, 1, 2
+# Per-plane numbers: offset along its axis or normal, Coulomb coefficient, adhesive traction and its reach, unit normal
+# (three); and its integers: the normal counts with the sign, and the axis is of the updated form.
+PLANE_OFFSET, PLANE_FRICTION, PLANE_ADHESION, PLANE_REACH, PLANE_NORMAL = 0, 1, 2, 3, 4
+PLANE = 7
+PLANE_AXIS, PLANE_SIGN, PLANE_STICK, PLANE_ELASTIC = 0, 1, 2, 3
+PLANE_INTEGERS = 4
 
 # Nodes: mass and velocity with internal forces (kept for the adjoint); affine FLIP also needs, in a buffer of its own,
 # the velocity before any force; then the velocity after contact and the transferred one.

@@ -23,6 +23,7 @@ from torchsoro.simulation.kernels.layout import (
     PLANE,
     PLANE_ADHESION,
     PLANE_FRICTION,
+    PLANE_INTEGERS,
     PLANE_STICK,
 )
 from torchsoro.simulation.kernels.tensor import add, load_vector, store_vector
@@ -177,7 +178,8 @@ def node_adjoint(
             n = normal_of(plane_kind, k, u)
             arriving = contact(planes, plane_kind, planes_at, k, x, mass, pushed, cell, dt)
             if in_contact(distance):
-                stick, friction = plane_kind[3 * k + PLANE_STICK], planes[planes_at + PLANE * k + PLANE_FRICTION]
+                stick = plane_kind[PLANE_INTEGERS * k + PLANE_STICK]
+                friction = planes[planes_at + PLANE * k + PLANE_FRICTION]
                 u_bar, friction_bar, hold_bar = response_adjoint(arriving, n, stick, friction, hold, moved_bar)
                 moved_bar = u_bar
                 add(atomic, planes_bar, planes_bar_at + PLANE * k + PLANE_FRICTION, friction_bar)

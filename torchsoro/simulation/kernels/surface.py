@@ -4,12 +4,16 @@ A node outside of a face lies half a cell in front of it, and of a design the ou
 responds to a plane not where it is itself but where the surface of the matter is that it carries: some way
 (``NODAL_REACH``, as share of that to the next node, known from the masses) towards its neighbours, wherever these
 have moved.
+
+Where a plane keeps energy the way has the length that it had in the undeformed body, towards the neighbours: a node
+then meets the plane with its own motion, so that the plane's force on it does the work that the plane's spring takes.
 """
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.contact import axis_normal, gap_response, gap_response_adjoint
+from torchsoro.simulation.kernels.contact import plane_contact, plane_contact_adjoint
 from torchsoro.simulation.kernels.lattice import node_place, nodes_per_axis, product
+from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     BATCH,
     EDGE,
@@ -19,12 +23,15 @@ from torchsoro.simulation.kernels.layout import (
     NODES_BAR,
     PLANE,
     PLANE_ADHESION,
-    PLANE_AXIS,
     PLANE_BAR,
+    PLANE_ELASTIC,
     PLANE_FRICTION,
+    PLANE_INTEGERS,
     PLANE_KIND,
+    PLANE_NORMAL,
     PLANE_NUMBERS,
     PLANE_OFFSET,
+    PLANE_REACH,
     PLANE_SIGN,
     PLANE_STICK,
     PLANES,
@@ -32,10 +39,6 @@ from torchsoro.simulation.kernels.layout import (
     SURFACES,
 )
 from torchsoro.simulation.kernels.tensor import add, load_vector
-
-# How far in front of a plane a node is looked at, and how near it is held by adhesion, in cells.
-LOOK = 2.0
-CONTACT_DISTANCE = 1e-3
 
 
 @ti.func
@@ -50,50 +53,98 @@ def neighbour(i, m, c: ti.template(), side):
 
 
 @ti.func
-def index_along(i, m, axis):
-    """Number of node i along an axis."""
-    index = i // (m[1] * m[2])
-    if axis == 1:
-        index = (i // m[2]) % m[1]
-    elif axis == 2:
-        index = i % m[2]
-    return index
-
-
-@ti.func
-def step_inward(
-    ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, axis, c: ti.template(), reach
-):
-    """From node i to its neighbour towards ``reach`` along axis c: the coordinate along ``axis`` gained."""
-    along = at + axis * product(m)
-    gain = state[along + neighbour(i, m, c, reach)] - state[along + i]
-    if axis == c:
-        here = index_along(i, m, c)
-        gain += node_place(ints, fixed, c, here + ti.select(reach > 0, 1, -1)) - node_place(ints, fixed, c, here)
-    return gain
-
-
-@ti.func
-def places(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, b, i, m, axis):
-    """Coordinate along ``axis`` of node i, and of the surface of the matter that it carries."""
+def step_inward(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, c: ti.template(), reach):
+    """The way from node i to its neighbour towards ``reach`` along axis c, and its length in the undeformed body."""
     nodes = product(m)
-    node = node_place(ints, fixed, axis, index_along(i, m, axis)) + state[at + axis * nodes + i]
-    surface = node
-    for c in ti.static(range(3)):
-        reach = fixed[ints[NODES] + (b * NODAL + NODAL_REACH + c) * nodes + i]
-        if reach != 0:
-            surface += step_inward(ints, fixed, state, at, i, m, axis, c, reach) * ti.abs(reach)
-    return node, surface
+    here = index_of(i, m)[c]
+    length = node_place(ints, fixed, c, here + ti.select(reach > 0, 1, -1)) - node_place(ints, fixed, c, here)
+    step = load_vector(state, at + neighbour(i, m, c, reach), nodes) - load_vector(state, at + i, nodes)
+    step[c] += length
+    return step, ti.abs(length)
 
 
 @ti.func
-def adhesive_hold(ints: ti.template(), fixed: ti.template(), plane, gap, mass):
-    """Pull-off speed that adhesion cancels in a step; negative where it does not reach."""
-    edge = fixed[EDGE]
-    hold = mass * 0 - 1
-    if gap < CONTACT_DISTANCE * edge:
-        hold = fixed[plane + PLANE_ADHESION] * edge * edge * fixed[STEP_SIZE] / mass
-    return hold
+def index_of(i, m):
+    """Numbers of node i along the axes."""
+    return ti.Vector([i // (m[1] * m[2]), (i // m[2]) % m[1], i % m[2]])
+
+
+@ti.func
+def current_place(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m):
+    """Where node i is."""
+    index = index_of(i, m)
+    x = load_vector(state, at + i, product(m))
+    for c in ti.static(range(3)):
+        x[c] += node_place(ints, fixed, c, index[c])
+    return x
+
+
+@ti.func
+def reaches_of(ints: ti.template(), fixed: ti.template(), b, i, nodes):
+    """The way from node i to the surface of the matter that it carries, as shares of those to the next nodes."""
+    return load_vector(fixed, ints[NODES] + (b * NODAL + NODAL_REACH) * nodes + i, nodes)
+
+
+@ti.func
+def inward(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, c: ti.template(), reach, keeps):
+    """:func:`step_inward`, of its undeformed length if planes keep energy."""
+    step, length = step_inward(ints, fixed, state, at, i, m, c, reach)
+    if keeps:
+        step *= length / step.norm()
+    return step
+
+
+@ti.func
+def inward_adjoint(
+    ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, c: ti.template(), reach, keeps, bar
+):
+    """Adjoint of :func:`inward` times the reach: gradient by the way to the neighbour."""
+    found = bar * ti.abs(reach)
+    if keeps:
+        step, length = step_inward(ints, fixed, state, at, i, m, c, reach)
+        along = step / step.norm()
+        found = (found - found.dot(along) * along) * length / step.norm()
+    return found
+
+
+@ti.func
+def elastic(ints: ti.template()):
+    """Whether any plane keeps energy."""
+    found = False
+    for k in range(ints[PLANES]):
+        if ints[ints[PLANE_KIND] + k * PLANE_INTEGERS + PLANE_ELASTIC] == 1:
+            found = True
+    return found
+
+
+@ti.func
+def surface_place(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, node, reaches, keeps):
+    """Where the surface of the matter is that a node carries, which is at ``node``."""
+    x = node
+    for c in ti.static(range(3)):
+        if reaches[c] != 0:
+            x += inward(ints, fixed, state, at, i, m, c, reaches[c], keeps) * ti.abs(reaches[c])
+    return x
+
+
+@ti.func
+def plane_of(ints: ti.template(), fixed: ti.template(), b, k, reaches, mass):
+    """Of plane k: unit normal to the free side, distance from the origin along it, and what ``plane_contact`` takes.
+
+    These are: stick, friction, pull-off speed that adhesion cancels in a step, its reach, push. Adhesion reaches to the
+    nodes whose matter faces the plane.
+    """
+    plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
+    kind = ints[PLANE_KIND] + k * PLANE_INTEGERS
+    edge, sign = fixed[EDGE], ints[kind + PLANE_SIGN]
+    n, level = sign * load_vector(fixed, plane + PLANE_NORMAL, 1), sign * fixed[plane + PLANE_OFFSET]
+    stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
+    hold = fixed[plane + PLANE_ADHESION] * edge * edge * fixed[STEP_SIZE] / mass
+    reach = fixed[plane + PLANE_REACH]
+    if not reaches.dot(n) > 0:
+        reach = reach * 0
+    push = edge * 0 + laws.PUSH * ints[kind + PLANE_ELASTIC]
+    return n, level, stick, friction, hold, reach, push
 
 
 @ti.func
@@ -102,17 +153,14 @@ def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.templa
     r = u
     onto = u * 0
     m = nodes_per_axis(ints)
+    edge, dt, keeps = fixed[EDGE], fixed[STEP_SIZE], elastic(ints)
+    node = current_place(ints, fixed, state, at, i, m)
+    reaches = reaches_of(ints, fixed, b, i, product(m))
     for k in range(count):
-        plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
-        kind = ints[PLANE_KIND] + 3 * k
-        offset, sign = fixed[plane + PLANE_OFFSET], ints[kind + PLANE_SIGN]
-        node, surface = places(ints, fixed, state, at, b, i, m, ints[kind + PLANE_AXIS])
-        if sign * (node - offset) < LOOK * fixed[EDGE]:
-            gap = sign * (surface - offset)
-            hold = adhesive_hold(ints, fixed, plane, gap, mass)
-            normal = axis_normal(ints[kind + PLANE_AXIS], sign, u)
-            stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
-            after, way = gap_response(r, normal, gap, fixed[STEP_SIZE], stick, friction, hold)
+        normal, level, stick, friction, hold, reach, push = plane_of(ints, fixed, b, k, reaches, mass)
+        if node.dot(normal) - level < laws.LOOK * edge + reach:
+            gap = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps).dot(normal) - level
+            after, way = plane_contact(r, normal, gap, dt, stick, friction, hold, reach, laws.TOUCH * edge, push)
             r = after
             onto += way
     return r, onto
@@ -141,43 +189,44 @@ def surface_response_adjoint(
     mass_bar = mass * 0
     m = nodes_per_axis(ints)
     nodes = product(m)
-    dt = fixed[STEP_SIZE]
+    edge, dt, keeps = fixed[EDGE], fixed[STEP_SIZE], elastic(ints)
+    node = current_place(ints, fixed, state, at, i, m)
+    reaches = reaches_of(ints, fixed, b, i, nodes)
     for back in range(ints[PLANES]):
         k = ints[PLANES] - 1 - back
-        plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
-        kind = ints[PLANE_KIND] + 3 * k
-        axis, sign = ints[kind + PLANE_AXIS], ints[kind + PLANE_SIGN]
-        node, surface = places(ints, fixed, state, at, b, i, m, axis)
-        if sign * (node - fixed[plane + PLANE_OFFSET]) < LOOK * fixed[EDGE]:
-            gap = sign * (surface - fixed[plane + PLANE_OFFSET])
-            hold = adhesive_hold(ints, fixed, plane, gap, mass)
+        normal, level, stick, friction, hold, reach, push = plane_of(ints, fixed, b, k, reaches, mass)
+        if node.dot(normal) - level < laws.LOOK * edge + reach:
+            surface = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps)
+            gap = surface.dot(normal) - level
             arriving, _ = surface_response(ints, fixed, state, at, b, i, k, mass, u)
-            normal = axis_normal(axis, sign, u)
-            friction, stick = fixed[plane + PLANE_FRICTION], ints[kind + PLANE_STICK]
-            by_u, gap_bar, by_friction, hold_bar = gap_response_adjoint(
-                arriving, normal, gap, dt, stick, friction, hold, u_bar, onto_bar
+            by_u, by_normal, gap_bar, by_friction, hold_bar = plane_contact_adjoint(
+                arriving, normal, gap, dt, stick, friction, hold, reach, laws.TOUCH * edge, push, u_bar, onto_bar
             )
             u_bar = by_u
+            by_normal += gap_bar * surface
+            sign = ints[ints[PLANE_KIND] + k * PLANE_INTEGERS + PLANE_SIGN]
             bar = ints[PLANE_BAR] + (b * ints[PLANES] + k) * PLANE * nodes + i
             add(False, sums, bar + PLANE_OFFSET * nodes, -sign * gap_bar)
             add(False, sums, bar + PLANE_FRICTION * nodes, by_friction)
-            if hold >= 0:
-                add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * fixed[EDGE] * fixed[EDGE] * dt / mass)
-                mass_bar -= hold_bar * hold / mass
+            add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * edge * edge * dt / mass)
+            mass_bar -= hold_bar * hold / mass
+            for c in ti.static(range(3)):
+                add(False, sums, bar + (PLANE_NORMAL + c) * nodes, sign * by_normal[c])
             if gap_bar != 0:
+                surface_bar += gap_bar * normal
                 for c in ti.static(range(3)):
-                    if axis == c:
-                        surface_bar[c] += sign * gap_bar
-                    mine = (b * NODAL + NODAL_REACH + c) * nodes + i
-                    reach = fixed[ints[NODES] + mine]
-                    if reach != 0:
-                        gain = sign * gap_bar * step_inward(ints, fixed, state, at, i, m, axis, c, reach)
-                        add(False, sums, ints[NODES_BAR] + mine, ti.select(reach > 0, gain, -gain))
+                    if reaches[c] != 0:
+                        step = inward(ints, fixed, state, at, i, m, c, reaches[c], keeps)
+                        gain = gap_bar * normal.dot(step)
+                        mine = ints[NODES_BAR] + (b * NODAL + NODAL_REACH + c) * nodes + i
+                        add(False, sums, mine, ti.select(reaches[c] > 0, gain, -gain))
     return u_bar, surface_bar, mass_bar
 
 
 @ti.func
-def surface_spread(ints: ti.template(), fixed: ti.template(), back: ti.template(), parity, b, i):
+def surface_spread(
+    ints: ti.template(), fixed: ti.template(), state: ti.template(), at, back: ti.template(), parity, b, i
+):
     """What the surfaces of node i and of the neighbours that reach to it add to the gradient by its place."""
     m = nodes_per_axis(ints)
     nodes = product(m)
@@ -185,13 +234,16 @@ def surface_spread(ints: ti.template(), fixed: ti.template(), back: ti.template(
     reaches = ints[NODES] + (b * NODAL + NODAL_REACH) * nodes
     own = load_vector(back, surfaces + i, nodes)
     total = own
-    place = ti.Vector([i // (m[1] * m[2]), (i // m[2]) % m[1], i % m[2]])
+    place, keeps = index_of(i, m), elastic(ints)
     for c in ti.static(range(3)):
-        total -= ti.abs(fixed[reaches + c * nodes + i]) * own
+        reach = fixed[reaches + c * nodes + i]
+        if reach != 0:
+            total -= inward_adjoint(ints, fixed, state, at, i, m, c, reach, keeps, own)
         for side in ti.static((-1, 1)):
             if place[c] + side >= 0 and place[c] + side < m[c]:
                 other = neighbour(i, m, c, side)
-                reach = fixed[reaches + c * nodes + other]
-                if reach * side < 0:
-                    total += ti.abs(reach) * load_vector(back, surfaces + other, nodes)
+                towards = fixed[reaches + c * nodes + other]
+                if towards * side < 0:
+                    bar = load_vector(back, surfaces + other, nodes)
+                    total += inward_adjoint(ints, fixed, state, at, other, m, c, towards, keeps, bar)
     return total

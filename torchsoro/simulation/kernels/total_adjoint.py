@@ -129,7 +129,8 @@ def node_adjoint(
                     table = head[SOURCES] + (k + 1) * SHARED * nodes
                     d_bar += by_volume * sum_tiles(fixed, ints, scratch, partials, table, i, nodes)
             if head[PLANES] > 0:
-                d_bar += surface_spread(ints, fixed, back, (t + 1) % 2, b, i)
+                after = ((t + 1) * head[BATCH] + b) * state_length(head)
+                d_bar += surface_spread(ints, fixed, state, after, back, (t + 1) % 2, b, i)
             if ti.static(rates):
                 if head[VISCOUS] == 1:
                     rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * SLOT

@@ -16,9 +16,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Largest share of its mass that a node may lose. Bodies of three cells across ask for 0.55; beyond that the change
-# fades, and is none where a node would lose all of its mass: cubes of two cells get 0.2 of it, of one cell nothing.
-_MOST, _NONE = 0.55, 1.0
+# Largest share of its mass that a node may lose, as a norm over all nodes: the largest itself has no slope where a
+# symmetric body has several. Cubes of three cells ask for 0.59; beyond the first number the change fades, and is none
+# from the second: cubes of two cells get a quarter of it, of one cell almost nothing.
+_MOST, _NONE = 0.65, 1.1
+_NORM = 32
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +33,8 @@ class Matching:
         excess: What each kilogram at a node adds too much to the second moments, in the units of ``terms`` [n, 3].
         normal: Sums of m^2 over products of terms [B, 10, 10].
         q: The polynomial at the nodes [B, n].
-        loss: Largest share that a node would lose [B], and at which node.
-        strength: Share of the change that is made [B].
+        loss: Share that each node would lose [B, n], and their norm [B, 1].
+        strength: Share of the change that is made [B, 1].
     """
 
     mass: Tensor
@@ -63,28 +65,27 @@ class Matching:
         excess = spread.to(m) / half.square()
         wanted = torch.nn.functional.pad(-(m @ excess), (4, 3))
         q = torch.linalg.solve(normal, wanted) @ terms.T
-        loss = (-m * q).max(1)
-        strength = ((_NONE - loss.values) / (_NONE - _MOST)).clamp(0, 1)
-        return cls(
-            mass=m, terms=terms, excess=excess, normal=normal, q=q, loss=(loss.values, loss.indices), strength=strength
-        )
+        loss = (-m * q).relu()
+        largest = loss.amax(1, keepdim=True)
+        norm = largest * (loss / largest).pow(_NORM).sum(1, keepdim=True).pow(1 / _NORM)
+        strength = ((_NONE - norm) / (_NONE - _MOST)).clamp(0, 1)
+        return cls(mass=m, terms=terms, excess=excess, normal=normal, q=q, loss=(loss, norm), strength=strength)
 
     @property
     def matched(self) -> Tensor:
         """The masses [B, n] kg."""
-        return self.mass * (1 + self.strength.unsqueeze(1) * self.mass * self.q)
+        return self.mass * (1 + self.strength * self.mass * self.q)
 
     def adjoint(self, bar: Tensor) -> Tensor:
         """Gradient by the lumped masses, from that by the matched ones [B, n]."""
-        m, q, (loss, at) = self.mass, self.q, self.loss
+        m, q, (loss, norm) = self.mass, self.q, self.loss
         bar = bar.to(m)
-        change = self.strength.unsqueeze(1) * bar
-        q_bar = m.square() * change
-        fades = (loss > _MOST) & (loss < _NONE)
-        loss_bar = torch.where(fades, -(bar * m.square() * q).sum(1) / (_NONE - _MOST), torch.zeros_like(loss))
-        at = at.unsqueeze(1)
-        by_loss = torch.zeros_like(m).scatter(1, at, -loss_bar.unsqueeze(1))
-        q_bar = q_bar + m * by_loss
-        by_wanted = torch.linalg.solve(self.normal, q_bar @ self.terms)
+        change = self.strength * bar
+        fades = (norm > _MOST) & (norm < _NONE)
+        strength_bar = (bar * m.square() * q).sum(1, keepdim=True)
+        # By the share that each node gains.
+        by_norm = torch.where(fades, strength_bar / (_NONE - _MOST), torch.zeros_like(norm))
+        by_gain = by_norm * (loss / norm).pow(_NORM - 1)
+        by_wanted = torch.linalg.solve(self.normal, (m.square() * change + m * by_gain) @ self.terms)
         by_square = -(by_wanted @ self.terms.T) * q
-        return bar + 2 * m * (q * change + by_square) + q * by_loss - by_wanted[:, 4:7] @ self.excess.T
+        return bar + 2 * m * (q * change + by_square) + q * by_gain - by_wanted[:, 4:7] @ self.excess.T

@@ -31,7 +31,8 @@ class Scene:
         high: Upper corner of the analysis box [m].
         kind: int32 [N], -1 for solid, else the number of the gas chamber.
         share: [groups, N], each particle's share of its group's force.
-        plane_kind: int32 [planes, 3]: axis, side (+1 or -1), 1 for stick or 0 for Coulomb.
+        plane_kind: int32 [planes, PLANE_INTEGERS]: axis (-1 if oblique), side (+1 or -1), 1 for stick or 0 for Coulomb,
+            1 for elastic landing or 0.
         springs: Whether any particle has a spring or drag, be it of zero.
         viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
         stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
@@ -77,7 +78,7 @@ class Inputs:
         pressure: [T + 1, B, chambers] supply pressure at each substep and after the last [Pa].
         gravity: [T, B, 3] [m/s2].
         force: [T, B, groups, 3] [N].
-        planes: [B, planes, 3]: offset [m], Coulomb coefficient, adhesive traction [Pa].
+        planes: [B, planes, PLANE]: offset [m], Coulomb coefficient, adhesive traction [Pa], its reach [m], normal.
         origin: [B, 3] a grid node [m].
     """
 
