@@ -10,6 +10,7 @@ import torch
 from problems import DT, WAYS, H, block, simulator, ways
 
 from torchsoro import Plane, Prony, ground
+from torchsoro.simulation.ops.lattice import Lattice
 
 G = 9.81
 
@@ -141,10 +142,121 @@ def test_shifting_ground_and_body_together_changes_nothing(way):
     assert float(by) == pytest.approx(1.0, rel=1e-9)
 
 
+@pytest.mark.parametrize("landing", ["inelastic", "elastic"])
+def test_a_plane_with_the_normal_of_an_axis_is_the_plane_of_that_axis(landing):
+    _, body = block(velocity=vector(0.5, 0.2, -0.5))
+    given = {"offset": -2e-4, "friction": 0.3, "adhesion": 20.0, "landing": landing}
+    planes = Plane(axis=2, **given), Plane(normal=(0, 0, 3.0), **given)
+    ends = [
+        simulator(formulation="total")(body, duration=100 * DT, gravity=(0.0, 0.0, -G), planes=[plane]).final
+        for plane in planes
+    ]
+    assert torch.equal(*ends)
+
+
+def test_a_block_slides_down_an_oblique_plane_with_the_gravity_along_it():
+    # A body of the same lattice on a plane of slope 0.2: what is not held by friction accelerates it.
+    slope, mu = 0.2, 0.1
+    n = vector(-slope, 0.0, 1.0) / math.sqrt(1 + slope**2)
+    down = vector(1.0, 0.0, slope) / math.sqrt(1 + slope**2)
+    _, body = block((12, 12, 4))
+    plane = Plane.through((0.0, 0.0, 0.0), normal=n, friction=mu)
+    # Rotated gravity keeps the block, whose face is not parallel to the plane, from tipping before it lies on it.
+    run = simulator(formulation="total")(
+        body, duration=0.08, gravity=tuple((-G * n - 3.0 * down).tolist()), planes=[plane], prony=Prony.paper(3),
+        sample_every=0.02,
+    )  # fmt: skip
+    along, off = run.center_velocity @ down, run.center_velocity @ n
+    # Friction is mu times the normal impulse, which also accounts for what the block bounces.
+    expected = -3.0 * run.time + mu * (G * run.time + off)
+    torch.testing.assert_close(along, expected, rtol=0, atol=0.01)
+    assert float(along[-1]) < -0.1
+
+
+@pytest.mark.parametrize("friction", [0.0, "stick"])
+def test_a_bouncing_cube_of_6_cells_keeps_99_5_percent_of_its_energy_at_its_first_blow_if_elastic(friction):
+    lost = {landing: energy_lost(6, landing, friction) for landing in ("inelastic", "elastic")}
+    print({landing: f"{100 * share:.2f} %" for landing, share in lost.items()})
+    assert abs(lost["elastic"]) < 0.005
+    assert lost["inelastic"] > 0.02
+
+
+def energy_lost(cells, landing, friction):
+    """Share of the energy of an elastic cube of ``cells`` across that its first blow on the ground takes."""
+    _, body = block((2 * cells,) * 3, origin=(0.0, 0.0, 0.2 * H), velocity=vector(0.0, 0.0, -0.5))
+    sim = simulator(formulation="total", dt=1e-4)
+    rule = {"gravity": (0.0, 0.0, 0.0), "planes": [ground(friction=friction, landing=landing)]}
+    lattice = Lattice.around(body.position, 2 * H)
+    mass, nodes = lattice.nodal_mass(body.mass.unsqueeze(0))[0], lattice.nodes
+    # Until it is off the ground, then the mean over ten substeps.
+    before, found = sim(body, duration=60 * cells * 1e-4, **rule).final, []
+    for _ in range(10):
+        after = sim(body, duration=1e-4, start=before, **rule).final
+        # Of symplectic Euler, velocities are those of half a step before; so is the place in the middle.
+        d, v = (before + after)[0, : 3 * nodes].view(3, -1) / 2, after[0, 3 * nodes : 6 * nodes].view(3, -1)
+        F = lattice.gradient(d.unsqueeze(0))[0].permute(2, 0, 1) + torch.eye(3).double()
+        J = torch.linalg.det(F)
+        elastic = body.shear / 2 * (J ** (-2 / 3) * (F * F).sum((1, 2)) - 3)
+        elastic = elastic + body.bulk / 4 * ((J - 1) ** 2 + torch.log(J) ** 2)
+        found.append(float((body.volume * elastic).sum() + (mass * v * v).sum() / 2))
+        before = after
+    return 1 - sum(found) / 10 / float(body.mass.sum() * 0.5**2 / 2)
+
+
+def test_adhesion_pulls_a_block_from_within_its_reach_only():
+    _, body = block(origin=(0.0, 0.0, 1e-3))
+    found = []
+    for reach in (0.9e-3, 1.1e-3):
+        plane = Plane(axis=2, adhesion=50.0, reach=reach)
+        run = simulator(formulation="total")(body, duration=4 * DT, gravity=(0.0, 0.0, 0.0), planes=[plane])
+        found.append(-float(run.center_velocity[-1, 2]))
+    assert abs(found[0]) < 1e-15
+    # A node holds with the area of a whole cell: sixteen of them where the block has four faces of cells.
+    force = 50.0 * 16 * (2 * H) ** 2
+    assert found[1] == pytest.approx(force * 4 * DT / float(body.mass.sum()), rel=1e-6)
+
+
+def test_a_normal_has_a_gradient():
+    def run(slope):
+        _, body = block(velocity=vector(0.0, 0.0, -0.4))
+        normal = torch.stack([slope, torch.zeros_like(slope), torch.ones_like(slope)])
+        plane = Plane.through((0.0, 0.0, -3e-4), normal=normal, friction=0.3)
+        return simulator(formulation="total")(
+            body, duration=60 * DT, gravity=(0.0, 0.0, -G), planes=[plane], prony=Prony.paper(1)
+        ).center_of_gravity[-1] @ vector(1.0, 0.3, 0.2)
+
+    slope = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+    (by,) = torch.autograd.grad(run(slope), slope)
+    with torch.no_grad():
+        difference = (run(slope + 1e-7) - run(slope - 1e-7)) / 2e-7
+    assert float(by) == pytest.approx(float(difference), rel=1e-5)
+
+
+@ways("apic", "flip")
+@pytest.mark.parametrize(
+    ("settings", "name"),
+    [
+        ({"normal": (1.0, 0.0, 1.0)}, "normal"),
+        ({"axis": 2, "landing": "elastic"}, "landing"),
+        ({"axis": 2, "reach": 1e-3}, "reach"),
+    ],
+)
+def test_the_updated_form_refuses_planes_that_it_has_not(settings, name, way):
+    with pytest.raises(ValueError, match=rf"^planes: plane 0 has {name} = .*, which the updated formulation has not"):
+        run(gravity=(0.0, 0.0, -G), planes=[Plane(**settings)], **way)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"axis": 3}, r"axis = 3: wanted 0 \(x\), 1 \(y\) or 2 \(z\)"),
+        ({"axis": 3}, r"axis = 3: wanted 0 \(x\), 1 \(y\) or 2 \(z\), or a normal"),
+        ({"axis": None}, r"axis = None: wanted 0"),
+        ({"normal": (0.0, 0.0, 1.0)}, r"axis = 2, side = 1: wanted neither beside a normal"),
+        ({"axis": None, "normal": (0.0, 0.0, 0.0)}, r"normal = .*: wanted \[..., 3\], finite and not zero"),
+        ({"axis": None, "normal": (0.0, 1.0)}, r"normal = .*: wanted \[..., 3\]"),
+        ({"landing": "bouncy"}, r"landing = 'bouncy': wanted 'inelastic' or 'elastic'"),
+        ({"reach": -1.0}, r"reach = -1\.0: wanted finite and at least 0"),
+        ({"reach": torch.tensor(1e-3, requires_grad=True)}, r"reach: requires a gradient"),
         ({"axis": "z"}, r"axis = 'z': wanted 0"),
         ({"side": 0}, r"side = 0: wanted \+1 or -1"),
         ({"friction": "glue"}, r"friction = 'glue': wanted 'stick' or a coefficient of at least 0"),

@@ -74,6 +74,20 @@ def test_gradcheck_by_every_tensor(name, form, stick):
     assert check(problem(batch=2, stick=stick, **form), name)
 
 
+@pytest.mark.parametrize("elastic", [0, 1])
+@pytest.mark.parametrize("name", ["coefficients", "planes", "state"])
+def test_gradcheck_with_oblique_planes_that_pull_from_afar(name, elastic):
+    p = problem(batch=2, formulation="total")
+    g = torch.Generator().manual_seed(4)
+    normal = p.tensors["planes"][..., layout.PLANE_NORMAL :]
+    # What lies far behind a plane that keeps energy is thrown off.
+    normal += (0.01 if elastic else 0.2) * torch.randn(normal.shape, generator=g, dtype=torch.float64)
+    normal /= normal.norm(dim=-1, keepdim=True)
+    p.tensors["planes"][..., layout.PLANE_REACH] = 0.3
+    p.scene.plane_kind[:, layout.PLANE_ELASTIC] = elastic
+    assert check(p, name)
+
+
 @forms("mixed", "total")
 def test_gradcheck_of_every_entry(form):
     # The full Jacobian by all nine tensors, so that no error can hide in a sum.

@@ -86,11 +86,24 @@ def reaches_of(ints: ti.template(), fixed: ti.template(), b, i, nodes):
 
 
 @ti.func
+def resized(step, length):
+    """A vector of another length."""
+    return step * (length / step.norm())
+
+
+@ti.func
+def resized_adjoint(step, length, bar):
+    """Adjoint of :func:`resized`: gradient by the vector."""
+    along = step / step.norm()
+    return (bar - bar.dot(along) * along) * (length / step.norm())
+
+
+@ti.func
 def inward(ints: ti.template(), fixed: ti.template(), state: ti.template(), at, i, m, c: ti.template(), reach, keeps):
     """:func:`step_inward`, of its undeformed length if planes keep energy."""
     step, length = step_inward(ints, fixed, state, at, i, m, c, reach)
     if keeps:
-        step *= length / step.norm()
+        step = resized(step, length)
     return step
 
 
@@ -102,8 +115,7 @@ def inward_adjoint(
     found = bar * ti.abs(reach)
     if keeps:
         step, length = step_inward(ints, fixed, state, at, i, m, c, reach)
-        along = step / step.norm()
-        found = (found - found.dot(along) * along) * length / step.norm()
+        found = resized_adjoint(step, length, found)
     return found
 
 
