@@ -137,11 +137,12 @@ def problem(
     dtype: torch.dtype = torch.float64,
     seed: int = 1,
     lattice: Lattice | None = None,
+    lanes: bool = True,
 ) -> Problem:
     """A problem in units of the cell, all of whose numbers are of order one and random, so that every term counts.
 
     In the total-Lagrangian form a corner of the lattice is empty, and its nodes there have no mass. A lattice may be
-    given; else it is uniform.
+    given; else it is uniform. Without ``lanes`` the kernels are those of a GPU, wherever they run.
     """
     g = torch.Generator().manual_seed(seed)
 
@@ -217,5 +218,6 @@ def problem(
         stiffens=True,
         probes=torch.tensor([0, 7, int((kind == -1).nonzero()[-1])]),
         lattice=lattice,
+        lanes=lanes,
     )
     return Problem(scene=scene, tensors={name: t.to(dtype) for name, t in tensors.items()}, samples=samples)

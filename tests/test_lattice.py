@@ -310,7 +310,7 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
     laid = {
         (ints, layout.KIND): p.scene.kind,
         (ints, layout.PLANE_KIND): p.scene.plane_kind,
-        (integrator.fixed.buffer, layout.NUMBERS): numbers(lat, p.scene.dt),
+        (integrator.fixed.buffer, layout.NUMBERS): numbers(lat, p.scene.dt, p.scene.cell),
         (integrator.fixed.buffer, layout.COEFFICIENT): t["coefficients"],
         (integrator.fixed.buffer, layout.ELEMENT): t["prony"],
         (integrator.fixed.buffer, layout.PLANE_NUMBERS): t["planes"],
@@ -326,7 +326,7 @@ def test_a_segment_lays_its_quantities_where_the_constants_say():
         assert torch.equal(buffer[start : start + wanted.numel()], wanted.detach().reshape(-1)), constant
     table = integrator.fixed.buffer
     assert float(table[layout.STEP_SIZE]) == p.scene.dt
-    assert float(table[layout.EDGE]) == lat.cell
+    assert float(table[layout.EDGE]) == p.scene.cell
     start = layout.AXES
     for axis in lat.axes:
         weight, slope = (torch.from_numpy(t.reshape(-1, 3)) for t in axis.table)

@@ -39,19 +39,60 @@ def wide() -> Lattice:
     )
 
 
+engines = pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "taichi"])
+
+
+@engines
 @pytest.mark.parametrize("name", TENSORS)
-def test_gradcheck_by_every_tensor_with_open_knots_and_creases(name):
-    assert check(problem(formulation="total", lattice=uneven(), batch=2), name)
+def test_gradcheck_by_every_tensor_with_open_knots_and_creases(name, lanes):
+    assert check(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes), name)
 
 
-def test_gradcheck_over_several_tiles():
-    p = problem(formulation="total", lattice=wide(), steps=3, samples=(0, 3))
+@pytest.mark.parametrize("stick", [False, True])
+@pytest.mark.parametrize("name", TENSORS)
+def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(name, stick):
+    assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), name)
+
+
+@pytest.mark.parametrize("elements", [0, 1, 5])
+def test_gradcheck_of_the_kernels_of_a_gpu_with_other_numbers_of_maxwell_elements(elements):
+    p = problem(formulation="total", elements=elements, lanes=False)
+    assert check(p, "state", "coefficients", *(["prony"] if elements else []))
+
+
+@engines
+def test_gradcheck_over_several_tiles(lanes):
+    p = problem(formulation="total", lattice=wide(), steps=3, samples=(0, 3), lanes=lanes)
     assert check(p, "state", "coefficients", "pressure", "gravity")
 
 
-def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamber():
+@pytest.mark.parametrize("lattice", [None, uneven(), wide()], ids=["uniform", "uneven", "wide"])
+def test_both_engines_give_the_same_results_and_gradients(lattice):
+    found = []
+    for lanes in (True, False):
+        p = problem(formulation="total", lattice=lattice, batch=2, steps=12, samples=(0, 5, 12), lanes=lanes)
+        # Void and gas have no history, and void no viscosity.
+        c, nodes = p.tensors["coefficients"], p.scene.lattice.nodes  # type: ignore[union-attr]
+        solid = (p.scene.kind == -1) & (c[:, layout.VOID_FRACTION] < 1)
+        c[:, layout.VISCOSITY : layout.VOLUME_VISCOSITY + 1] *= solid.unsqueeze(1)
+        p.tensors["state"][:, 6 * nodes :].view(2, 12, -1).mul_(solid.unsqueeze(1))
+        leaves = p.leaves()
+        outputs = p.run(leaves)
+        weights = [torch.linspace(0.5, 1.5, o.numel(), dtype=torch.float64).view_as(o) for o in outputs]
+        loss = torch.stack([(w * o).sum() for w, o in zip(weights, outputs, strict=True)]).sum()
+        found.append([*(o.detach() for o in outputs), *torch.autograd.grad(loss, list(leaves.values()))])
+    for name, one, other in zip([*(["output"] * 7), *leaves], *found, strict=True):
+        if name == "coefficients":
+            one, other = one * solid.unsqueeze(1), other * solid.unsqueeze(1)
+        if name == "state":
+            one, other = (t[:, : 6 * nodes] for t in (one, other))
+        assert float((one - other).norm()) <= 1e-10 * float(other.norm()), name
+
+
+@engines
+def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamber(lanes):
     # One substep from a random state against the derivatives, by torch, of what is summed over all points at once.
-    p = problem(formulation="total", lattice=wide(), steps=1, samples=(), elements=0)
+    p = problem(formulation="total", lattice=wide(), steps=1, samples=(), elements=0, lanes=lanes)
     lat, c = wide(), p.tensors["coefficients"]
     kind = torch.full(lat.points, -1, dtype=torch.int32)
     kind[2:7, 3:9, 4:15] = 0

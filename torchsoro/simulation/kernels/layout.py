@@ -106,8 +106,8 @@ FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(49, 53)
 COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(53, 61)
 HEAD = 61
 
-# Numbers of the lattice: substep, edge of a cell; then the axes one after the other: for each point the weights of its
-# three nodes and their slopes by the reference place; places of the particles; places of the nodes.
+# Numbers of the lattice: substep, edge of a cell for contact; then the axes one after the other: for each point the
+# weights of its three nodes and their slopes by the reference place; places of the particles; places of the nodes.
 STEP_SIZE, EDGE, AXES = 0, 1, 2
 AXIS = 6
 

@@ -202,10 +202,11 @@ def stress_point(
         at = ((t % head[RING]) * head[BATCH] + b) * length + 6 * nodes + p
         out = (((t + 1) % head[RING]) * head[BATCH] + b) * length + 6 * nodes + p
         mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
+        # Read together, before they are needed.
         volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
+        bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
         F = plus_identity(tile_gradient(pad, base, 0, q), 1)
         if kind < 0:
-            void_fraction = fixed[mat + VOID_FRACTION * points]
             Q = F * 0
             factor = void_fraction * 0 + 1
             if void_fraction < 1:
@@ -229,7 +230,7 @@ def stress_point(
             else:
                 for c in range(6 * elements):
                     state[out + c * points] = 0
-            P = volume * piola(F, Q, fixed[mat + BULK * points], shear, factor, void_fraction)
+            P = volume * piola(F, Q, bulk, shear, factor, void_fraction)
         else:
             for c in range(6 * elements):
                 state[out + c * points] = 0

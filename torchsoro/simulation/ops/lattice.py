@@ -292,12 +292,12 @@ def _mesh(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Tensor:
     return torch.from_numpy(np.stack(np.meshgrid(x, y, z, indexing="ij"), -1).reshape(-1, 3))
 
 
-def numbers(lattice: Lattice, dt: float) -> Tensor:
-    """What kernels need to know of a lattice, float64: substep and cell, then axis by axis.
+def numbers(lattice: Lattice, dt: float, cell: float) -> Tensor:
+    """What kernels need to know of a lattice, float64: substep, size of a cell for contact, then axis by axis.
 
     Of an axis: three weights and three slopes [1/m] for each point; the places of the particles and of the nodes [m].
     """
-    rows = [np.array([dt, lattice.cell])]
+    rows = [np.array([dt, cell])]
     for axis in lattice.axes:
         table = np.concatenate([t.reshape(-1, 3) for t in axis.table], 1)
         rows += [table.reshape(-1), axis.inside(PARTICLES).reshape(-1), axis.places]

@@ -116,7 +116,7 @@ class TotalSegmentIntegrator:
         self.tables = _tables[scene]
         self.fixed = Arena(
             "fixed",
-            numbers(self.lattice, scene.dt).to(like),
+            numbers(self.lattice, scene.dt, scene.cell).to(like),
             *(like, inputs.prony, inputs.planes, self.nodal, self.chamber, scene.share),
         )
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, inputs.force)
