@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from problems import problem
 from test_ops import TENSORS, check
 
+import torchsoro
 from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
@@ -87,6 +88,27 @@ def test_both_engines_give_the_same_results_and_gradients(lattice):
         if name == "state":
             one, other = (t[:, : 6 * nodes] for t in (one, other))
         assert float((one - other).norm()) <= 1e-10 * float(other.norm()), name
+
+
+def on(device, p):
+    """Outputs of the kernels of a GPU on a device, and gradients of their sum."""
+    torchsoro.init(device)
+    s = p.scene
+    moved = {name: getattr(s, name).to(device) for name in ("kind", "share", "plane_kind", "probes")}
+    leaves = {name: t.detach().to(device).requires_grad_() for name, t in p.tensors.items()}
+    outputs = replace(p, scene=replace(s, **moved)).run(leaves)
+    gradients = torch.autograd.grad(torch.stack([o.sum() for o in outputs]).sum(), list(leaves.values()))
+    return [t.detach().cpu() for t in (*outputs, *gradients)]
+
+
+@pytest.mark.parametrize("lattice", [None, uneven(), wide()], ids=["uniform", "uneven", "wide"])
+def test_cuda_agrees_with_the_same_kernels_on_a_cpu_and_with_itself_bit_by_bit(cuda, lattice):
+    p = problem(formulation="total", lattice=lattice, batch=2, steps=12, samples=(0, 5, 12), lanes=False)
+    wanted, found, again = on("cpu", p), on(str(cuda), p), on(str(cuda), p)
+    torchsoro.init("cpu")
+    for a, b, c in zip(wanted, found, again, strict=True):
+        assert torch.equal(b, c)
+        assert float((a - b).norm()) <= 1e-12 * float(a.norm())
 
 
 @engines

@@ -23,6 +23,7 @@ from torchsoro.simulation.ops.tiles import tables, tile_count, tile_counts
 from torchsoro.simulation.runtime import init
 
 CHUNK = 1024  # substeps between two checks for divergence
+LAUNCH = 256  # substeps in a launch on a GPU, lest one that also drives a screen takes a large body's for hung
 BLOCKS = 2  # of 256 threads that a multiprocessor runs at a time: Taichi asks for so many, at 128 registers a thread
 TALLIES = 64  # shares in which sums over all nodes or points are taken
 _NEVER = 2**31 - 1
@@ -231,8 +232,11 @@ class TotalSegmentIntegrator:
 
             def go(first: int, last: int) -> None:
                 nonlocal arrivals
-                launch(1, first, last, arrivals)
-                arrivals += 2 * self.blocks * (last - first)
+                starts = range(first, last, LAUNCH)
+                for start in reversed(starts) if backward else starts:
+                    stop = min(start + LAUNCH, last)
+                    launch(1, start, stop, arrivals)
+                    arrivals += 2 * self.blocks * (stop - start)
 
             return go
         step = capture(on_cpu, *flags, 0, *buffers)
