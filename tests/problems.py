@@ -113,8 +113,12 @@ class Problem:
     def smooth(self, name: str, t: Tensor) -> Tensor:
         """A tensor in place of that name, but unchanged where a step to either side makes another problem.
 
-        Those are coefficients of zero, as of places without a particle, and void fractions of one.
+        Those are coefficients of zero, as of places without a particle, void fractions of one, and normals of axes.
         """
+        if name == "planes":
+            free = torch.ones_like(t, dtype=torch.bool)
+            free[..., layout.PLANE_NORMAL :] = (self.scene.plane_kind[:, layout.PLANE_AXIS] < 0).unsqueeze(-1)
+            return torch.where(free, t, self.tensors[name])
         if name != "coefficients":
             return t
         given = self.tensors[name]
@@ -212,7 +216,7 @@ def problem(
         high=(reach, reach, reach),
         kind=kind,
         share=share.to(dtype),
-        plane_kind=torch.tensor([[2, 1, int(stick), 0], [0, -1, 0, 0], [1, 1, 0, 0]], dtype=torch.int32),
+        plane_kind=torch.tensor([[2, 1, int(stick), 0, 0], [0, -1, 0, 0, 0], [1, 1, 0, 0, 0]], dtype=torch.int32),
         springs=True,
         viscous=True,
         stiffens=True,

@@ -84,7 +84,9 @@ def test_gradcheck_with_oblique_planes_that_pull_from_afar(name, elastic):
     normal += (0.01 if elastic else 0.2) * torch.randn(normal.shape, generator=g, dtype=torch.float64)
     normal /= normal.norm(dim=-1, keepdim=True)
     p.tensors["planes"][..., layout.PLANE_REACH] = 0.3
+    p.scene.plane_kind[:, layout.PLANE_AXIS] = -1
     p.scene.plane_kind[:, layout.PLANE_ELASTIC] = elastic
+    p.scene.plane_kind[:, layout.PLANE_AFAR] = 1
     assert check(p, name)
 
 

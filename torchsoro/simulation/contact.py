@@ -84,6 +84,11 @@ class Plane:
         """Whether the plane holds what is pressed on it."""
         return isinstance(self.friction, str)
 
+    @property
+    def pulls_from_afar(self) -> bool:
+        """Whether adhesion reaches beyond what touches."""
+        return bool((torch.as_tensor(self.reach) > 0).any())
+
     @classmethod
     def through(cls, point: Sequence[float] | Tensor, *, normal: Sequence[float] | Tensor, **settings) -> Plane:
         """The plane through a point [..., 3] m with a normal [..., 3]; further arguments as of the class."""
@@ -108,6 +113,7 @@ class Plane:
             layout.PLANE_SIGN: self.side,
             layout.PLANE_STICK: int(self.sticks),
             layout.PLANE_ELASTIC: int(self.landing == "elastic"),
+            layout.PLANE_AFAR: int(self.pulls_from_afar),
         }
         return [found[place] for place in range(layout.PLANE_INTEGERS)]
 
@@ -139,7 +145,7 @@ def check_updated(planes: Sequence[Plane]) -> None:
         given = {
             "normal": plane.normal is not None,
             "landing": plane.landing != "inelastic",
-            "reach": bool((torch.as_tensor(plane.reach) != 0).any()),
+            "reach": plane.pulls_from_afar,
         }
         for name in (name for name, there in given.items() if there):
             raise ValueError(

@@ -50,7 +50,13 @@ def _lanes_of(scene: Scene, batch: int, dtype: torch.dtype) -> Lanes:
 
 def in_lanes(scene: Scene, like: Tensor) -> bool:
     """Whether a scene's simulations on the device of a tensor run in lanes."""
-    return scene.lattice is not None and scene.lanes and not like.is_cuda
+    return scene.lattice is not None and scene.lanes and not like.is_cuda and plain(scene)
+
+
+def plain(scene: Scene) -> bool:
+    """Whether all planes are those of an axis, land inelastically and hold nothing from afar: lanes have no others."""
+    axis, elastic, afar = scene.plane_kind[:, [layout.PLANE_AXIS, layout.PLANE_ELASTIC, layout.PLANE_AFAR]].unbind(1)
+    return bool(((axis >= 0) & (elastic == 0) & (afar == 0)).all())
 
 
 def numbers(t: Tensor) -> np.ndarray:
@@ -408,7 +414,9 @@ class LaneIntegrator:
         if planes:
             by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
             by_plane = by_node.sum(-1).view(self.batch, planes, PLANE)
-            planes_bar = torch.cat([by_plane[..., 3:4] * s.plane_kind[:, 1:2], by_plane[..., 4:]], -1)
+            # The normal of an axis has no gradient.
+            planes_bar[..., layout.PLANE_OFFSET] = by_plane[..., 3] * s.plane_kind[:, 1]
+            planes_bar[..., [layout.PLANE_FRICTION, layout.PLANE_ADHESION]] = by_plane[..., 4:]
         gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
         if {"gravity", "force"} & wanted:
             mass = self.nodal[:, :1]
