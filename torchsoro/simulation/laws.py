@@ -161,6 +161,9 @@ def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach,
     elif gap < reach:
         v = along - hold
     way, gain, lands = plane_approach(v, gap, dt, push)
+    holds = push > 0 or lands > 0 or v > 0
+    if not holds:
+        held = held * 0
     after = v + gain
     back = min(max(after, after * 0), held)
     pressed = gain + held - back
@@ -197,6 +200,9 @@ def plane_contact_adjoint(
     elif gap < reach:
         v = along - hold
     way, gain, lands = plane_approach(v, gap, dt, push)
+    holds = push > 0 or lands > 0 or v > 0
+    if not holds:
+        held = held * 0
     after = v + gain
     back = min(max(after, after * 0), held)
     pressed = gain + held - back
@@ -251,9 +257,9 @@ def plane_contact_adjoint(
     t2_bar = rest * r2_bar + early * o2_bar + turned * t2
     along_bar = v_bar - (t0_bar * n0 + t1_bar * n1 + t2_bar * n2)
     hold_bar = v * 0
-    if gap < touch:
+    if gap < touch and holds:
         hold_bar = held_bar
-    elif gap < reach:
+    elif gap >= touch and gap < reach:
         hold_bar = -v_bar
     return (
         t0_bar + along_bar * n0,

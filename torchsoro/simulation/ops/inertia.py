@@ -61,15 +61,17 @@ class Matching:
         x, y, z = ((x - x.amin(0)) / half - 1).unbind(1)
         terms = torch.stack([torch.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], 1)
         normal = (m.square().unsqueeze(1) * terms.T) @ terms
-        normal = normal + 1e-13 * torch.diag_embed(normal.diagonal(dim1=1, dim2=2))
+        safe = normal + 1e-13 * torch.diag_embed(normal.diagonal(dim1=1, dim2=2))
         excess = spread.to(m) / half.square()
         wanted = torch.nn.functional.pad(-(m @ excess), (4, 3))
-        q = torch.linalg.solve(normal, wanted) @ terms.T
+        weights = torch.linalg.solve(safe, wanted)
+        weights = weights + torch.linalg.solve(safe, wanted - (normal @ weights.unsqueeze(2)).squeeze(2))
+        q = weights @ terms.T
         loss = (-m * q).relu()
         largest = loss.amax(1, keepdim=True)
         norm = largest * (loss / largest).pow(_NORM).sum(1, keepdim=True).pow(1 / _NORM)
         strength = ((_NONE - norm) / (_NONE - _MOST)).clamp(0, 1)
-        return cls(mass=m, terms=terms, excess=excess, normal=normal, q=q, loss=(loss, norm), strength=strength)
+        return cls(mass=m, terms=terms, excess=excess, normal=safe, q=q, loss=(loss, norm), strength=strength)
 
     @property
     def matched(self) -> Tensor:
