@@ -28,7 +28,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import torch
 import tyro
-from contact_checks import Curve, ball_drop, restitution, sliding, standing
+from contact_checks import Curve, ball_drop, couple, first_blow, restitution, sliding, standing
 from motion_checks import PAPER_STEP, fall, ramp, rheology, stability
 from structures import EXACT, FORMS, bar, damping, shifted, sphere
 from tables import Row, show
@@ -165,6 +165,8 @@ def main(check: tyro.conf.Positional[Check], out: Path | None = None) -> None:
         if out is not None:
             draw_ball(out / "ball.png", [curve for _, curves in drops for curve in curves])
     if wanted("contact"):
+        show("Energy that an elastic 30 mm cube loses at its first blow on the ground", first_blow())
+        show("Rotation of a free bar by a couple at its ends, total form", couple())
         show("Centre of a viscous 30 mm block at rest on smooth ground, against H/2 - rho g H^2 / (3 E)", standing())
         show("30 mm block, three Maxwell elements, slides to rest from 1 m/s, against v^2 / (2 mu g)", sliding())
         show("The same on a shifted grid", sliding((6,), shifts=(0.25, 0.5, 0.75)))
