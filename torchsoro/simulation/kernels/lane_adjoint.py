@@ -16,7 +16,6 @@ from torchsoro.simulation.kernels.lane_laws import (
     contract,
     cross,
     excess,
-    law,
     least_ratio,
     piola_adjoint,
     plus,
@@ -44,7 +43,6 @@ from torchsoro.simulation.kernels.lane_points import (
     VOLUME,
     VOLUME_VISCOSITY,
     deformed,
-    fast,
     gather,
     hand_on,
     keep,
@@ -54,7 +52,7 @@ from torchsoro.simulation.kernels.lane_points import (
     value,
 )
 from torchsoro.simulation.kernels.lane_threads import meet
-from torchsoro.simulation.kernels.lanes import larger, load, select, store
+from torchsoro.simulation.kernels.lanes import fast, larger, law, load, select, store
 
 
 class Sums(NamedTuple):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from torchsoro.simulation import laws
-from torchsoro.simulation.kernels.lane_laws import law
-from torchsoro.simulation.kernels.lanes import any_lane, larger, load, magnitude, select, square_root, store
+from torchsoro.simulation.kernels.lanes import any_lane, larger, law, load, magnitude, select, square_root, store
 
-GRAZING = 1 / laws.STEEPEST
-LOOK, CONTACT_DISTANCE = float(laws.LOOK), laws.TOUCH
+GRAZING = 0.2  # slope below which a point that arrives is taken to graze the plane
+LOOK = 2.0  # cells in front of a plane at which a node is looked at
+CONTACT_DISTANCE = 1e-3  # cells from which adhesion holds
 NORMAL, OFFSET, FRICTION, ADHESION, PLANE = 0, 3, 4, 5, 6  # numbers of a plane
 
 

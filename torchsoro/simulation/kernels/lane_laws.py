@@ -4,12 +4,7 @@ A tensor is a tuple of its nine components, row by row; a symmetric one of six: 
 of a symmetric tensor, an off-diagonal component counts once.
 """
 
-from numba import njit
-
-from torchsoro.simulation.kernels.lanes import larger, rough_cube_root, select, split
-
-OPTIONS = {"boundscheck": False, "error_model": "numpy", "nogil": True, "_nrt": False}
-law = njit(**OPTIONS, forceinline=True)
+from torchsoro.simulation.kernels.lanes import larger, law, rough_cube_root, select, split
 
 # Least volume ratio that the solid's share of a partly void point feels: a grey point under pressure may be crushed.
 CRUSHED = 0.2

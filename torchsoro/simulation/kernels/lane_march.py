@@ -11,14 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchsoro.simulation.kernels.lane_laws import law
 from torchsoro.simulation.kernels.lane_nodes import advance
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
     NUMBERS,
     ROOM,
     enclosed,
-    fast,
     gather,
     hand_on,
     keep,
@@ -28,7 +26,7 @@ from torchsoro.simulation.kernels.lane_points import (
     value,
 )
 from torchsoro.simulation.kernels.lane_threads import look, meet
-from torchsoro.simulation.kernels.lanes import load, store
+from torchsoro.simulation.kernels.lanes import fast, law, load, store
 
 NEVER = 2**62
 SCRATCH = ROOM + 5 * 1152  # numbers of a thread: for sums, and tensors of eight points of five kinds

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_contact import meets
-from torchsoro.simulation.kernels.lane_laws import law
-from torchsoro.simulation.kernels.lane_points import fast
-from torchsoro.simulation.kernels.lanes import load, select, store, total
+from torchsoro.simulation.kernels.lanes import fast, law, load, select, store, total
 
 STIFFNESS, REFERENCE = 0, 1  # numbers of a chamber: mean air stiffness, reference volume
 

@@ -11,21 +11,15 @@ lanes along y and z.
 
 from __future__ import annotations
 
-from numba import njit
-
 from torchsoro.simulation.kernels.lane_laws import (
-    OPTIONS,
     contract,
     excess,
-    law,
     least_ratio,
     piola,
     pull_back,
     viscous_piola,
 )
-from torchsoro.simulation.kernels.lanes import any_lane, larger, load, select, store
-
-fast = njit(**OPTIONS, cache=True)
+from torchsoro.simulation.kernels.lanes import any_lane, larger, law, load, select, store
 
 # Numbers of a point.
 VOLUME, BULK, SHEAR, VOID_FRACTION, STIFFENING, VISCOSITY, VOLUME_VISCOSITY = 0, 1, 2, 3, 4, 6, 7

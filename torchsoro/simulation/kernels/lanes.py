@@ -11,13 +11,17 @@ import operator
 from typing import Any
 
 from llvmlite import ir
-from numba import types
+from numba import njit, types
 from numba.core import cgutils
 from numba.core.typeconv.castgraph import Conversion
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
 from numba.extending import intrinsic, lower_builtin, lower_cast, models, register_model
 
 LANES = 16
+# Without counts of references to arrays: every slice would be counted, which takes longer than what is done with some.
+_OPTIONS: dict[str, Any] = {"boundscheck": False, "error_model": "numpy", "nogil": True, "_nrt": False}
+law = njit(**_OPTIONS, forceinline=True)
+fast = njit(**_OPTIONS, cache=True)
 FLAGS = ("nsz", "arcp", "contract")
 
 
