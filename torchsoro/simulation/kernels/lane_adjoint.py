@@ -26,6 +26,7 @@ from torchsoro.simulation.kernels.lane_laws import (
 from torchsoro.simulation.kernels.lane_march import SCRATCH, clear
 from torchsoro.simulation.kernels.lane_nodes import (
     chamber_pressure,
+    gravity_row,
     sum_areas,
     sum_chamber,
     sum_items,
@@ -34,6 +35,7 @@ from torchsoro.simulation.kernels.lane_nodes import (
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
     BULK,
+    MAXWELL,
     NUMBERS,
     ROOM,
     SHEAR,
@@ -136,7 +138,7 @@ def point_adjoint(
         T = pull_back(F, least)
     S = (factor * T[0], factor * T[1], factor * T[2], factor * T[3], factor * T[4], factor * T[5])
     for e in range(elements):
-        g, b = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16)
+        g, b = load(maxwell, m + 64 * e), load(maxwell, m + 64 * e + 16)
         gb, i = g * b, before + 96 * e
         Q0, Q1 = Q0 + g * load(past, i) + gb * S[0], Q1 + g * load(past, i + 16) + gb * S[1]
         Q2, Q3 = Q2 + g * load(past, i + 32) + gb * S[2], Q3 + g * load(past, i + 48) + gb * S[3]
@@ -151,7 +153,8 @@ def point_adjoint(
     # S_bar gathers from all elements.
     Z0, Z1, Z2, Z3, Z4, Z5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
     for e in range(elements):
-        g, b, a = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16), load(maxwell, m + 48 * e + 32)
+        g, b, a = load(maxwell, m + 64 * e), load(maxwell, m + 64 * e + 16), load(maxwell, m + 64 * e + 32)
+        fade = load(maxwell, m + 64 * e + 48)
         q0, q1, q2 = volume * R[0], volume * R[1], volume * R[2]
         q3, q4, q5 = volume * R[3], volume * R[4], volume * R[5]
         o, i = after + 96 * e, before + 96 * e
@@ -159,10 +162,10 @@ def point_adjoint(
         h3, h4, h5 = load(bars, o + 48), load(bars, o + 64), load(bars, o + 80)
         lost = 1 - a
         Z0, Z1, Z2 = (
-            Z0 + b * (g * q0 - lost * h0), Z1 + b * (g * q1 - lost * h1), Z2 + b * (g * q2 - lost * h2)
+            Z0 + b * g * q0 - fade * h0, Z1 + b * g * q1 - fade * h1, Z2 + b * g * q2 - fade * h2
         )  # fmt: skip
         Z3, Z4, Z5 = (
-            Z3 + b * (g * q3 - lost * h3), Z4 + b * (g * q4 - lost * h4), Z5 + b * (g * q5 - lost * h5)
+            Z3 + b * g * q3 - fade * h3, Z4 + b * g * q4 - fade * h4, Z5 + b * g * q5 - fade * h5
         )  # fmt: skip
         if flags[3]:
             z0, z1, z2 = load(past, i), load(past, i + 16), load(past, i + 32)
@@ -315,7 +318,7 @@ def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room,
         n = (g * blocks + b) * 128 * NUMBERS
         h = (g * blocks + b) * 8 * each
         e = (g * blocks + b) * 48 * case.elements
-        m, s = g * 48 * case.elements, case.softening[32 * g :]
+        m, s = g * 16 * MAXWELL * case.elements, case.softening[32 * g :]
         for k in range(8):
             point_adjoint(
                 G, B, rates, 144 * k, case.numbers, n + 16 * NUMBERS * k, work.histories, past + h + each * k,
@@ -439,7 +442,7 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                 store(sums.surfaces, s, select(moves, c0, zero))
                 store(sums.surfaces, s + n, select(moves, c1, zero))
                 store(sums.surfaces, s + 2 * n, select(moves, c2, zero))
-            pull = 48 * (t * case.groups + g)
+            pull = gravity_row(case, g, t)
             g0, g1, g2 = load(case.gravity, pull), load(case.gravity, pull + 16), load(case.gravity, pull + 32)
             whole = 1 / left
             add(sums.drag_factor, node, select(moves, (u0 * b0 + u1 * b1 + u2 * b2) * whole, zero))

@@ -14,6 +14,7 @@ import numpy as np
 from torchsoro.simulation.kernels.lane_nodes import advance
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
+    MAXWELL,
     NUMBERS,
     ROOM,
     enclosed,
@@ -26,6 +27,7 @@ from torchsoro.simulation.kernels.lane_points import (
     value,
 )
 from torchsoro.simulation.kernels.lane_threads import look, meet
+from torchsoro.simulation.kernels.lane_walls import ties_forward, walls_forward
 from torchsoro.simulation.kernels.lanes import fast, law, load, store
 
 NEVER = 2**62
@@ -63,6 +65,14 @@ class Mesh(NamedTuple):
     plane_item: np.ndarray
     plane_slot: np.ndarray
     places: np.ndarray
+    own: np.ndarray
+    wall_begin: np.ndarray
+    wall_at: np.ndarray
+    wall_value: np.ndarray
+    wall_place: np.ndarray
+    wall_axis: np.ndarray
+    wall_area: np.ndarray
+    wall_chamber: np.ndarray
 
 
 class Case(NamedTuple):
@@ -86,7 +96,12 @@ class Case(NamedTuple):
     pressure: np.ndarray
     gravity: np.ndarray
     share: np.ndarray
+    share_there: np.ndarray
     force: np.ndarray
+    force_start: np.ndarray
+    tie_share: np.ndarray
+    tie_stiffness: np.ndarray
+    quadratic: np.ndarray
     plane_numbers: np.ndarray
     plane_stick: np.ndarray
     area: np.ndarray
@@ -105,6 +120,7 @@ class Work(NamedTuple):
     forces: np.ndarray
     areas: np.ndarray
     swept: np.ndarray
+    stretch: np.ndarray
     collapsed: np.ndarray
     sync: np.ndarray
     scratch: np.ndarray
@@ -178,7 +194,7 @@ def points_forward(mesh, case, work, g, item, past, future, state, room, G, rate
             collapsed = gas_forward(mesh, case, work, g, item, b, G, rates, room) or collapsed
         n = (g * blocks + b) * 128 * NUMBERS
         h = (g * blocks + b) * 8 * each
-        m, s = g * 48 * case.elements, case.softening[32 * g :]
+        m, s = g * 16 * MAXWELL * case.elements, case.softening[32 * g :]
         for k in range(8):
             gone = point(
                 G, rates, 144 * k, case.numbers, n + 16 * NUMBERS * k, work.histories, past + h + each * k,
@@ -188,6 +204,8 @@ def points_forward(mesh, case, work, g, item, past, future, state, room, G, rate
         if case.flags[4]:
             springs_forward(mesh, case, work, g, item, b, corner, rates)
         scatter(mesh, b, x, forces, out, room, G)
+    if mesh.wall_begin[item] < mesh.wall_begin[item + 1]:
+        walls_forward(mesh, case, work, g, item, corner)
     return collapsed
 
 
@@ -208,6 +226,9 @@ def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where
             g, item = task // items, task % items
             if points_forward(mesh, case, work, g, item, past, future, now + g * 6 * mesh.component, room, G, rates):
                 work.collapsed[8 * rank] = min(work.collapsed[8 * rank], t)
+        if rank == 0 and case.tie_stiffness.size:
+            for g in range(case.groups):
+                ties_forward(mesh, case, work, g, now + g * 6 * mesh.component)
         meet(work.sync, threads)
         if stop_where_collapsed:
             for other in range(threads):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_contact import meets
-from torchsoro.simulation.kernels.lanes import fast, law, load, select, store, total
+from torchsoro.simulation.kernels.lanes import fast, law, load, magnitude, select, store, total
 
 STIFFNESS, REFERENCE = 0, 1  # numbers of a chamber: mean air stiffness, reference volume
 
@@ -46,9 +46,24 @@ def force_at(mesh, case, work, g, p, c, at, t):
     found = sum_items(work.forces, mesh, g * items * size, size, p, c, at)
     i = mesh.front + p * mesh.plane + at
     for k in range(case.share.shape[0]):
-        force = load(case.force, 16 * (3 * ((t * case.groups + g) * case.share.shape[0] + k) + c))
-        found = found - load(case.share[k], i) * force
+        start = case.force_start[k]
+        # Forces that begin at a step have one row; others one for each step.
+        if start <= t and case.share_there[k, i // 16]:
+            row = t if start < 0 else 0
+            force = load(case.force, 16 * (3 * ((row * case.groups + g) * case.share.shape[0] + k) + c))
+            found = found - load(case.share[k], i) * force
+    ties = case.tie_stiffness.size // (16 * case.groups)
+    for k in range(ties):
+        tie = g * ties + k
+        pull = load(case.tie_stiffness, 16 * tie) * load(work.stretch, 16 * (3 * tie + c))
+        found = found + load(case.tie_share, tie * mesh.component + i) * pull
     return found
+
+
+@law
+def gravity_row(case, g, t):
+    """Where gravity of a substep begins; constant gravity has one row."""
+    return 48 * (t * case.groups + g) if case.gravity.size > 48 * case.groups else 48 * g
 
 
 @law
@@ -108,11 +123,17 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
         n = mesh.component
         d0, d1, d2 = load(d, a), load(d, a + n), load(d, a + 2 * n)
         v0, v1, v2 = load(d, a + 3 * n), load(d, a + 4 * n), load(d, a + 5 * n)
-        pull = 48 * (t * case.groups + g)
+        pull = gravity_row(case, g, t)
         moves = free > 0
-        u0 = select(moves, left * (v0 + dt * (load(case.gravity, pull) - light * f0)), v0)
-        u1 = select(moves, left * (v1 + dt * (load(case.gravity, pull + 16) - light * f1)), v1)
-        u2 = select(moves, left * (v2 + dt * (load(case.gravity, pull + 32) - light * f2)), v2)
+        u0 = v0 + dt * (load(case.gravity, pull) - light * f0)
+        u1 = v1 + dt * (load(case.gravity, pull + 16) - light * f1)
+        u2 = v2 + dt * (load(case.gravity, pull + 32) - light * f2)
+        if case.quadratic.size:
+            q, sink = 3 * g * mesh.component + i, dt * light
+            u0 = u0 / (1 + sink * load(case.quadratic, q) * magnitude(u0))
+            u1 = u1 / (1 + sink * load(case.quadratic, q + n) * magnitude(u1))
+            u2 = u2 / (1 + sink * load(case.quadratic, q + 2 * n) * magnitude(u2))
+        u0, u1, u2 = select(moves, left * u0, v0), select(moves, left * u1, v1), select(moves, left * u2, v2)
         planes = len(case.plane_stick)
         o0, o1, o2 = u0 * 0, u1 * 0, u2 * 0
         if planes > 0:

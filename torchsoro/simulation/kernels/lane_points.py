@@ -24,9 +24,9 @@ from torchsoro.simulation.kernels.lanes import any_lane, larger, law, load, sele
 # Numbers of a point.
 VOLUME, BULK, SHEAR, VOID_FRACTION, STIFFENING, VISCOSITY, VOLUME_VISCOSITY = 0, 1, 2, 3, 4, 6, 7
 NUMBERS = 8
-# Numbers of a Maxwell element: g, b, a.
-MODULUS, GAIN, DECAY = 0, 1, 2
-MAXWELL = 3
+# Numbers of a Maxwell element: g, b, a, and b (1 - a), which float32 would not find from the others.
+MODULUS, GAIN, DECAY, FADE = 0, 1, 2, 3
+MAXWELL = 4
 
 
 @law
@@ -191,8 +191,8 @@ def added(S, past, before, future, after, elements, maxwell, m):
     """Q = sum g (Z + b S) over the Maxwell elements, and their states: Z becomes a Z - b (1 - a) S."""
     Q0, Q1, Q2, Q3, Q4, Q5 = 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0]
     for e in range(elements):
-        g, b, a = load(maxwell, m + 48 * e), load(maxwell, m + 48 * e + 16), load(maxwell, m + 48 * e + 32)
-        gb, fade = g * b, b - b * a
+        g, b = load(maxwell, m + 64 * e), load(maxwell, m + 64 * e + 16)
+        a, fade, gb = load(maxwell, m + 64 * e + 32), load(maxwell, m + 64 * e + 48), g * b
         i, o = before + 96 * e, after + 96 * e
         z0, z1, z2 = load(past, i), load(past, i + 16), load(past, i + 32)
         z3, z4, z5 = load(past, i + 48), load(past, i + 64), load(past, i + 80)

@@ -155,10 +155,12 @@ class LaneIntegrator:
         wide = share.unsqueeze(0).expand(self.batch, -1, -1) if len(share) else share.unsqueeze(0)
         shares = lanes.from_nodes(wide)[0] if len(share) else like.new_zeros(0, self.mesh.component)
         prony = i.prony[..., _PRONY]
+        prony = torch.cat([prony, prony[..., 1:2] * (1 - prony[..., 2:])], -1)
         assert prony.shape[-1] == MAXWELL
         chambers = self.mesh.chambers
         softening = like.new_zeros(lanes.groups, 2, LANES)
         softening[:, 1] = 1
+        none = np.zeros(0, numbers(like).dtype)
         return Case(
             dt=float(s.dt),
             groups=lanes.groups,
@@ -178,7 +180,12 @@ class LaneIntegrator:
             pressure=numbers(lanes.from_batch(i.pressure[:, :, :chambers], 1)),
             gravity=numbers(lanes.from_batch(i.gravity, 1)),
             share=shares.numpy(),
+            share_there=(shares.view(len(shares), self.mesh.component // LANES, LANES) != 0).any(-1).numpy(),
             force=numbers(lanes.from_batch(i.force, 1)),
+            force_start=np.full(len(shares), -1),
+            tie_share=none,
+            tie_stiffness=none,
+            quadratic=none,
             plane_numbers=numbers(lanes.from_batch(planes)),
             plane_stick=np.array(stick, bool),
             area=np.full(max(1, len(axis)) * self.mesh.component, s.cell**2, numbers(like).dtype),
@@ -264,6 +271,7 @@ class LaneIntegrator:
             forces=numbers(like.new_zeros(tasks, size)),
             areas=numbers(like.new_zeros(tasks, mesh.chambers, size)),
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
+            stretch=np.zeros(3 * self.case.tie_stiffness.size, numbers(like).dtype),
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),
             scratch=aligned(threads * SCRATCH, numbers(like).dtype),
@@ -407,7 +415,7 @@ class LaneIntegrator:
         found[:, layout.DRAG] += drag_bar
         prony_bar = torch.zeros_like(i.prony)
         if self.elements and "prony" in wanted:
-            by_element = tensor(sums.maxwell, groups, blocks, self.elements, MAXWELL, LANES).sum(1)
+            by_element = tensor(sums.maxwell, groups, blocks, self.elements, len(_PRONY), LANES).sum(1)
             prony_bar[..., _PRONY] = lanes.to_batch(by_element)
         planes = s.plane_kind.shape[0]
         planes_bar = torch.zeros_like(i.planes)

@@ -248,6 +248,14 @@ def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> L
         plane_item=np.array([i for e in listed for i, _ in e], whole),
         plane_slot=np.array([s for e in listed for _, s in e], whole),
         places=places.numpy().reshape(-1),
+        own=(np.arange(LANES) < unit).astype(real),
+        wall_begin=np.zeros(len(items) + 1, whole),
+        wall_at=np.zeros(0, whole),
+        wall_value=np.zeros(0, real),
+        wall_place=np.zeros(0, real),
+        wall_axis=np.zeros(0, whole),
+        wall_area=np.zeros(0, real),
+        wall_chamber=np.zeros(0, whole),
     )  # fmt: skip
     return Lanes(
         mesh=mesh,
