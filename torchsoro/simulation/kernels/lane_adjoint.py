@@ -383,7 +383,8 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                     d1 = d1 + volume_bar * sum_areas(mesh, work, g, k, p, 1, at)
                     d2 = d2 + volume_bar * sum_areas(mesh, work, g, k, p, 2, at)
             if planes > 0:
-                s0, s1, s2 = spread(mesh, case, sums.surfaces, (t + 1) % 2, g, i)
+                after = ((t + 1) * case.groups + g) * 6 * n
+                s0, s1, s2 = spread(mesh, case, work.states, after, sums.surfaces, (t + 1) % 2, g, i)
                 d0, d1, d2 = d0 + s0, d1 + s1, d2 + s2
             if case.flags[2]:
                 v0 = v0 + sum_items(sums.rates, mesh, first, size, p, 0, at)
@@ -418,25 +419,9 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
             if planes > 0:
                 s = (t * case.groups + g) * 3 * n + i
                 u0, u1, u2 = load(work.pushed, s), load(work.pushed, s + n), load(work.pushed, s + 2 * n)
+                by_way = dt * d0, dt * d1, dt * d2
                 b0, b1, b2, c0, c1, c2, mass_bar = meets_adjoint(
-                    mesh,
-                    case,
-                    work.states,
-                    state,
-                    sums,
-                    g,
-                    i,
-                    light,
-                    moves,
-                    u0,
-                    u1,
-                    u2,
-                    b0,
-                    b1,
-                    b2,
-                    dt * d0,
-                    dt * d1,
-                    dt * d2,
+                    mesh, case, work.states, state, sums, g, i, light, moves, (u0, u1, u2), (b0, b1, b2), by_way
                 )
                 s = (((t % 2) * case.groups + g) * 3) * n + i
                 store(sums.surfaces, s, select(moves, c0, zero))

@@ -1,64 +1,33 @@
-"""Planes against the nodes, in lanes: the rules of ``contact`` and ``surface`` without branches, and their adjoint."""
+"""Planes against the nodes, in lanes: the counterpart of ``surface``, with the same law, and the adjoint."""
 
 from __future__ import annotations
 
-from torchsoro.simulation.kernels.lanes import any_lane, larger, law, load, magnitude, select, square_root, store
+from torchsoro.simulation.kernels.lanes import any_lane, law, load, magnitude, select, square_root, store
+from torchsoro.simulation.kernels.laws_lanes import laws
 
-GRAZING = 0.2  # slope below which a point that arrives is taken to graze the plane
-LOOK = 2.0  # cells in front of a plane at which a node is looked at
-CONTACT_DISTANCE = 1e-3  # cells from which adhesion holds
-NORMAL, OFFSET, FRICTION, ADHESION, PLANE = 0, 3, 4, 5, 6  # numbers of a plane
+NORMAL, OFFSET, FRICTION, ADHESION, REACH, PLANE = 0, 3, 4, 5, 6, 7  # numbers of a plane
+LOOK, TOUCH, PUSH = laws.LOOK, laws.TOUCH, laws.PUSH
+plane_contact, plane_contact_adjoint = laws.plane_contact, laws.plane_contact_adjoint
 
 
 @law
-def dot(a0, a1, a2, b0, b1, b2):
+def dot(a, b):
     """A . b."""
-    return a0 * b0 + a1 * b1 + a2 * b2
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @law
-def response(u0, u1, u2, n0, n1, n2, normal, sticks, friction, hold):
-    """Velocity after a plane, as ``contact.response``."""
-    t0, t1, t2 = u0 - normal * n0, u1 - normal * n1, u2 - normal * n2
-    speed = square_root(larger(dot(t0, t1, t2, t0, t1, t2), 1e-30))
-    loss = friction * (hold - normal)
-    rest = select(speed > loss, 1 - loss / speed, 0 * speed)
-    if sticks:
-        rest = 0 * rest
-    tears = normal > hold
-    held = ((normal < 0) | (hold > 0)) & ~tears
-    r0, r1, r2 = select(held, rest * t0, u0), select(held, rest * t1, u1), select(held, rest * t2, u2)
-    return select(tears, u0 - hold * n0, r0), select(tears, u1 - hold * n1, r1), select(tears, u2 - hold * n2, r2)
+def vector(a, at, stride):
+    """Three components."""
+    return load(a, at), load(a, at + stride), load(a, at + 2 * stride)
 
 
 @law
-def lands(u0, u1, u2, n0, n1, n2, gap, dt, sticks, friction, hold):
-    """Velocity after a plane that is ``gap`` away, and what carries a point that arrives onto it."""
-    normal = dot(u0, u1, u2, n0, n1, n2)
-    way = larger(gap, 0.0)
-    arrives = normal * dt + way < 0
-    leaves = (normal > 0) & (hold >= 0) & ~arrives
-    pull = larger(hold, 0.0)
-    r0, r1, r2 = response(u0, u1, u2, n0, n1, n2, normal, sticks, friction, pull)
-    l0, l1, l2 = u0 - r0 - normal * n0, u1 - r1 - normal * n1, u2 - r2 - normal * n2
-    speed = larger(-normal, GRAZING * square_root(larger(dot(l0, l1, l2, l0, l1, l2), 1e-30)))
-    rate, back = way / dt, 1 / larger(speed, 1e-30)
-    o0, o1, o2 = rate * (l0 * back - n0), rate * (l1 * back - n1), rate * (l2 * back - n2)
-    felt, zero = arrives | leaves, 0 * normal
-    return (
-        select(felt, r0, u0), select(felt, r1, u1), select(felt, r2, u2),
-        select(arrives, o0, zero), select(arrives, o1, zero), select(arrives, o2, zero),
-    )  # fmt: skip
-
-
-@law
-def inward(mesh, d, state, i, stride, component, reach):
-    """From nodes to their neighbours towards ``reach``: how far along an axis, deformation included."""
-    c = component * mesh.component
-    here = load(d, state + c + i) + load(mesh.places, c + i)
-    up = load(d, state + c + i + stride) + load(mesh.places, c + i + stride)
-    down = load(d, state + c + i - stride) + load(mesh.places, c + i - stride)
-    return select(reach > 0, up, down) - here
+def add_vector(a, at, stride, v):
+    """Add to three components."""
+    store(a, at, load(a, at) + v[0])
+    store(a, at + stride, load(a, at + stride) + v[1])
+    store(a, at + 2 * stride, load(a, at + 2 * stride) + v[2])
 
 
 @law
@@ -70,187 +39,180 @@ def stride_of(mesh, c):
 
 
 @law
-def surface_gap(mesh, case, d, state, g, i, q):
-    """Distance in front of a plane of nodes, and of the surface of the matter that they carry."""
-    n0, n1, n2 = load(case.plane_numbers, q), load(case.plane_numbers, q + 16), load(case.plane_numbers, q + 32)
-    n = mesh.component
-    x0 = load(d, state + i) + load(mesh.places, i)
-    x1 = load(d, state + i + n) + load(mesh.places, i + n)
-    x2 = load(d, state + i + 2 * n) + load(mesh.places, i + 2 * n)
-    node = dot(x0, x1, x2, n0, n1, n2) - load(case.plane_numbers, q + 16 * OFFSET)
-    gap = node
-    for c in range(3):
-        reach = load(case.reach, (3 * g + c) * n + i)
-        way = magnitude(reach)
-        if any_lane(way > 0):
-            stride = stride_of(mesh, c)
-            a0, a1, a2 = (
-                inward(mesh, d, state, i, stride, 0, reach),
-                inward(mesh, d, state, i, stride, 1, reach),
-                inward(mesh, d, state, i, stride, 2, reach),
-            )
-            gap = gap + select(way > 0, way * dot(a0, a1, a2, n0, n1, n2), 0 * way)
-    return node, gap, n0, n1, n2
+def place(mesh, d, state, i):
+    """Where nodes are."""
+    x, u = vector(mesh.places, i, mesh.component), vector(d, state + i, mesh.component)
+    return x[0] + u[0], x[1] + u[1], x[2] + u[2]
 
 
 @law
-def meets(mesh, case, d, state, g, i, count, light, u0, u1, u2):
-    """Velocity after the first ``count`` planes, one after the other, and what carries the nodes onto them."""
-    dt = case.dt
-    o0, o1, o2 = 0 * u0, 0 * u0, 0 * u0
+def step_inward(mesh, d, state, i, c, reach):
+    """The way from nodes to their neighbours towards ``reach`` along axis c, and its length in the undeformed body."""
+    stride, n = stride_of(mesh, c), mesh.component
+    here, up, down = place(mesh, d, state, i), place(mesh, d, state, i + stride), place(mesh, d, state, i - stride)
+    on = reach > 0
+    step = (
+        select(on, up[0], down[0]) - here[0],
+        select(on, up[1], down[1]) - here[1],
+        select(on, up[2], down[2]) - here[2],
+    )
+    at = c * n + i
+    other = select(on, load(mesh.places, at + stride), load(mesh.places, at - stride))
+    return step, magnitude(other - load(mesh.places, at))
+
+
+@law
+def inward(mesh, case, d, state, i, c, reach):
+    """:func:`step_inward`, of its undeformed length if planes keep energy."""
+    step, length = step_inward(mesh, d, state, i, c, reach)
+    if case.keeps:
+        scale = length / square_root(dot(step, step))
+        step = step[0] * scale, step[1] * scale, step[2] * scale
+    return step
+
+
+@law
+def inward_adjoint(mesh, case, d, state, i, c, reach, bar):
+    """Adjoint of :func:`inward` times the reach: gradient by the way to the neighbour, where there is a reach."""
+    way, zero = magnitude(reach), 0 * reach
+    found = bar[0] * way, bar[1] * way, bar[2] * way
+    if case.keeps:
+        step, length = step_inward(mesh, d, state, i, c, reach)
+        one = 1 / square_root(dot(step, step))
+        e = step[0] * one, step[1] * one, step[2] * one
+        along, scale = dot(found, e), length * one
+        found = scale * (found[0] - along * e[0]), scale * (found[1] - along * e[1]), scale * (found[2] - along * e[2])
+    there = way > 0
+    return select(there, found[0], zero), select(there, found[1], zero), select(there, found[2], zero)
+
+
+@law
+def surface(mesh, case, d, state, g, i):
+    """Where the surface of the matter is that nodes carry."""
+    x0, x1, x2 = place(mesh, d, state, i)
+    for c in range(3):
+        reach = load(case.reach, (3 * g + c) * mesh.component + i)
+        way = magnitude(reach)
+        there, zero = way > 0, 0 * way
+        if any_lane(there):
+            a = inward(mesh, case, d, state, i, c, reach)
+            x0, x1, x2 = (
+                x0 + select(there, way * a[0], zero),
+                x1 + select(there, way * a[1], zero),
+                x2 + select(there, way * a[2], zero),
+            )
+    return x0, x1, x2
+
+
+@law
+def contact_numbers(mesh, case, g, k, i, light):
+    """What ``plane_contact`` takes of plane k: stick, friction, hold, reach, touch, push; and hold by adhesion."""
     planes = len(case.plane_stick)
+    q, s = 16 * PLANE * (g * planes + k), (g * planes + k) * mesh.component + i
+    zero = 0 * light
+    per_adhesion = load(case.area, s) * case.dt * light
+    hold = load(case.plane_numbers, q + 16 * ADHESION) * per_adhesion
+    reach = select(load(case.far, s) > 0, load(case.plane_numbers, q + 16 * REACH), zero)
+    stick, push = zero + 1.0 * case.plane_stick[k], zero + PUSH * case.plane_elastic[k]
+    return (
+        stick,
+        load(case.plane_numbers, q + 16 * FRICTION),
+        hold,
+        reach,
+        zero + TOUCH * case.spacing,
+        push,
+        per_adhesion,
+    )
+
+
+@law
+def meets(mesh, case, d, state, g, i, count, light, u):
+    """Velocity after the first ``count`` planes, one after the other, and what carries the nodes onto them."""
+    u0, u1, u2 = u
+    zero = 0 * u0
+    o0, o1, o2 = zero, zero, zero
+    x = place(mesh, d, state, i)
+    touching = load(case.touches, i) > 0
     for k in range(count):
-        q = 16 * PLANE * (g * planes + k)
-        n = mesh.component
-        node = dot(
-            load(d, state + i) + load(mesh.places, i),
-            load(d, state + i + n) + load(mesh.places, i + n),
-            load(d, state + i + 2 * n) + load(mesh.places, i + 2 * n),
-            load(case.plane_numbers, q),
-            load(case.plane_numbers, q + 16),
-            load(case.plane_numbers, q + 32),
-        ) - load(case.plane_numbers, q + 16 * OFFSET)
-        near = node < LOOK * case.spacing
+        q = 16 * PLANE * (g * len(case.plane_stick) + k)
+        n, level = vector(case.plane_numbers, q, 16), load(case.plane_numbers, q + 16 * OFFSET)
+        near = touching & (dot(x, n) - level < LOOK * case.spacing + load(case.plane_numbers, q + 16 * REACH))
         if any_lane(near):
-            _, gap, n0, n1, n2 = surface_gap(mesh, case, d, state, g, i, q)
-            area = load(case.area, k * n + i)
-            hold = load(case.plane_numbers, q + 16 * ADHESION) * area * dt * light
-            hold = select(gap < CONTACT_DISTANCE * case.spacing, hold, 0 * hold - 1)
-            friction = load(case.plane_numbers, q + 16 * FRICTION)
-            r0, r1, r2, p0, p1, p2 = lands(u0, u1, u2, n0, n1, n2, gap, dt, case.plane_stick[k], friction, hold)
+            gap = dot(surface(mesh, case, d, state, g, i), n) - level
+            stick, friction, hold, reach, touch, push, _ = contact_numbers(mesh, case, g, k, i, light)
+            r0, r1, r2, p0, p1, p2 = plane_contact(
+                u0, u1, u2, n[0], n[1], n[2], gap, case.dt, stick, friction, hold, reach, touch, push
+            )
             u0, u1, u2 = select(near, r0, u0), select(near, r1, u1), select(near, r2, u2)
-            zero = 0 * p0
             o0, o1, o2 = o0 + select(near, p0, zero), o1 + select(near, p1, zero), o2 + select(near, p2, zero)
     return u0, u1, u2, o0, o1, o2
 
 
 @law
-def response_adjoint(u0, u1, u2, n0, n1, n2, normal, sticks, friction, hold, b0, b1, b2):
-    """Adjoint of :func:`response`: gradients by the velocity, friction and hold."""
-    t0, t1, t2 = u0 - normal * n0, u1 - normal * n1, u2 - normal * n2
-    speed = square_root(larger(dot(t0, t1, t2, t0, t1, t2), 1e-30))
-    loss = friction * (hold - normal)
-    slides, zero = speed > loss, 0 * speed
-    e0, e1, e2 = t0 / speed, t1 / speed, t2 / speed
-    loss_bar = -dot(e0, e1, e2, b0, b1, b2)
-    along = dot(b0, b1, b2, n0, n1, n2)
-    f0, f1, f2 = b0 - along * n0, b1 - along * n1, b2 - along * n2
-    share, ahead = loss / speed, dot(e0, e1, e2, f0, f1, f2)
-    pressed = loss_bar * friction
-    h0 = f0 - share * (f0 - ahead * e0) - pressed * n0
-    h1 = f1 - share * (f1 - ahead * e1) - pressed * n1
-    h2 = f2 - share * (f2 - ahead * e2) - pressed * n2
-    friction_bar, hold_bar = loss_bar * (hold - normal), pressed
-    h0, h1, h2 = select(slides, h0, zero), select(slides, h1, zero), select(slides, h2, zero)
-    friction_bar, hold_bar = select(slides, friction_bar, zero), select(slides, hold_bar, zero)
-    if sticks:
-        h0, h1, h2, friction_bar, hold_bar = zero, zero, zero, zero, zero
-    tears = normal > hold
-    held = ((normal < 0) | (hold > 0)) & ~tears
-    return (
-        select(held, h0, b0), select(held, h1, b1), select(held, h2, b2),
-        select(held, friction_bar, zero), select(held, hold_bar, select(tears, -along, zero)),
-    )  # fmt: skip
-
-
-@law
-def lands_adjoint(u0, u1, u2, n0, n1, n2, gap, dt, sticks, friction, hold, b0, b1, b2, o0, o1, o2):
-    """Adjoint of :func:`lands`: gradients by the velocity, gap, friction and hold."""
-    normal, zero = dot(u0, u1, u2, n0, n1, n2), 0 * gap
-    way = larger(gap, 0.0)
-    arrives = normal * dt + way < 0
-    leaves = (normal > 0) & (hold >= 0) & ~arrives
-    pull = larger(hold, 0.0)
-    r0, r1, r2 = response(u0, u1, u2, n0, n1, n2, normal, sticks, friction, pull)
-    # What carries it onto the plane.
-    l0, l1, l2 = u0 - r0 - normal * n0, u1 - r1 - normal * n1, u2 - r2 - normal * n2
-    size = square_root(larger(dot(l0, l1, l2, l0, l1, l2), 1e-30))
-    grazes = -normal < GRAZING * size
-    speed = larger(larger(-normal, GRAZING * size), 1e-30)
-    back, on = 1 / speed, dot(o0, o1, o2, n0, n1, n2)
-    gap_bar = dot(l0 * back - n0, l1 * back - n1, l2 * back - n2, o0, o1, o2) / dt
-    rate = way * back / dt
-    m0, m1, m2 = rate * (o0 - on * n0), rate * (o1 - on * n1), rate * (o2 - on * n2)
-    speed_bar = -dot(m0, m1, m2, l0, l1, l2) * back
-    turned = select(grazes, speed_bar * GRAZING / size, zero)
-    m0, m1, m2 = m0 + turned * l0, m1 + turned * l1, m2 + turned * l2
-    straight = select(grazes, zero, speed_bar)
-    carried = arrives & (gap > 0)
-    m0, m1, m2 = select(carried, m0, zero), select(carried, m1, zero), select(carried, m2, zero)
-    straight, gap_bar = select(carried, straight, zero), select(carried, gap_bar, zero)
-    h0, h1, h2, friction_bar, hold_bar = response_adjoint(
-        u0, u1, u2, n0, n1, n2, normal, sticks, friction, pull, b0 - m0, b1 - m1, b2 - m2
-    )
-    h0, h1, h2 = h0 + m0 - straight * n0, h1 + m1 - straight * n1, h2 + m2 - straight * n2
-    felt = arrives | leaves
-    return (
-        select(felt, h0, b0), select(felt, h1, b1), select(felt, h2, b2),
-        gap_bar, select(felt, friction_bar, zero), select(felt, hold_bar, zero),
-    )  # fmt: skip
-
-
-@law
-def meets_adjoint(mesh, case, d, state, sums, g, i, light, moves, u0, u1, u2, b0, b1, b2, o0, o1, o2):
+def meets_adjoint(mesh, case, d, state, sums, g, i, light, moves, u, b, o):
     """Adjoint of :func:`meets`: gradients by the velocity, by the places of the surfaces, and by the mass."""
-    dt, n, zero = case.dt, mesh.component, 0 * u0
+    n, zero = mesh.component, 0 * light
+    b0, b1, b2 = b
     c0, c1, c2, mass_bar = zero, zero, zero, zero
     planes = len(case.plane_stick)
+    x = place(mesh, d, state, i)
+    touching = moves & (load(case.touches, i) > 0)
     for behind in range(planes):
         k = planes - 1 - behind
         q = 16 * PLANE * (g * planes + k)
-        node, gap, n0, n1, n2 = surface_gap(mesh, case, d, state, g, i, q)
-        near = (node < LOOK * case.spacing) & moves
+        m, level = vector(case.plane_numbers, q, 16), load(case.plane_numbers, q + 16 * OFFSET)
+        near = touching & (dot(x, m) - level < LOOK * case.spacing + load(case.plane_numbers, q + 16 * REACH))
         if any_lane(near):
-            area = load(case.area, k * n + i)
-            reaches = gap < CONTACT_DISTANCE * case.spacing
-            hold = load(case.plane_numbers, q + 16 * ADHESION) * area * dt * light
-            hold = select(reaches, hold, zero - 1)
-            friction = load(case.plane_numbers, q + 16 * FRICTION)
-            r0, r1, r2, _, _, _ = meets(mesh, case, d, state, g, i, k, light, u0, u1, u2)
-            h0, h1, h2, gap_bar, friction_bar, hold_bar = lands_adjoint(
-                r0, r1, r2, n0, n1, n2, gap, dt, case.plane_stick[k], friction, hold, b0, b1, b2, o0, o1, o2
-            )
+            s0, s1, s2 = surface(mesh, case, d, state, g, i)
+            gap = dot((s0, s1, s2), m) - level
+            stick, friction, hold, reach, touch, push, per_adhesion = contact_numbers(mesh, case, g, k, i, light)
+            r0, r1, r2, _, _, _ = meets(mesh, case, d, state, g, i, k, light, u)
+            h0, h1, h2, m0, m1, m2, gap_bar, friction_bar, hold_bar = plane_contact_adjoint(
+                r0, r1, r2, m[0], m[1], m[2], gap, case.dt, stick, friction, hold, reach, touch, push,
+                b0, b1, b2, o[0], o[1], o[2],
+            )  # fmt: skip
             b0, b1, b2 = select(near, h0, b0), select(near, h1, b1), select(near, h2, b2)
             gap_bar, friction_bar = select(near, gap_bar, zero), select(near, friction_bar, zero)
-            hold_bar = select(near & reaches, hold_bar, zero)
+            hold_bar = select(near, hold_bar, zero)
+            by_normal = (
+                select(near, m0 + gap_bar * s0, zero), select(near, m1 + gap_bar * s1, zero),
+                select(near, m2 + gap_bar * s2, zero),
+            )  # fmt: skip
             s = (g * planes + k) * PLANE * n + i
-            store(sums.planes, s + OFFSET * n, load(sums.planes, s + OFFSET * n) - gap_bar)
-            store(sums.planes, s + FRICTION * n, load(sums.planes, s + FRICTION * n) + friction_bar)
-            store(sums.planes, s + ADHESION * n, load(sums.planes, s + ADHESION * n) + hold_bar * area * dt * light)
+            add_vector(sums.planes, s, n, by_normal)
+            add_vector(sums.planes, s + OFFSET * n, n, (-gap_bar, friction_bar, hold_bar * per_adhesion))
             mass_bar = mass_bar - hold_bar * hold * light
-            c0, c1, c2 = c0 + gap_bar * n0, c1 + gap_bar * n1, c2 + gap_bar * n2
+            c0, c1, c2 = c0 + gap_bar * m[0], c1 + gap_bar * m[1], c2 + gap_bar * m[2]
             for c in range(3):
                 r = (3 * g + c) * n + i
                 reach = load(case.reach, r)
-                way = magnitude(reach)
-                if any_lane(way > 0):
-                    stride = stride_of(mesh, c)
-                    gain = gap_bar * dot(
-                        inward(mesh, d, state, i, stride, 0, reach),
-                        inward(mesh, d, state, i, stride, 1, reach),
-                        inward(mesh, d, state, i, stride, 2, reach),
-                        n0, n1, n2,
-                    )  # fmt: skip
+                if any_lane(magnitude(reach) > 0):
+                    gain = gap_bar * dot(inward(mesh, case, d, state, i, c, reach), m)
                     gain = select(reach > 0, gain, select(reach < 0, -gain, zero))
                     store(sums.reach, r, load(sums.reach, r) + gain)
     return b0, b1, b2, c0, c1, c2, mass_bar
 
 
 @law
-def spread(mesh, case, surfaces, parity, g, i):
+def spread(mesh, case, d, state, surfaces, parity, g, i):
     """What the surfaces of nodes and of the neighbours that reach to them add to the gradient by their places."""
     n = mesh.component
     s = (parity * case.groups + g) * 3 * n + i
-    a0, a1, a2 = load(surfaces, s), load(surfaces, s + n), load(surfaces, s + 2 * n)
-    own, zero = 0 * a0 + 1, 0 * a0
-    t0, t1, t2 = zero, zero, zero
+    own = vector(surfaces, s, n)
+    t0, t1, t2 = own
+    zero = 0 * t0
     for c in range(3):
-        r = (3 * g + c) * n + i
-        own = own - magnitude(load(case.reach, r))
-        stride = stride_of(mesh, c)
-        up, down = load(case.reach, r + stride), load(case.reach, r - stride)
-        from_up, from_down = select(up < 0, -up, zero), select(down > 0, down, zero)
-        t0 = t0 + from_up * load(surfaces, s + stride) + from_down * load(surfaces, s - stride)
-        t1 = t1 + from_up * load(surfaces, s + n + stride) + from_down * load(surfaces, s + n - stride)
-        t2 = t2 + from_up * load(surfaces, s + 2 * n + stride) + from_down * load(surfaces, s + 2 * n - stride)
-    return own * a0 + t0, own * a1 + t1, own * a2 + t2
+        r, stride = (3 * g + c) * n + i, stride_of(mesh, c)
+        reach, up, down = load(case.reach, r), load(case.reach, r + stride), load(case.reach, r - stride)
+        if any_lane(magnitude(reach) > 0):
+            a = inward_adjoint(mesh, case, d, state, i, c, reach, own)
+            t0, t1, t2 = t0 - a[0], t1 - a[1], t2 - a[2]
+        if any_lane(up < 0):
+            bar = vector(surfaces, s + stride, n)
+            a = inward_adjoint(mesh, case, d, state, i + stride, c, select(up < 0, up, zero), bar)
+            t0, t1, t2 = t0 + a[0], t1 + a[1], t2 + a[2]
+        if any_lane(down > 0):
+            bar = vector(surfaces, s - stride, n)
+            a = inward_adjoint(mesh, case, d, state, i - stride, c, select(down > 0, down, zero), bar)
+            t0, t1, t2 = t0 + a[0], t1 + a[1], t2 + a[2]
+    return t0, t1, t2

@@ -104,7 +104,11 @@ class Case(NamedTuple):
     quadratic: np.ndarray
     plane_numbers: np.ndarray
     plane_stick: np.ndarray
+    plane_elastic: np.ndarray
+    keeps: bool
     area: np.ndarray
+    far: np.ndarray
+    touches: np.ndarray
     spacing: float
 
 

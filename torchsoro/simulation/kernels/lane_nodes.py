@@ -142,7 +142,7 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
                 store(work.pushed, q, u0)
                 store(work.pushed, q + n, u1)
                 store(work.pushed, q + 2 * n, u2)
-            w0, w1, w2, o0, o1, o2 = meets(mesh, case, d, now + own, g, i, planes, light, u0, u1, u2)
+            w0, w1, w2, o0, o1, o2 = meets(mesh, case, d, now + own, g, i, planes, light, (u0, u1, u2))
             u0, u1, u2 = select(moves, w0, u0), select(moves, w1, u1), select(moves, w2, u2)
         d0 = select(moves, d0 + dt * (o0 + u0), d0)
         d1 = select(moves, d1 + dt * (o1 + u1), d1)

@@ -32,6 +32,11 @@ _NUMBERS = (
     *(layout.VISCOSITY, layout.VOLUME_VISCOSITY),
 )
 _PRONY = [layout.PRONY_MODULUS, layout.PRONY_GAIN, layout.PRONY_DECAY]  # of an element, likewise
+# Numbers of a plane in the order of ``lane_contact``; normal and offset count with the plane's sign.
+_PLANE = [
+    *(layout.PLANE_NORMAL + c for c in range(3)),
+    *(layout.PLANE_OFFSET, layout.PLANE_FRICTION, layout.PLANE_ADHESION, layout.PLANE_REACH),
+]
 _layouts: WeakKeyDictionary[Scene, dict[tuple, Lanes]] = WeakKeyDictionary()
 
 
@@ -50,13 +55,7 @@ def _lanes_of(scene: Scene, batch: int, dtype: torch.dtype) -> Lanes:
 
 def in_lanes(scene: Scene, like: Tensor) -> bool:
     """Whether a scene's simulations on the device of a tensor run in lanes."""
-    return scene.lattice is not None and scene.lanes and not like.is_cuda and plain(scene)
-
-
-def plain(scene: Scene) -> bool:
-    """Whether all planes are those of an axis, land inelastically and hold nothing from afar: lanes have no others."""
-    axis, elastic, afar = scene.plane_kind[:, [layout.PLANE_AXIS, layout.PLANE_ELASTIC, layout.PLANE_AFAR]].unbind(1)
-    return bool(((axis >= 0) & (elastic == 0) & (afar == 0)).all())
+    return scene.lattice is not None and scene.lanes and not like.is_cuda
 
 
 def numbers(t: Tensor) -> np.ndarray:
@@ -145,12 +144,11 @@ class LaneIntegrator:
         mass = self.nodal[:, :1]
         there = mass > 0
         inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
-        axis, sign, stick = (s.plane_kind[:, k].tolist() for k in range(3))
-        planes = like.new_zeros(self.batch, len(axis), PLANE)
-        for k, (a, side) in enumerate(zip(axis, sign, strict=True)):
-            planes[:, k, a] = side
-            planes[:, k, 3] = side * i.planes[:, k, 0]
-            planes[:, k, 4:6] = i.planes[:, k, 1:3]
+        sign = s.plane_kind[:, layout.PLANE_SIGN, None].to(like)
+        numbered = i.planes[..., _PLANE] * torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+        count, elastic = s.plane_kind.shape[0], s.plane_kind[:, layout.PLANE_ELASTIC].bool()
+        ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
+        far = lanes.from_nodes((ways > 0).to(like)) if count else like.new_zeros(0)
         share = self.lattice.to_nodes(s.share.to(like)) if len(s.share) else like.new_zeros(0, self.lattice.nodes)
         wide = share.unsqueeze(0).expand(self.batch, -1, -1) if len(share) else share.unsqueeze(0)
         shares = lanes.from_nodes(wide)[0] if len(share) else like.new_zeros(0, self.mesh.component)
@@ -186,9 +184,13 @@ class LaneIntegrator:
             tie_share=none,
             tie_stiffness=none,
             quadratic=none,
-            plane_numbers=numbers(lanes.from_batch(planes)),
-            plane_stick=np.array(stick, bool),
-            area=np.full(max(1, len(axis)) * self.mesh.component, s.cell**2, numbers(like).dtype),
+            plane_numbers=numbers(lanes.from_batch(numbered)),
+            plane_stick=s.plane_kind[:, layout.PLANE_STICK].bool().numpy(),
+            plane_elastic=elastic.numpy(),
+            keeps=bool(elastic.any()),
+            area=numbers(torch.full_like(far, s.cell**2)),
+            far=numbers(far),
+            touches=np.ones(self.mesh.component, none.dtype),
             spacing=float(s.cell),
         )
 
@@ -422,9 +424,8 @@ class LaneIntegrator:
         if planes:
             by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
             by_plane = by_node.sum(-1).view(self.batch, planes, PLANE)
-            # The normal of an axis has no gradient.
-            planes_bar[..., layout.PLANE_OFFSET] = by_plane[..., 3] * s.plane_kind[:, 1]
-            planes_bar[..., [layout.PLANE_FRICTION, layout.PLANE_ADHESION]] = by_plane[..., 4:]
+            sign = s.plane_kind[:, layout.PLANE_SIGN, None].to(c)
+            planes_bar[..., _PLANE] = by_plane * torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
         gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
         if {"gravity", "force"} & wanted:
             mass = self.nodal[:, :1]
