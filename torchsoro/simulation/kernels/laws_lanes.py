@@ -103,7 +103,8 @@ def _compiled() -> SimpleNamespace:
         # Numba's cache tells functions of a file by their first lines, which stay what they are.
         node.body = [ast.copy_location(statement, node) for statement in _Branchless().block(node.body, arguments)]
     names = {name: value for name, value in vars(text).items() if isinstance(value, int | float)}
-    names |= {"select": select, **_CALLS, "__name__": f"{text.__name__}_lanes"}
+    # A module that Numba finds when it reads compiled code from disk.
+    names |= {"select": select, **_CALLS, "__name__": __name__}
     assert all(getattr(math, name, None) is None or name in _CALLS for name in vars(text) if name[0] != "_")
     for node in functions:
         own = ast.fix_missing_locations(ast.Module([node], []))
