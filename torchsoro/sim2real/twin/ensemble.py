@@ -17,10 +17,11 @@ from torch import Tensor
 from torchsoro.sim2real.twin.grid import Grid
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
+from torchsoro.sim2real.twin.variations import simulate
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.compiled import remove_stale_code
-from torchsoro.simulation.kernels.simd_ensemble import LANES, MARKED, Case, Mesh, march
+from torchsoro.simulation.kernels.simd_ensemble import LANES, Case, Mesh
 from torchsoro.simulation.material import Prony
 
 SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
@@ -116,6 +117,7 @@ class Ensemble:
             members.sort(key=lambda lane: steps[lane[0]][lane[1]])
             kinds.append([members[k : k + LANES] for k in range(0, len(members), LANES)])
         markers = len(self.twin.setup.markers)
+        nodes, values = self.twin.marks()
         longest = max(s.until for s in scenarios)
         samples = math.ceil(longest / SAMPLE - 1e-9) + 1
         seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
@@ -127,9 +129,7 @@ class Ensemble:
 
         def run(group: list[Lane]) -> float:
             case = prepared(group)
-            out = np.zeros((samples, MARKED * markers), np.float32)
-            march(self.mesh, case, out)
-            found = out.reshape(samples, markers, 5, 3, LANES)
+            found = looked_at(simulate(self.twin, case, samples), nodes, values)
             for k, (i, b) in enumerate(group):
                 seen[i][b] = found[..., k]
             return case.dt
@@ -265,6 +265,24 @@ class Ensemble:
                 len(normals), self.twin.grid.nodes
             ),
         )
+
+
+def looked_at(motion: np.ndarray, nodes: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Markers in nodal motions [samples, 6, nodes, 16].
+
+    Args:
+        motion: Displacements and velocities.
+        nodes: Of each marker [M, 27].
+        values: Weights and slopes [M, 27, 4].
+
+    Returns:
+        Place, velocity, and derivatives of the displacement by x, y, z [samples, M, 5, 3, 16].
+    """
+    near = motion[:, :, nodes].astype(float)
+    d, v = near[:, :3], near[:, 3:]
+    moved = np.einsum("scmnl,mn->smcl", v, values[..., 0])
+    parts = np.einsum("scmnl,mnk->smkcl", d, values)
+    return np.concatenate([parts[:, :, :1], moved[:, :, None], parts[:, :, 1:]], 2)
 
 
 def _common(s: Scenario) -> object:
