@@ -23,6 +23,7 @@ from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.simd_ensemble import LANES, Case, Mesh
 from torchsoro.simulation.material import Prony
+from torchsoro.simulation.ops.inertia import Matching
 
 SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
 SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars were stable up to 1.6
@@ -79,6 +80,12 @@ class Ensemble:
     def room(self) -> int:
         """Number of variations that take as long as one."""
         return LANES * self.threads if self.body is None else cuda_ensemble.ROOM
+
+    @cached_property
+    def spreads(self) -> Tensor:
+        """By how much lumped masses exceed second moments, by node and axis [n, 3] m2."""
+        each = (a.spreads for a in self.twin.grid.axes)
+        return torch.from_numpy(np.stack(np.meshgrid(*each, indexing="ij"), -1).reshape(-1, 3))
 
     @cached_property
     def chamber_volume(self) -> np.ndarray:
@@ -201,7 +208,8 @@ class Ensemble:
 
         def mass(s: Scenario) -> Tensor:
             if id(s) not in known:
-                known[id(s)] = self.twin.nodal(s.density * volume) + s.point_mass
+                own = torch.atleast_2d(self.twin.nodal(s.density * volume))
+                known[id(s)] = Matching.of(own, self.twin.places, self.spreads).matched + s.point_mass
             return known[id(s)]
 
         weight = lanes(lambda s: torch.where(mass(s) > 0, 1 / mass(s).clamp(min=1e-30), 0.0), 1)
