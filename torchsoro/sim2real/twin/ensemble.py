@@ -21,7 +21,8 @@ from torchsoro.sim2real.twin.variations import simulate
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.compiled import remove_stale_code
-from torchsoro.simulation.kernels.simd_ensemble import LANES, Case, Mesh
+from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.kernels.variations import Case, Mesh
 from torchsoro.simulation.material import Prony
 from torchsoro.simulation.ops.inertia import Matching
 

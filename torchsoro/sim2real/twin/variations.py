@@ -14,7 +14,7 @@ from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, 
 from torchsoro.simulation.kernels.lane_points import BULK, MAXWELL, NUMBERS, SHEAR, STIFFENING, VOID_FRACTION, VOLUME
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
-from torchsoro.simulation.kernels.simd_ensemble import Case as Numbers
+from torchsoro.simulation.kernels.variations import Case as Numbers
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.lattice import Lattice
 

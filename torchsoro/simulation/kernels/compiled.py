@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import hashlib
 from pathlib import Path
+
+from torchsoro.simulation import laws
+from torchsoro.storage import atomic_write
 
 
 @functools.cache
 def remove_stale_code() -> None:
-    """Remove compiled code that is older than a source, once in a process, before the first kernel is called.
+    """Remove compiled code of other sources than today's, once in a process, before the first kernel is called.
 
-    Numba by itself compares the file of the outermost function only.
+    Numba by itself compares the file of the outermost function only, not what that is compiled with.
     """
     here = Path(__file__).parent
-    newest = max(source.stat().st_mtime for source in (here.parent / "laws.py", *here.glob("*.py")))
-    for index in here.glob("__pycache__/*.nbi"):
-        with contextlib.suppress(OSError):
-            if index.stat().st_mtime < newest:
+    digest = hashlib.sha256()
+    for source in [*sorted(here.glob("*.py")), Path(str(laws.__file__))]:
+        digest.update(source.read_bytes())
+    # A folder that cannot be written has no compiled code either: Numba then keeps it elsewhere, by the user.
+    with contextlib.suppress(OSError):
+        stamp = here / "__pycache__" / "sources.sha256"
+        if not stamp.exists() or stamp.read_text() != digest.hexdigest():
+            for index in stamp.parent.glob("*.nbi"):
                 index.unlink()
+            with atomic_write(stamp) as file:
+                file.write(digest.hexdigest().encode())

@@ -1,37 +1,16 @@
 """What the threads of a block do for a variation of a body on a GPU: stress at points, forces of cells, walls, planes.
 
-As :mod:`simd_cells`, whose laws of stress these are, and :mod:`simd_ensemble`, for one variation.
+The substep is that of ``lane_march``, for one variation.
 """
 
 from __future__ import annotations
 
 import math
-from types import FunctionType
-from typing import Any
 
-import numba.cuda
-
-from torchsoro.simulation.kernels import simd_cells
-from torchsoro.simulation.kernels.simd_cells import f32
-
-cuda: Any = numba.cuda  # its types are those of the host
-_device = cuda.jit(device=True, fastmath=True)
+from torchsoro.simulation.kernels.cuda_laws import cuda, device, f32, piola
 
 
-def _laws() -> dict[str, Any]:
-    """Stress at a point as in :mod:`simd_cells`, for a GPU: the same functions, which call each other there."""
-    found: dict[str, Any] = {}
-    for law in ("at_least", "logarithm", "shrinkage", "pull_back", "piola"):
-        body = getattr(simd_cells, law).py_func
-        found[law] = _device(FunctionType(body.__code__, {**body.__globals__, **found}, law))
-    return found
-
-
-_law = _laws()
-pull_back, piola = _law["pull_back"], _law["piola"]
-
-
-@_device
+@device
 def gradient(mesh, d, cell, k):
     """Deformation gradient at point k of a cell, F[a][b] = d x_a / d X_b, row by row."""
     weights, slopes, cells, corners, stride_x, stride_y = mesh
@@ -64,7 +43,7 @@ def gradient(mesh, d, cell, k):
     return g00, g01, g02, g10, g11, g12, g20, g21, g22
 
 
-@_device
+@device
 def stress(F, Q, own, p, law, stiffens, softens, P):
     """First Piola stress times volume into P [9, P], derivative by derivative."""
     P00, P10, P20, P01, P11, P21, P02, P12, P22, largest = piola(
@@ -77,7 +56,7 @@ def stress(F, Q, own, p, law, stiffens, softens, P):
         own[2, p] = largest
 
 
-@_device
+@device
 def hand_out(mesh, spread, slots, P, shares, thread):
     """What each cell hands to each of its nodes; ``shares`` [3, slots], a node's lie ``nodes`` apart.
 
@@ -105,7 +84,7 @@ def hand_out(mesh, spread, slots, P, shares, thread):
         shares[0, slot], shares[1, slot], shares[2, slot] = f0, f1, f2
 
 
-@_device
+@device
 def wall_area(wall, d, w, normals):
     """Area vector of a point of a chamber's wall, p dA = p t1 x t2, and its share of the volume."""
     begin, node, value, place, axes, area, _ = wall
@@ -130,7 +109,7 @@ def wall_area(wall, d, w, normals):
     normals[3, w] = (x0 * n0 + x1 * n1 + x2 * n2) / f32(3)
 
 
-@_device
+@device
 def met(u0, u1, u2, gap, normal, stick, push, hold, friction):
     """Velocity of a node that meets a plane; see :func:`lanes._meet`."""
     n0, n1, n2 = normal[0], normal[1], normal[2]
@@ -150,7 +129,7 @@ def met(u0, u1, u2, gap, normal, stick, push, hold, friction):
     return t0 * rest + along * n0, t1 * rest + along * n1, t2 * rest + along * n2
 
 
-@_device
+@device
 def look(mark, d, v, out, thread):
     """Markers: place, velocity, derivatives of the displacement by x, y, z; out [M, 5, 3]."""
     begin, node, value = mark

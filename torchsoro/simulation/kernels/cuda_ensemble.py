@@ -1,4 +1,4 @@
-"""Variations of a body on a GPU: the substep of :mod:`simd_ensemble`, a block of threads for each variation.
+"""Variations of a body on a GPU: the substep of ``lane_march``, a block of threads for each variation.
 
 A block marches through all its substeps by itself, so that nothing waits for another block or for the host. Points,
 nodes of cells, and nodes are handed to its threads in turn; sums are gathered and never added to by two threads at
@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from numba import config, float32
 
-from torchsoro.simulation.kernels.cuda_cells import cuda, gradient, hand_out, look, met, pull_back, stress, wall_area
-from torchsoro.simulation.kernels.simd_cells import f32
-from torchsoro.simulation.kernels.simd_ensemble import SURFACE, TOUCH, Case, Mesh
+from torchsoro.simulation.kernels.cuda_cells import gradient, hand_out, look, met, stress, wall_area
+from torchsoro.simulation.kernels.cuda_laws import cuda, f32, pull_back
+from torchsoro.simulation.kernels.variations import Case, Mesh
 
+TOUCH = 1e-6  # m in front of a plane within which a node lies on it
+SURFACE = 0.5  # stiffness of planes for a node, in its mass over the square of the step: what the step still bears
 ROOM = 264  # variations that run side by side on a GPU of some hundred multiprocessors
 SIMULATED = bool(getattr(config, "ENABLE_CUDASIM", False))  # by Numba, on the processor, for tests
 WARP = 32  # threads that add up what a block has in common
