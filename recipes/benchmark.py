@@ -4,6 +4,7 @@
     python recipes/benchmark.py --only table --particles 4096    # one section, one size
     python recipes/benchmark.py --five --bits --auto-dt          # also these three
     python recipes/benchmark.py --compile                        # also seconds to compile, without and with the cache
+    python recipes/benchmark.py --only engines --repeats 5       # a CPU's vector kernels against those of a GPU on it
     python recipes/benchmark.py --only host                      # does the device wait for the host? also 64 bodies
     python recipes/benchmark.py --preset paper --json paper.json # 64,000 particles, 75,000 steps, beside the required
 

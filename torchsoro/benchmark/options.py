@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 
     from torchsoro.benchmark.timing import Case
 
-SECTIONS = ("naive", "table", "where", "host", "rollout", "bits", "auto-dt", "five", "compile")
-Section = Literal["naive", "table", "where", "host", "rollout", "bits", "auto-dt", "five", "compile"]
+SECTIONS = ("naive", "table", "engines", "where", "host", "rollout", "bits", "auto-dt", "five", "compile")
+Section = Literal["naive", "table", "engines", "where", "host", "rollout", "bits", "auto-dt", "five", "compile"]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -68,7 +68,15 @@ class Options:
     def sections(self) -> tuple[str, ...]:
         """What to measure, in order."""
         paper = self.preset == "paper"
-        on = {"naive": True, "table": True, "where": True, "host": paper, "rollout": paper, "bits": paper or self.bits}
+        on = {
+            "naive": True,
+            "table": True,
+            "engines": False,
+            "where": True,
+            "host": paper,
+            "rollout": paper,
+            "bits": paper or self.bits,
+        }
         on |= {"five": paper or self.five, "auto-dt": self.auto_dt, "compile": self.compile}
         return tuple(name for name in SECTIONS if (name in self.only if self.only else on[name]))
 

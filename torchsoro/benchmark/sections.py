@@ -103,6 +103,32 @@ def sizes(options: Options, bandwidth: float) -> list[Row]:
     return rows
 
 
+def engines(options: Options) -> list[Row]:
+    """The total-Lagrangian form on a CPU: sixteen lanes of its vector registers against the kernels of a GPU."""
+    rows: list[Row] = []
+    for count, bodies in ((4096, 1), (64_000, 1), (1000, 16)):
+        case = options.case(
+            "total", count=count, bodies=bodies, steps=max(20, options.table_steps * 4096 // count // bodies)
+        )
+        seconds: dict[str, tuple[float, float]] = {}
+        for name, lanes in (("lanes", True), ("GPU's kernels", False)):
+            say(f"{count:,} points, {bodies} bodies, {name}")
+            one = dataclasses.replace(case, lanes=lanes)
+            kept = one.kept()
+            forward, _ = best_of(options.repeats, one.forward, case.device)
+            both, _ = best_of(options.repeats, kept.gradient, case.device)
+            seconds[name] = forward / one.steps, both / kept.steps
+        points = case.domain.count * bodies
+        (fast, fast_both), (slow, slow_both) = seconds["lanes"], seconds["GPU's kernels"]
+        rows.append(
+            {"points": case.domain.count, "bodies": bodies, "forward [M/s]": points / fast / 1e6}
+            | {"GPU's kernels [M/s]": points / slow / 1e6, "ratio": slow / fast}
+            | {"both [M/s]": points / fast_both / 1e6, "GPU's, both [M/s]": points / slow_both / 1e6}
+            | {"ratio of both": slow_both / fast_both}
+        )
+    return rows
+
+
 def traced(case: Case) -> list[dict[str, tuple[str, float]]]:
     """Milliseconds of each Taichi task, with its kernel: in a forward run, and in its gradient with recomputation."""
     say(f"{case.formulation}: Taichi's profiler, in a process of its own")
@@ -286,6 +312,7 @@ TITLES = {
     "table": "Sizes",
     "tasks": "Where the time goes: Taichi's tasks in a step forward and back with recomputation",
     "split": "Where the time goes, by the clock, per step",
+    "engines": "Engines on a CPU, total-Lagrangian form: million point-steps per second",
     "host": "A step by the clock over its kernels' own time",
     "rollout": "Whole rollout",
     "bits": "Equal bits in two whole rollouts",
@@ -315,6 +342,10 @@ def run(options: Options) -> dict[str, Any]:
             show(naive=naive_step(options))
         if "table" in options.sections:
             show(table=sizes(options, bandwidth))
+        if "engines" in options.sections:
+            if options.target.type == "cuda":
+                raise ValueError("only = engines: compares two engines of a CPU, wanted --device cpu")
+            show(engines=engines(options))
         if "where" in options.sections:
             show(**where(options))
         if "host" in options.sections:

@@ -24,7 +24,7 @@ from torchsoro.design.domain import Chamber, Domain
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import square_wave
 from torchsoro.simulation.contact import ground
-from torchsoro.simulation.formulation import FormulationName, formulation_of
+from torchsoro.simulation.formulation import FormulationName, Total, formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.simulator import Simulator
 from torchsoro.simulation.stability import stable_step
@@ -66,7 +66,8 @@ class Case:
     It rests for a third of the time and is then driven at 80 kPa and 5 Hz, as the paper's walker is. Its density falls
     from front to back, so that it travels. ``dt`` [s] is by default the paper's for its cell; with ``auto`` the
     simulator chooses its own for the same duration. ``segment`` and ``budget`` [bytes] are the simulator's. ``bodies``
-    of this size are simulated at once, each a little denser than the one before.
+    of this size are simulated at once, each a little denser than the one before. Without ``lanes`` a CPU runs the
+    kernels of a GPU.
     """
 
     count: int
@@ -79,6 +80,7 @@ class Case:
     segment: int | None = None
     budget: int | None = None
     bodies: int = 1
+    lanes: bool = True
 
     @cached_property
     def domain(self) -> Domain:
@@ -120,7 +122,8 @@ class Case:
         """The simulator."""
         room = EDGE + 4 * self.domain.cell
         options: Row = {"dt": "auto" if self.auto else self.substep, "cell": self.domain.cell}
-        options |= {"formulation": self.formulation, "segment": self.segment, "memory_budget": self.budget}
+        form = Total(lanes=self.lanes) if self.formulation == "total" else self.formulation
+        options |= {"formulation": form, "segment": self.segment, "memory_budget": self.budget}
         return Simulator(low=(-room,) * 3, high=(2 * room,) * 3, **options)
 
     @property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal, Protocol
 
 from torch import Tensor
@@ -132,8 +132,13 @@ class Updated:
 
 @dataclass(frozen=True)
 class Total:
-    """Total-Lagrangian: the grid is the body's own lattice and moves with it."""
+    """Total-Lagrangian: the grid is the body's own lattice and moves with it.
 
+    Attributes:
+        lanes: Whether a CPU fills its vector registers, by kernels of its own; else it runs those of a GPU.
+    """
+
+    lanes: bool = True
     name: ClassVar[FormulationName] = "total"
     air_density: ClassVar[float] = AIR
 
@@ -163,7 +168,7 @@ class Total:
 
     def place(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, weight: Tensor) -> Placed:
         """To all points of the particles' lattice."""
-        return on_lattice(scene, inputs, x, velocity, weight)
+        return on_lattice(replace(scene, lanes=self.lanes), inputs, x, velocity, weight)
 
     def initial(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
         """State [B, L]."""
