@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections import defaultdict
+from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -150,7 +150,22 @@ def _blocks(layer: np.ndarray, row: int, first: list[np.ndarray]) -> list[tuple[
     return found
 
 
+_known: OrderedDict[tuple, Lanes] = OrderedDict()
+MOST = 16  # layouts that are remembered
+
+
 def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
+    """:func:`_laid_out`, remembered: every call of a simulator asks again for the same body."""
+    key = (*((a.knots.tobytes(), a.first.tobytes()) for a in lattice.axes), kind.cpu().numpy().tobytes(), batch, dtype)
+    if key not in _known:
+        _known[key] = _laid_out(lattice, kind, batch, dtype)
+        if len(_known) > MOST:
+            _known.popitem(last=False)
+    _known.move_to_end(key)
+    return _known[key]
+
+
+def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
     """Deal the cells of a lattice, and the simulations of a batch, to blocks of sixteen lanes.
 
     Args:
