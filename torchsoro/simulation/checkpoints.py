@@ -44,11 +44,12 @@ def plan_checkpoints(
     most = max(1, _LARGEST * element_bytes // state_bytes - 1)
     if each * (steps + 1) <= budget and steps <= most:
         return Plan(segment=steps, keep=True, memory=each * (steps + 1))
-    # Long segments cost little more than short ones to begin with, so the longest that leave room for their starts.
-    segment = min(most, steps, math.isqrt(steps) + 1)
-    least = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
-    if least > budget:
-        raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")
-    segment = min(most, max(segment, (budget - least) // each))
-    memory = state_bytes * math.ceil(steps / segment) + each * (segment + 1)
-    return Plan(segment=segment, keep=False, memory=memory)
+    # The fewest segments, as each costs the host some time; of equal length, which takes the least memory.
+    least, fewest = math.inf, math.ceil(steps / most)
+    for count in range(fewest, max(fewest, math.isqrt(steps) + 1) + 1):
+        segment = math.ceil(steps / count)
+        memory = state_bytes * count + each * (segment + 1)
+        if memory <= budget:
+            return Plan(segment=segment, keep=False, memory=memory)
+        least = min(least, memory)
+    raise ValueError(f"memory_budget = {budget / 2**20:.0f} MiB: wanted at least {least / 2**20:.0f} MiB")

@@ -248,6 +248,9 @@ class Simulator(nn.Module):
     ) -> tuple[list[Tensor], Tensor]:
         """Run the segments of the plan one after the other; ``began`` substeps went before."""
         steps = whole.gravity.shape[0]
+        # The same tensors in every segment, which then share what follows from them alone.
+        whole = Inputs(**{f.name: getattr(whole, f.name).contiguous() for f in fields(whole)})
+        weight = weight.contiguous()
         differentiable = torch.is_grad_enabled() and any(
             t.requires_grad for t in (state, weight, *(getattr(whole, f.name) for f in fields(whole)))
         )

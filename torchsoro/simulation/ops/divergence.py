@@ -14,10 +14,11 @@ from torchsoro.simulation.ops.scene import Inputs, Scene
 def outside(scene: Scene, inputs: Inputs, state: Tensor) -> Tensor:
     """Points outside of the analysis box, void excepted [B, points], of a state [B, 3 nodes or more]."""
     lattice = _lattice(scene)
-    x = lattice.to_points(_nodes(lattice, state), "mark") + lattice.places.T.to(state)
-    low, high = (x.new_tensor(c).view(1, 3, 1) for c in (scene.low, scene.high))
+    x = _points(lattice, _nodes(lattice, state))
     matter = (scene.kind != layout.ABSENT) & (inputs.coefficients[:, layout.VOID_FRACTION] < 1)
-    return matter & ~((x > low) & (x < high)).all(1)
+    sides = enumerate(zip(scene.low, scene.high, strict=True))
+    within = [(x[:, a] > low) & (x[:, a] < high) for a, (low, high) in sides]
+    return matter & ~(within[0] & within[1] & within[2])
 
 
 def report(scene: Scene, inputs: Inputs, step: int, state: Tensor) -> None:
@@ -26,7 +27,7 @@ def report(scene: Scene, inputs: Inputs, step: int, state: Tensor) -> None:
     d = _nodes(lattice, state)
     J = torch.linalg.det(lattice.gradient(d).permute(0, 3, 1, 2) + torch.eye(3).to(state))
     solid = (scene.kind == -1) & (inputs.coefficients[:, layout.VOID_FRACTION] == 0)
-    x = lattice.to_points(d, "mark") + lattice.places.T.to(state)
+    x = _points(lattice, d)
     there = scene.kind != layout.ABSENT
     smaller = "a smaller time step, a lower pressure or a higher void fraction"
     lowest = torch.where(solid, J, torch.inf)
@@ -72,3 +73,8 @@ def _lattice(scene: Scene) -> Lattice:
 def _nodes(lattice: Lattice, state: Tensor) -> Tensor:
     """Displacements [B, 3, nodes] m."""
     return state[:, : 3 * lattice.nodes].reshape(len(state), 3, lattice.nodes)
+
+
+def _points(lattice: Lattice, d: Tensor) -> Tensor:
+    """Places of the points [B, 3, points] m, from the displacements of the nodes."""
+    return lattice.to_points(d, "mark") + lattice.on("places", d).T

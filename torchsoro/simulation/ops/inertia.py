@@ -64,8 +64,8 @@ class Matching:
         safe = normal + 1e-13 * torch.diag_embed(normal.diagonal(dim1=1, dim2=2))
         excess = spread.to(m) / half.square()
         wanted = torch.nn.functional.pad(-(m @ excess), (4, 3))
-        weights = torch.linalg.solve(safe, wanted)
-        weights = weights + torch.linalg.solve(safe, wanted - (normal @ weights.unsqueeze(2)).squeeze(2))
+        weights = _solve(safe, wanted)
+        weights = weights + _solve(safe, wanted - (normal @ weights.unsqueeze(2)).squeeze(2))
         q = weights @ terms.T
         loss = (-m * q).relu()
         largest = loss.amax(1, keepdim=True)
@@ -88,6 +88,11 @@ class Matching:
         # By the share that each node gains.
         by_norm = torch.where(fades, strength_bar / (_NONE - _MOST), torch.zeros_like(norm))
         by_gain = by_norm * (loss / norm).pow(_NORM - 1)
-        by_wanted = torch.linalg.solve(self.normal, (m.square() * change + m * by_gain) @ self.terms)
+        by_wanted = _solve(self.normal, (m.square() * change + m * by_gain) @ self.terms)
         by_square = -(by_wanted @ self.terms.T) * q
         return bar + 2 * m * (q * change + by_square) + q * by_gain - by_wanted[:, 4:7] @ self.excess.T
+
+
+def _solve(matrix: Tensor, right: Tensor) -> Tensor:
+    """Solution [B, 10] without a check for singular matrices, for which the host would wait for the device."""
+    return torch.linalg.solve_ex(matrix, right).result

@@ -23,6 +23,7 @@ from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
+from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.threads import thread_count
 
@@ -92,8 +93,22 @@ class LaneIntegrator:
         self.lanes = _lanes_of(scene, self.batch, like.dtype)
         self.mesh: Mesh = self.lanes.mesh
         self.history = 6 * self.elements
-        self.nodal = self.lattice.nodal(like[:, layout.MASS], like[:, layout.DRAG], scene.dt)
-        self.case = self._case()
+        constants = [like, inputs.prony, inputs.planes]
+        self.nodal, case = once(scene, "case", constants, self._constants)
+        self.case = case._replace(**self._supply())
+
+    def _constants(self) -> tuple[Tensor, Case]:
+        """What the segments of a run have in common."""
+        c = self.inputs.coefficients.detach()
+        self.nodal = self.lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], self.scene.dt)
+        return self.nodal, self._case()
+
+    def _supply(self) -> dict[str, np.ndarray]:
+        """What acts over time, for the kernels."""
+        i, lanes = self.inputs, self.lanes
+        pressure = i.pressure[:, :, : self.mesh.chambers]
+        named = {"pressure": pressure, "gravity": i.gravity, "force": i.force}
+        return {name: numbers(lanes.from_batch(t, 1)) for name, t in named.items()}
 
     def _gas(self, values: Tensor) -> Tensor:
         """Volumes of the gas in each pair of a block and a chamber [groups, pairs, 8, 16]."""
@@ -155,7 +170,6 @@ class LaneIntegrator:
         prony = i.prony[..., _PRONY]
         prony = torch.cat([prony, prony[..., 1:2] * (1 - prony[..., 2:])], -1)
         assert prony.shape[-1] == MAXWELL
-        chambers = self.mesh.chambers
         softening = like.new_zeros(lanes.groups, 2, LANES)
         softening[:, 1] = 1
         none = np.zeros(0, numbers(like).dtype)
@@ -175,11 +189,9 @@ class LaneIntegrator:
             drag_factor=numbers(lanes.from_nodes(self.nodal[:, 4:])),
             reach=numbers(lanes.from_nodes(self.nodal[:, 1:4])),
             air=numbers(lanes.from_batch(self._chamber())),
-            pressure=numbers(lanes.from_batch(i.pressure[:, :, :chambers], 1)),
-            gravity=numbers(lanes.from_batch(i.gravity, 1)),
             share=shares.numpy(),
             share_there=(shares.view(len(shares), self.mesh.component // LANES, LANES) != 0).any(-1).numpy(),
-            force=numbers(lanes.from_batch(i.force, 1)),
+            **self._supply(),
             force_start=np.full(len(shares), -1),
             tie_share=none,
             tie_stiffness=none,

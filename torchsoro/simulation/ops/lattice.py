@@ -36,6 +36,14 @@ def _matrix(kind: str, axis: Axis, dtype: torch.dtype, device: torch.device) -> 
     return (torch.linalg.pinv(found).T if kind == "back" else found).to(dtype=dtype, device=device)
 
 
+@lru_cache(maxsize=256)
+def _gaps(axis: Axis, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Of each node along an axis: middle, depth, span, the ways to the next and from the last one [5, nodes] m."""
+    gaps = np.diff(axis.places)
+    rows = np.stack([axis.centers, _DEPTH * axis.spans, axis.spans, np.append(gaps, 1.0), np.append(1.0, gaps)])
+    return torch.from_numpy(rows).to(dtype=dtype, device=device)
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
     """A box of 2 x 2 x 2 points per cell around a body, and its nodes.
@@ -146,6 +154,22 @@ class Lattice:
         """Reference places of the nodes [nodes, 3] m, float64."""
         return _mesh(*(a.places for a in self.axes))
 
+    @cached_property
+    def _node_spreads(self) -> Tensor:
+        """What sum_i N_i x_i^2 has more than x^2, by node and axis [nodes, 3] m2, float64."""
+        return _mesh(*(a.spreads for a in self.axes))
+
+    @cached_property
+    def _copies(self) -> dict[tuple[str, torch.dtype, torch.device], Tensor]:
+        return {}
+
+    def on(self, name: str, like: Tensor) -> Tensor:
+        """The attribute with a name in the type and on the device of a tensor, copied there once: a copy waits."""
+        key = name, like.dtype, like.device
+        if key not in self._copies:
+            self._copies[key] = getattr(self, name).to(like)
+        return self._copies[key]
+
     def to_nodes(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
         """Sum over points, with weights or another kind of matrix (and one more along an axis): [..., nodes]."""
         wx, wy, wz = self._matrices(values, kind, along)
@@ -187,13 +211,10 @@ class Lattice:
 
         A node of which the matter fills all that its spline covers, or half of it, reaches nowhere.
         """
-        a = self.axes[axis]
-        gaps = np.diff(a.places)
-        rows = np.stack([a.centers, _DEPTH * a.spans, a.spans, np.append(gaps, 1.0), np.append(1.0, gaps)])
         shape = [1, 1, 1]
         shape[axis] = -1
         middle, depth, span, up, down = (
-            row.view(shape).expand(self.shape).reshape(-1) for row in torch.from_numpy(rows).to(total)
+            row.view(shape).expand(self.shape).reshape(-1) for row in _gaps(self.axes[axis], total.dtype, total.device)
         )
         center = self.to_nodes(mass, along=(axis, "moment")) / total
         off = center - middle
@@ -207,7 +228,8 @@ class Lattice:
 
     def _matching(self, lumped: Tensor) -> Matching:
         """Lumped masses of the nodes [B, nodes], with the body's moments of inertia."""
-        return Matching.of(lumped, self.node_places, _mesh(*(a.spreads for a in self.axes)))
+        like = lumped.double()
+        return Matching.of(like, self.on("node_places", like), self.on("_node_spreads", like))
 
     def nodal_mass(self, mass: Tensor) -> Tensor:
         """Masses of the nodes [B, nodes] kg, from those of the points [B, points]: the first of :meth:`nodal`."""

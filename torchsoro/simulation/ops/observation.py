@@ -48,7 +48,7 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
     share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
     for c in range(pressure.shape[1]):
-        gas = (scene.kind == c).nonzero().squeeze(1)
+        gas = scene.gas(c)
         J = state[:, layout.DEFORMATION, gas]
         parts = coefficients[:, layout.VOLUME, gas] * J
         local = coefficients[:, layout.BULK, gas] * (1 - J) + pressure[:, c : c + 1]
@@ -76,7 +76,7 @@ def _observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tenso
         share_bar += (state[:, rows] * at_center.unsqueeze(-1)).sum(1)
         _add_at(state_bar[:, rows], scene.probes, at_probes.transpose(1, 2))
     for c in range(pressure.shape[1]):
-        gas = (scene.kind == c).nonzero().squeeze(1)
+        gas = scene.gas(c)
         J, V, K = state[:, layout.DEFORMATION, gas], *coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
         parts, local = V * J, K * (1 - J) + pressure[:, c : c + 1]
         whole = parts.sum(-1, keepdim=True)
@@ -95,7 +95,7 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     lattice = scene.lattice
     assert lattice is not None
     d, v = _motion(state, lattice.nodes)
-    places = lattice.places.to(state)
+    places = lattice.on("places", state)
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     share = weight / weight.sum(-1, keepdim=True)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
@@ -133,7 +133,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence
         field_bar += nodal * at_center.unsqueeze(-1)
         nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
         _add_at(field_bar, at, at_probes.transpose(1, 2).unsqueeze(-1) * how)
-    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.places.to(state).T
+    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.on("places", state).T
     for c in range(pressure.shape[1]):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
@@ -177,7 +177,7 @@ def _motion(state: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
 
 def _chamber(d: Tensor, c: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Points of a chamber, their nodes and slopes there, and their deformation gradients [B, points, 3, 3]."""
-    gas = (scene.kind == c).nonzero().squeeze(1)
+    gas = scene.gas(c)
     at, _, slopes = _stencil(scene, f"chamber {c}", lambda: gas, QUADRATURE, d)
     F = torch.einsum("bcpn,pan->bpca", d[:, :, at], slopes) + torch.eye(3).to(d)
     return gas, at, slopes, F

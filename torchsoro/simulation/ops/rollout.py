@@ -140,6 +140,8 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     end_bar, *seen_bar = bars
     integrator = _integrator(scene, inputs, first, samples if keep else ())
     if not keep:
+        if isinstance(integrator, TotalSegmentIntegrator):
+            integrator.checked = True  # the same bits as in the forward pass
         record = integrator.record(integrator.forward(state, keep=True, observe=lambda k, s: None))
         integrator.samples = tuple(samples)
     states: Any = integrator.restore(record)
@@ -257,8 +259,8 @@ def rollout(
             raise ValueError(f"{name}: dtype {tensor.dtype}, wanted {state.dtype} (float32 or float64)")
         if tensor.device != state.device:
             raise ValueError(f"{name}: on {tensor.device}, wanted {state.device}, the device of the state")
-    if int(scene.kind.max()) >= chambers:
-        raise ValueError(f"kind: chamber {int(scene.kind.max())}, wanted less than the {chambers} of pressure")
+    if scene.last_chamber >= chambers:
+        raise ValueError(f"kind: chamber {scene.last_chamber}, wanted less than the {chambers} of pressure")
     if list(samples) != sorted(set(samples)) or (samples and not 0 <= samples[0] <= samples[-1] <= steps):
         raise ValueError(f"samples = {samples}: wanted increasing substeps from 0 to {steps}")
     values = [t.contiguous() for t in (state, weight, *tensors.values())]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from weakref import WeakValueDictionary
 
 from torch import Tensor
 
+from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
 
 # Arguments of an operator of torch.library are tensors and numbers, so that a scene is passed by its handle.
@@ -61,6 +63,27 @@ class Scene:
     def __post_init__(self) -> None:
         """Register the scene under its handle."""
         _scenes[self.handle] = self
+
+    @cached_property
+    def last_chamber(self) -> int:
+        """Highest number of a chamber, below 0 if there is none."""
+        return int(self.kind.max())
+
+    @cached_property
+    def absent(self) -> Tensor | None:
+        """Places of the lattice without a particle, bool [N]; None if there are none."""
+        absent = self.kind == layout.ABSENT
+        return absent if bool(absent.any()) else None
+
+    @cached_property
+    def _gas(self) -> dict[int, Tensor]:
+        return {}
+
+    def gas(self, chamber: int) -> Tensor:
+        """The particles of a chamber, int64."""
+        if chamber not in self._gas:
+            self._gas[chamber] = (self.kind == chamber).nonzero().squeeze(1)
+        return self._gas[chamber]
 
 
 def scene_of(handle: int) -> Scene:

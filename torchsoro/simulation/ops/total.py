@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
-from weakref import WeakKeyDictionary
 
-import numpy as np
 import taichi as ti
 import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout, total, total_adjoint
+from torchsoro.simulation.ops.arena import Arena
 from torchsoro.simulation.ops.divergence import outside, report
-from torchsoro.simulation.ops.lattice import numbers
+from torchsoro.simulation.ops.fixed import chamber_adjoint, fixed
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.ops.segment import empty_record
-from torchsoro.simulation.ops.tiles import tables, tile_count, tile_counts
+from torchsoro.simulation.ops.tiles import tile_count, tile_counts
 from torchsoro.simulation.runtime import init
 
 CHUNK = 1024  # substeps between two checks for divergence
@@ -30,52 +27,6 @@ _NEVER = 2**31 - 1
 
 
 _SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")
-
-
-class Arena:
-    """Several tensors in one buffer, under one of the names of ``layout.BUFFERS``, in the order given there.
-
-    Attributes:
-        name: Of the buffer.
-        buffer: All tensors, flat, one after the other; at least one number, as an empty tensor has no address.
-        offsets: Where each begins.
-        views: Each again, as part of the buffer.
-    """
-
-    def __init__(self, name: str, *tensors: Tensor) -> None:
-        buffer = torch.cat([*(t.detach().reshape(-1) for t in tensors), tensors[0].new_zeros(1)])
-        self._divide(name, buffer, [t.shape for t in tensors])
-
-    @classmethod
-    def zeros(cls, name: str, like: Tensor, *shapes: Sequence[int]) -> Arena:
-        """Tensors of zeros of these shapes, and of the type of ``like``."""
-        return cls.over(name, like.new_zeros(sum(map(math.prod, shapes)) + 1), *shapes)
-
-    @classmethod
-    def over(cls, name: str, buffer: Tensor, *shapes: Sequence[int]) -> Arena:
-        """The tensors of these shapes in a buffer that exists."""
-        arena = cls.__new__(cls)
-        arena._divide(name, buffer, shapes)
-        return arena
-
-    def _divide(self, name: str, buffer: Tensor, shapes: Sequence[Sequence[int]]) -> None:
-        assert len(shapes) == len(layout.BUFFERS[name])
-        ends = list(itertools.accumulate(math.prod(shape) for shape in shapes))
-        self.name, self.buffer, self.offsets = name, buffer, [0, *ends[:-1]]
-        self.views = [
-            buffer[start:end].view(*shape) for start, end, shape in zip(self.offsets, ends, shapes, strict=True)
-        ]
-
-
-# Index tables of the kernels, computed once per scene.
-_tables: WeakKeyDictionary[Scene, Arena] = WeakKeyDictionary()
-
-
-def _integers(scene: Scene, chambers: int) -> list[Tensor]:
-    """In the order of ``layout.BUFFERS``."""
-    assert scene.lattice is not None
-    found = tables(scene.lattice, scene.kind, chambers)
-    return [scene.kind, scene.plane_kind, *(torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in found)]
 
 
 @lru_cache
@@ -96,6 +47,9 @@ class TotalSegmentIntegrator:
         inputs: The segment's tensors, likewise.
         first: Number of the first substep in the whole run, for messages.
         samples: Substeps to observe, counted within the segment.
+
+    Attributes:
+        checked: Whether the segment has been found free of divergence before, so that ``forward`` need not look again.
     """
 
     def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
@@ -110,16 +64,9 @@ class TotalSegmentIntegrator:
         self.elements, self.chambers = inputs.prony.shape[1], inputs.pressure.shape[2]
         self.planes, self.groups = inputs.planes.shape[1], scene.share.shape[0]
         self.loaded = scene.viscous or scene.springs or self.groups > 0
-        self.nodal = self.lattice.nodal(like[:, layout.MASS], like[:, layout.DRAG], scene.dt)
-        self.chamber = self._chamber(like)
-        if scene not in _tables:
-            _tables[scene] = Arena("integers", *_integers(scene, self.chambers))
-        self.tables = _tables[scene]
-        self.fixed = Arena(
-            "fixed",
-            numbers(self.lattice, scene.dt, scene.cell).to(like),
-            *(like, inputs.prony, inputs.planes, self.nodal, self.chamber, scene.share),
-        )
+        common = fixed(scene, inputs)
+        self.nodal, self.chamber, self.tables, self.fixed = common.nodal, common.chamber, common.tables, common.arena
+        self.checked = False
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, inputs.force)
         tiles, chunks = tile_count(self.lattice), -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
@@ -136,8 +83,7 @@ class TotalSegmentIntegrator:
         """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
         ring, slots = (self.steps + 1, self.steps) if keep else (2, 1)
         # The kernels write no history at places without a particle.
-        full = bool((self.scene.kind != layout.ABSENT).all())
-        states = (start.new_empty if full else start.new_zeros)(ring, *start.shape)
+        states = (start.new_empty if self.scene.absent is None else start.new_zeros)(ring, *start.shape)
         states[0] = start
         self.kept = Arena.zeros("kept", start, *self._kept(slots))
         ints = self._ints([self.fixed, self.supply, self.kept, self.scratch], ring=ring, kept_ring=slots)
@@ -150,21 +96,26 @@ class TotalSegmentIntegrator:
         now = 0
         while now < self.steps:
             before = None if keep else states[now % 2].clone()
-            stop = min([self.steps, now + CHUNK, *(k for k in self.samples if k > now)])
+            stop = min([self.steps, *(k for k in (now + CHUNK, *self.samples) if k > now and not self.checked)])
             march(now, stop)
             after = states[stop % ring]
-            collapsed = int(ints[layout.COLLAPSED])
-            if collapsed < _NEVER:
+            if not self.checked and self._wrong(ints, after):
+                collapsed = int(ints[layout.COLLAPSED])
+                if collapsed == _NEVER:
+                    report(self.scene, self.inputs, self.first + stop, after)
                 if before is not None:
                     states[now % 2] = before
                     march(now, collapsed)
                 report(self.scene, self.inputs, self.first + collapsed, states[collapsed % ring])
-            if not bool(torch.isfinite(after).all()) or bool(outside(self.scene, self.inputs, after).any()):
-                report(self.scene, self.inputs, self.first + stop, after)
             if stop in self.samples:
                 observe(stop, after)
             now = stop
         return states
+
+    def _wrong(self, ints: Tensor, state: Tensor) -> bool:
+        """Whether a solid has collapsed, or a state is not finite or outside of the box; the host waits once."""
+        out = outside(self.scene, self.inputs, state)
+        return bool((ints[layout.COLLAPSED] < _NEVER) | ~torch.isfinite(state).all() | out.any())
 
     def record(self, states: Tensor) -> tuple[Tensor, ...]:
         """The memory of ``forward(keep=True)``: the states, and quantities of every substep; ``RECORD`` tensors."""
@@ -179,7 +130,8 @@ class TotalSegmentIntegrator:
         """Carry the gradient by the last state back to the first, in place; as ``SegmentIntegrator.backward``."""
         i, steps, b, nodes, points = self.inputs, self.steps, self.batch, self.nodes, self.points
         tallies = TALLIES if {"gravity", "force"} & wanted else 0
-        bar[:, 6 * nodes :].view(b, 6 * self.elements, points)[..., self.scene.kind == layout.ABSENT] = 0
+        if self.scene.absent is not None:
+            bar[:, 6 * nodes :].view(b, 6 * self.elements, points).masked_fill_(self.scene.absent, 0)
         sums = Arena.zeros(
             "sums",
             bar,
@@ -214,7 +166,8 @@ class TotalSegmentIntegrator:
         found: dict[str, Tensor] = dict(zip(_SUMS, views, strict=True))
         mass, drag = i.coefficients[:, layout.MASS], i.coefficients[:, layout.DRAG]
         mass_bar, drag_bar = self.lattice.nodal_adjoint(mass, drag, self.scene.dt, nodal_bar)
-        found["coefficients"] = found["coefficients"] + self._chamber_adjoint(chamber_bar)
+        by_chamber = chamber_adjoint(self.scene, i.coefficients, self.chamber, chamber_bar)
+        found["coefficients"] = found["coefficients"] + by_chamber
         found["coefficients"][:, layout.MASS] += mass_bar
         found["coefficients"][:, layout.DRAG] += drag_bar
         found |= {name: found[name].sum(-1) for name in ("prony", "planes")}
@@ -264,30 +217,11 @@ class TotalSegmentIntegrator:
             shift = layout.HEAD if name == "integers" else 0
             head += [shift + offset for offset in given.get(name, [0] * len(quantities))]
         assert len(head) == layout.HEAD
-        return torch.cat([self.tables.buffer.new_tensor(head), self.tables.buffer])
+        values = torch.tensor(head, dtype=torch.int32)
+        if self.gpu:  # from pinned memory, as the host would wait otherwise
+            values = values.pin_memory().to(self.tables.buffer.device, non_blocking=True)
+        return torch.cat([values, self.tables.buffer])
 
     def _kept(self, slots: int) -> tuple[tuple[int, ...], ...]:
         """Shapes of the quantities that are kept of every substep beside the states."""
         return (slots, self.batch, self.chambers), (slots, self.batch, 3, self.nodes)
-
-    def _chamber(self, coefficients: Tensor) -> Tensor:
-        """Mean air stiffness and reference volume of each chamber [B, chambers, 2]."""
-        rows = [coefficients.new_zeros(self.batch, 0, layout.CHAMBER)]
-        for c in range(self.chambers):
-            gas = self.scene.kind == c
-            V = coefficients[:, layout.VOLUME, gas]
-            k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
-            rows.append(torch.stack([k, V.sum(-1)], -1).unsqueeze(1))
-        return torch.cat(rows, 1)
-
-    def _chamber_adjoint(self, bar: Tensor) -> Tensor:
-        """Gradient by the coefficients, from that by :meth:`_chamber`."""
-        found = torch.zeros_like(self.inputs.coefficients)
-        for c in range(self.chambers):
-            gas = self.scene.kind == c
-            V, K = self.inputs.coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
-            k, whole = self.chamber[:, c, :1], self.chamber[:, c, 1:]
-            k_bar, whole_bar = bar[:, c, :1], bar[:, c, 1:]
-            found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
-            found[:, layout.BULK, gas] = k_bar * V / whole
-        return found
