@@ -234,6 +234,7 @@ class Simulator(nn.Module):
             viscous=_present(body, body.viscosity, body.volume_viscosity),
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
             probes=probes,
+            steady=True,
         )
 
     def _integrate(

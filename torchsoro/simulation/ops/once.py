@@ -17,19 +17,20 @@ _known: WeakKeyDictionary[Scene, dict[str, tuple[list[Tensor], list[int], Any]]]
 
 
 def once(scene: Scene, name: str, tensors: list[Tensor], compute: Callable[[], T]) -> T:
-    """What ``compute`` returns; of each scene and name the last outcome is kept for calls with the same tensors.
+    """What ``compute`` returns; of each steady scene and name the last outcome is kept for calls with the same tensors.
 
-    Tensors are the same if they share memory, shape and version, which every operation in place on them raises. What is
-    kept must not refer to the scene, with which it goes, and nobody may write to it.
+    Tensors are the same if they share memory, shape and version, which operations in place raise unless they go by
+    ``data``: hence of steady scenes only. What is kept must not refer to the scene, with which it goes, and nobody may
+    write to it.
 
     Args:
         scene: Constant data.
         name: Of what is computed.
-        tensors: That it depends on.
+        tensors: That it depends on; if none, it is kept of any scene.
         compute: Called without arguments where nothing is kept for these tensors.
     """
     given = [t.detach() for t in tensors]
-    if any(t.is_inference() for t in given):  # these have no version
+    if (given and not scene.steady) or any(t.is_inference() for t in given):  # these have no version
         return compute()
     kept = _known.setdefault(scene, {})
     versions = [t._version for t in given]

@@ -41,6 +41,7 @@ class Scene:
         probes: int64 [P], particles whose motion is recorded.
         lattice: Of the total-Lagrangian form; None for the updated form.
         lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
+        steady: Whether the scene is of one run, whose segments have the same coefficients, Maxwell elements and planes.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
 
@@ -58,6 +59,7 @@ class Scene:
     probes: Tensor
     lattice: Lattice | None = None
     lanes: bool = True
+    steady: bool = False
     handle: int = field(init=False, default_factory=_handles.__next__)
 
     def __post_init__(self) -> None:
