@@ -411,6 +411,12 @@ def test_plans_fit_the_budget(steps, state, budget, double):
     assert plan.keep == (plan.segment == steps and state * 1.15 * (steps + 1) <= budget * 1.001)
     states = plan.segment + 1 + (0 if plan.keep else math.ceil(steps / plan.segment))
     assert plan.memory >= states * state
+    # One segment less would not fit the budget, or the indices of a buffer.
+    fewer = math.ceil(steps / plan.segment) - 1
+    if fewer > 1:
+        longer = math.ceil(steps / fewer)
+        most = (2**31 - 1) * (8 if double else 4) // state - 1
+        assert int(1.15 * state) * (longer + 1) + state * fewer > budget or longer > most
 
 
 def test_a_small_budget_is_refused_with_the_smallest_that_does():
