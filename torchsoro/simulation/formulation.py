@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Protocol
 
 from torch import Tensor
@@ -138,7 +138,7 @@ class Total:
         lanes: Whether a CPU fills its vector registers, by kernels of its own; else it runs those of a GPU.
     """
 
-    lanes: bool = True
+    lanes: bool = field(default=True, repr=False)
     name: ClassVar[FormulationName] = "total"
     air_density: ClassVar[float] = AIR
 
