@@ -72,7 +72,7 @@ def test_an_outcome_agrees_with_its_trajectory_and_its_design(judged):
     assert outcome.center.tolist() == pytest.approx(place.tolist(), abs=1e-7)
     assert place[0] > 1e-3  # denser in front
     assert outcome.center.tolist() == pytest.approx(seen.center_of_gravity[0].tolist(), abs=1e-7)
-    assert seen.position.shape[1:] == (0, 3)
+    assert torch.equal(seen.probes, robot.soles) and seen.position.shape[1:] == (len(robot.soles), 3)
 
 
 def test_the_gradient_reaches_phi_and_is_mirror_symmetric_to_the_bit(judged):

@@ -227,6 +227,39 @@ class AugmentedLagrangian(nn.Module):
         return f"multiplier={float(self.multiplier):.6g}, penalty={float(self.penalty):.6g}, growth={self.growth}"
 
 
+class Tightening(nn.Module):
+    """The same loss with constant multiplier and penalty, for a limit that comes down step by step.
+
+    The violation that it is given is of the limit of the iteration. Where the number of iterations is small, a limit
+    that comes down leaves the design free at first and holds at the end, with no plateau to wait for.
+
+    Args:
+        penalty: Penalty sigma; the multiplier lambda is a twentieth of it.
+
+    Raises:
+        ValueError: The penalty is not finite and positive.
+    """
+
+    multiplier: Tensor
+    penalty: Tensor
+
+    def __init__(self, *, penalty: float) -> None:
+        """Set both numbers."""
+        if not (math.isfinite(penalty) and penalty > 0.0):
+            raise ValueError(f"penalty: got {penalty!r}, want a finite number > 0")
+        super().__init__()
+        self.register_buffer("penalty", torch.tensor(float(penalty), dtype=torch.float64), persistent=False)
+        self.register_buffer("multiplier", self.penalty / 20, persistent=False)
+
+    def forward(self, objective: Tensor, violation: Tensor) -> Tensor:
+        """Return the loss to minimise, as :meth:`AugmentedLagrangian.forward`."""
+        excess = torch.relu(violation)
+        return -objective + self.multiplier.to(objective) * excess + 0.5 * self.penalty.to(objective) * excess.square()
+
+    def update(self, loss: float, violation: float) -> None:
+        """Take note of nothing: the limit follows the iterations."""
+
+
 def _finite(name: str, value: float) -> float:
     """A number as a float, refused if it is not finite."""
     value = float(value)

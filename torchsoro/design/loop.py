@@ -13,12 +13,17 @@ from typing import Any
 import torch
 
 from torchsoro.design.field import DesignField
-from torchsoro.design.lagrangian import AugmentedLagrangian
+from torchsoro.design.lagrangian import AugmentedLagrangian, Tightening
 from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.settings import Settings
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 
 Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
+
+LARGEST_C = 0.25  # of any design
+MARGIN = 0.9  # of the limit on C that a limit which comes down ends at, since the loss does not hold it exactly
+WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
 
 
 def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[torch.Tensor, Outcome]:
@@ -50,7 +55,26 @@ def fell(robot: Robot, outcome: Outcome) -> bool:
     return s.upright > 0 and outcome.fall.item() > 0.1 * s.size[2]
 
 
-def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian) -> bool:
+def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
+    """What an iteration maximises besides C: travel less falling, in cells, as Adam wants gradients of order one.
+
+    A body that stands on one spot has next to no gradient by where it ends, whatever its legs; it has one by how far it
+    reaches while it is inflated. ``settings.inflated`` of that counts at first.
+    """
+    s = robot.settings
+    ahead = s.inflated * (1 - s.tightness(iteration))
+    whole = torch.lerp(outcome.travel, outcome.feet, s.feet)
+    return (torch.lerp(whole, outcome.inflated, ahead) - s.upright * outcome.fall) / robot.domain.cell
+
+
+def worth_of(robot: Robot, outcome: Outcome) -> float:
+    """What a design is worth, in cells: travel less falling; where feet count, no more than what they have walked."""
+    s = robot.settings
+    way = torch.minimum(outcome.travel, outcome.feet / WALKS) if s.feet > 0 else outcome.travel
+    return float((way - s.upright * outcome.fall).detach()) / robot.domain.cell
+
+
+def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian | Tightening) -> bool:
     """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
 
     As long as none is within the limit, what is gained and what is violated weigh as in the loss of now.
@@ -83,7 +107,7 @@ def restore(
     state: dict[str, Any],
     field: DesignField,
     adam: torch.optim.Adam,
-    lagrangian: AugmentedLagrangian,
+    lagrangian: AugmentedLagrangian | Tightening,
     path: Path,
 ) -> tuple[bool, dict[str, Any] | None, torch.Tensor]:
     """Put a checkpoint's state into field, optimizer and schedule.
@@ -119,6 +143,20 @@ def restore(
     return bool(state["stopped"]), best, state["good"]
 
 
+def _schedule(s: Settings) -> AugmentedLagrangian | Tightening:
+    """The loss under the limit on C."""
+    if s.tighten[1]:
+        return Tightening(penalty=s.penalty)
+    return AugmentedLagrangian(
+        previous=LARGEST_C - s.c_max,
+        penalty=s.penalty,
+        window=s.window,
+        tolerance=s.tolerance,
+        growth=s.growth,
+        patience=s.patience,
+    )
+
+
 def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
@@ -141,14 +179,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
         return torch.optim.Adam(field.parameters(), lr=s.learning_rate)
 
     adam = new_adam()
-    lagrangian = AugmentedLagrangian(
-        previous=0.25 - s.c_max,
-        penalty=s.penalty,
-        window=s.window,
-        tolerance=s.tolerance,
-        growth=s.growth,
-        patience=s.patience,
-    )
+    lagrangian = _schedule(s)
     stopped = False
     good = field.phi.detach().clone()
     best: dict[str, Any] | None = None
@@ -159,10 +190,10 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             gamma, outcome = simulate(robot, good, s.gravity_scale(k))
-            violation = outcome.intermediate - s.c_max
-            # Adam wants gradients of order one: travel counts in grid cells.
-            worth = (outcome.travel - s.upright * outcome.fall) / robot.domain.cell
-            loss = lagrangian(worth, violation)
+            limit = LARGEST_C + (s.c_max * MARGIN - LARGEST_C) * s.tightness(k) if s.tighten[1] else s.c_max
+            violation = float(outcome.intermediate.detach()) - s.c_max
+            worth = worth_of(robot, outcome)
+            loss = lagrangian(aim(robot, outcome, k), outcome.intermediate - limit)
             middle = time.perf_counter()
             adam.zero_grad()
             loss.backward()
@@ -177,17 +208,17 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                     quantity=f"gradient of norm {float(norm)} in iteration {k}",
                     remedy="a smaller step (dt), a lower pressure, or smaller weights (penalty, upright)",
                 )
-            if s.gravity_scale(k) == 1.0 and better(worth.item(), violation.item(), best, lagrangian):
+            if s.gravity_scale(k) == 1.0 and better(worth, violation, best, lagrangian):
                 best = {
                     "iteration": k,
-                    "worth": worth.item(),
-                    "violation": violation.item(),
+                    "worth": worth,
+                    "violation": violation,
                     "phi": field.phi.detach().clone(),
                 }
             end = time.perf_counter()
             adam.step()
             field.clamp_()
-            event = lagrangian.update(loss.item(), violation.item())
+            event = lagrangian.update(loss.item(), violation)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
             stopped = event is not None and event.stop and s.gravity_scale(k) == 1.0
@@ -196,7 +227,9 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                 k,
                 {
                     "objective/L": outcome.travel.detach(),
+                    "objective/feet": outcome.feet.detach(),
                     "constraint/C": outcome.intermediate.detach(),
+                    "constraint/limit": limit,
                     "objective/fall": outcome.fall.detach(),
                     "mass": outcome.mass.detach(),
                     **{f"cog/{axis}": center[i] for i, axis in enumerate("xyz")},

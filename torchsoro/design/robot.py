@@ -31,6 +31,8 @@ class Outcome:
 
     Attributes:
         travel: L, Eq. 13 [m].
+        feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
+        inflated: Travel of the centre of gravity when the valve closes for the first time [m].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
         fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
@@ -40,6 +42,8 @@ class Outcome:
     """
 
     travel: Tensor
+    feet: Tensor
+    inflated: Tensor
     intermediate: Tensor
     mass: Tensor
     fall: Tensor
@@ -101,6 +105,7 @@ class Robot(nn.Module):
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
+        self.soles = _outermost(self.domain, planes).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
         s.check_memory(self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every))
@@ -136,12 +141,17 @@ class Robot(nn.Module):
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
         trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress)
         end = s.settle + s.duration
-        distance = travel(
-            trajectory.center_of_gravity, trajectory.time, start=s.settle, end=end, direction=self.direction
-        )
+
+        def until(moment: float) -> Tensor:
+            seen, time = trajectory.center_of_gravity, trajectory.time
+            return travel(seen, time, start=s.settle, end=moment, direction=self.direction)
+
+        closes = s.sample_every * max(1, round(min(s.duty / s.frequency, s.duration) / s.sample_every))
         height = trajectory.center_of_gravity[:, 2]
         return Outcome(
-            travel=distance,
+            travel=until(end),
+            feet=self.feet(trajectory, gamma),
+            inflated=until(s.settle + closes),
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(solid),
             fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
@@ -149,6 +159,27 @@ class Robot(nn.Module):
             trajectory=trajectory,
             dt=trajectory.dt,
         )
+
+    def feet(self, trajectory: Trajectory, gamma: Tensor) -> Tensor:
+        """Travel of the feet since the actuation starts [m]; zero if nothing touches at the end.
+
+        Feet are the particles of the outermost layers that touch a plane at the end, to a quarter of a spacing; they
+        count by the cube of their density.
+
+        Args:
+            trajectory: With those layers among its probes.
+            gamma: Density [N].
+        """
+        at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
+        place, probes = trajectory.position[:, at], trajectory.probes[at]
+        first = int((trajectory.time - self.settings.settle).abs().argmin())
+        touches = torch.zeros_like(place[-1, :, 0], dtype=torch.bool)
+        for plane in self.planes:
+            above = plane.side * (place[-1, :, plane.axis].detach() - float(plane.offset))
+            touches |= above < 0.75 * self.domain.spacing
+        share = gamma[probes].clamp(min=0) ** 3 * touches
+        moved = (place[-1] - place[first]) @ place.new_tensor(self.direction)
+        return (share * moved).sum() / share.sum().clamp(min=torch.finfo(share.dtype).tiny)
 
     def filled(self, gamma: Tensor) -> Body:
         """The domain filled with a density [N]."""
@@ -175,9 +206,10 @@ class Robot(nn.Module):
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
         rest, keep = body.position, torch.ones_like(self.design)
+        probes = torch.arange(len(rest), device=rest.device) if everything else self.soles
         if not void:
             body, keep = without_void(body)
-            weight = weight[keep]
+            weight, probes = weight[keep], probes[keep[probes]]
         for halving in range(s.halvings + 1):
             try:
                 trajectory = self.simulator(2**halving)(
@@ -189,10 +221,12 @@ class Robot(nn.Module):
                     planes=self.planes,
                     sample_every=s.sample_every,
                     weight=weight,
-                    probes=torch.arange(len(body.chamber)) if everything else None,
+                    probes=(keep.cumsum(0) - 1)[probes],
                     progress=progress,
                 )
-                return self._with_void(trajectory, rest, keep) if everything and not void else trajectory
+                if everything and not void:
+                    return self._with_void(trajectory, rest, keep)
+                return replace(trajectory, probes=probes)
             except SimulationDiverged:
                 if halving == s.halvings:
                     raise
@@ -243,6 +277,15 @@ def climber(settings: Settings) -> Robot:
         Plane(axis=0, offset=half, side=-1, friction=settings.friction),
     )
     return Robot(settings, planes=planes, direction=(0.0, 0.0, 1.0), symmetry=("x", "y"))
+
+
+def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
+    """Particles of the layers that face a plane [n]."""
+    place, faces = domain.positions, torch.zeros(domain.count, dtype=torch.bool)
+    for plane in planes:
+        along = plane.side * place[:, plane.axis]
+        faces |= along < along.min() + 0.5 * domain.spacing
+    return faces.nonzero().squeeze(1)
 
 
 def _pressure(s: Settings, modulus: float) -> Waveform:

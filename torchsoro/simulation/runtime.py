@@ -1,22 +1,17 @@
-"""Start of Taichi, on the device of the tensors; exclusion of functions from ``torch.compile``."""
+"""Start of Taichi, on the device of the tensors."""
 
 from __future__ import annotations
 
 import atexit
 import contextlib
-import functools
 import io
-from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any
 
 import taichi as ti
 import torch
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
 from torchsoro.simulation.threads import set_threads
-
-P = ParamSpec("P")
-T = TypeVar("T")
 
 _started: str | None = None
 
@@ -78,21 +73,3 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> N
     with contextlib.redirect_stdout(io.StringIO()):  # Taichi prints the device that it starts on
         ti.init(arch=ti.cuda if kind == "cuda" else ti.cpu, offline_cache=True, log_level=ti.WARN, **options)
     _started = kind
-
-
-def uncompiled(function: Callable[P, T]) -> Callable[P, T]:
-    """A function that ``torch.compile`` does not trace, at the price of graph breaks.
-
-    As ``torch.compiler.disable``, but that imports ``torch._dynamo`` (1.5 to 3 s) also where nothing is compiled.
-    """
-    disabled: list[Any] = []
-
-    @functools.wraps(function)
-    def call(*args: P.args, **kwargs: P.kwargs) -> T:
-        if not torch.compiler.is_compiling():
-            return function(*args, **kwargs)
-        if not disabled:
-            disabled.append(torch.compiler.disable(function, reason="the simulator checks values before it runs"))
-        return disabled[0](*args, **kwargs)
-
-    return call

@@ -39,3 +39,9 @@ def _take_back(block: np.ndarray) -> None:
     _waiting.append(block)
     while sum(b.size for b in _waiting) > ROOM:
         _waiting.pop(0)
+
+
+def empty_record(like: Tensor) -> tuple[Tensor, ...]:
+    """A record of nothing, in the types of ``SegmentIntegrator.record``."""
+    nothing = (like.new_empty(0) for _ in range(3))
+    return *nothing, like.new_empty(0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -24,10 +24,13 @@ from torch.autograd import forward_ad
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lane_segment import LaneIntegrator, in_lanes
+from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.observation import observe, observe_adjoint
 from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
-from torchsoro.simulation.ops.segment import SegmentIntegrator, empty_record
-from torchsoro.simulation.ops.total import TotalSegmentIntegrator
+
+if TYPE_CHECKING:
+    from torchsoro.simulation.ops.segment import SegmentIntegrator
+    from torchsoro.simulation.ops.total import TotalSegmentIntegrator
 
 _INPUTS = tuple(f.name for f in fields(Inputs))
 _TENSORS = ("state", "weight", *_INPUTS)
@@ -57,9 +60,14 @@ _BACKWARD = _define(
 def _integrator(
     scene: Scene, inputs: Inputs, first: int, samples: Sequence[int]
 ) -> SegmentIntegrator | TotalSegmentIntegrator | LaneIntegrator:
-    kind: type = SegmentIntegrator
-    if scene.lattice is not None:
-        kind = LaneIntegrator if in_lanes(scene, inputs.coefficients) else TotalSegmentIntegrator
+    # Taichi is imported only where it simulates: that takes as long as a coarse simulation.
+    kind: type
+    if in_lanes(scene, inputs.coefficients):
+        kind = LaneIntegrator
+    elif scene.lattice is None:
+        from torchsoro.simulation.ops.segment import SegmentIntegrator as kind
+    else:
+        from torchsoro.simulation.ops.total import TotalSegmentIntegrator as kind
     return kind(scene, inputs, first=first, samples=tuple(samples))
 
 

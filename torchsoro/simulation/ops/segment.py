@@ -47,12 +47,6 @@ class Chunk:
         return self.size[0] * self.size[1] * self.size[2]
 
 
-def empty_record(like: Tensor) -> tuple[Tensor, ...]:
-    """A record of nothing, in the types of :meth:`SegmentIntegrator.record`."""
-    nothing = (like.new_empty(0) for _ in range(3))
-    return *nothing, like.new_empty(0, dtype=torch.int32), torch.empty(0, dtype=torch.int64)
-
-
 class SegmentIntegrator:
     """One segment: ``forward`` from a state to all states (or the last two), ``backward`` along the kept ones.
 

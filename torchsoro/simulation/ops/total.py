@@ -14,8 +14,8 @@ from torchsoro.simulation.ops.arena import Arena
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.fixed import chamber_adjoint, fixed
 from torchsoro.simulation.ops.launch import capture
+from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
-from torchsoro.simulation.ops.segment import empty_record
 from torchsoro.simulation.ops.tiles import tile_count, tile_counts
 from torchsoro.simulation.runtime import init
 
