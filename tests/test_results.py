@@ -91,7 +91,8 @@ def test_the_pictures_of_a_run_tell_the_numbers_of_its_result(tmp_path, monkeypa
         assert how["displacement"][-1, 0] == pytest.approx(found["L"], abs=1e-9)
     assert told["summary"]["note"] == numbers(found)
     assert numbers(found).startswith(
-        f"stride {1e3 * found['stride']:.2f} mm (mean of whole cycles), C = 0.0000 (limit 0.0125)"
+        f"feet {1e3 * found['feet']:.2f} mm, stride {1e3 * found['stride']:.2f} mm (mean of whole cycles), "
+        "C = 0.0000 (limit 0.0125)"
     )
     assert "limit 0.0125 NOT MET" in numbers({**found, "C_within_limit": False})
     assert numbers({**found, "stride": None}).startswith("no whole cycle")

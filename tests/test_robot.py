@@ -75,6 +75,22 @@ def test_an_outcome_agrees_with_its_trajectory_and_its_design(judged):
     assert torch.equal(seen.probes, robot.soles) and seen.position.shape[1:] == (len(robot.soles), 3)
 
 
+def test_feet_count_that_touch_the_ground_at_the_end_and_lean_nowhere_by_the_cube_of_their_density(judged):
+    robot, outcome = judged
+    seen, gamma = outcome.trajectory, robot.field().detach()
+    place = robot.domain.positions[robot.soles].float()
+    still = place.expand(len(seen.time), -1, -1).clone()
+    assert float(robot.feet(dataclasses.replace(seen, position=still), gamma)) == 0
+    moved = still.clone()
+    front = place[:, 0] > 0
+    moved[-1, front, 0] += 0.003
+    share = gamma[robot.soles] ** 3
+    half = float(share[front].sum() / share.sum())
+    assert float(robot.feet(dataclasses.replace(seen, position=moved), gamma)) == pytest.approx(0.003 * half, rel=1e-5)
+    moved[-1, ~front, 2] += 0.5 * robot.domain.spacing  # lifted
+    assert float(robot.feet(dataclasses.replace(seen, position=moved), gamma)) == pytest.approx(0.003, rel=1e-5)
+
+
 def test_the_gradient_reaches_phi_and_is_mirror_symmetric_to_the_bit(judged):
     robot, _ = judged
     gradient = robot.field.phi.grad
@@ -123,7 +139,9 @@ def test_a_robot_without_its_void_goes_the_same_way():
         assert getattr(part, name) == pytest.approx(getattr(whole, name)), name
     lean = robot(gamma, void=False)
     assert torch.equal(lean.travel, part.travel)
-    assert lean.trajectory.position.shape[1] == 0
+    there = robot.soles[~void[robot.soles]]
+    assert torch.equal(lean.trajectory.probes, there) and lean.trajectory.position.shape[1] == len(there)
+    torch.testing.assert_close(lean.feet, part.feet)
 
 
 def test_the_settings_name_the_robot():

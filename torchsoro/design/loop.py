@@ -63,18 +63,23 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
     """
     s = robot.settings
     ahead = s.inflated * (1 - s.tightness(iteration))
-    whole = torch.lerp(outcome.travel, outcome.feet, s.feet)
+    lean = torch.relu(1.1 * WALKS * outcome.travel - outcome.feet)
+    whole = torch.lerp(outcome.travel, outcome.feet, s.feet) - s.feet * lean
     return (torch.lerp(whole, outcome.inflated, ahead) - s.upright * outcome.fall) / robot.domain.cell
 
 
 def worth_of(robot: Robot, outcome: Outcome) -> float:
-    """What a design is worth, in cells: travel less falling; where feet count, no more than what they have walked."""
+    """What a design is worth, in cells: travel less falling and, where feet count, less four times what is leaning."""
     s = robot.settings
-    way = torch.minimum(outcome.travel, outcome.feet / WALKS) if s.feet > 0 else outcome.travel
-    return float((way - s.upright * outcome.fall).detach()) / robot.domain.cell
+    way = outcome.travel - s.upright * outcome.fall
+    if s.feet > 0:
+        way = way - 4 * torch.relu(1.03 * WALKS * outcome.travel - outcome.feet)
+    return float(way.detach()) / robot.domain.cell
 
 
-def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian | Tightening) -> bool:
+def better(
+    worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian | Tightening
+) -> bool:
     """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
 
     As long as none is within the limit, what is gained and what is violated weigh as in the loss of now.
@@ -143,6 +148,13 @@ def restore(
     return bool(state["stopped"]), best, state["good"]
 
 
+def limit_on_c(s: Settings, iteration: int) -> float:
+    """The limit on C that the loss of an iteration has: comes down by the same factor in each."""
+    if not s.tighten[1]:
+        return s.c_max
+    return LARGEST_C * (MARGIN * s.c_max / LARGEST_C) ** s.tightness(iteration)
+
+
 def _schedule(s: Settings) -> AugmentedLagrangian | Tightening:
     """The loss under the limit on C."""
     if s.tighten[1]:
@@ -190,7 +202,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             gamma, outcome = simulate(robot, good, s.gravity_scale(k))
-            limit = LARGEST_C + (s.c_max * MARGIN - LARGEST_C) * s.tightness(k) if s.tighten[1] else s.c_max
+            limit = limit_on_c(s, k)
             violation = float(outcome.intermediate.detach()) - s.c_max
             worth = worth_of(robot, outcome)
             loss = lagrangian(aim(robot, outcome, k), outcome.intermediate - limit)

@@ -31,20 +31,20 @@ _WALKER_DESK = dataclasses.replace(
     settle=0.05,
     duration=0.2,
     sample_every=0.0025,
-    iterations=80,
+    iterations=90,
     filter_radius=0.007,
     void_range=(0.1, 0.3),
     halvings=2,
     # In a single cycle, falling on the nose would be the longest stride.
-    upright=4.0,
-    sink=0.02,
-    feet=0.3,
-    inflated=0.5,
+    upright=8.0,
+    sink=0.01,
+    feet=1.0,
+    inflated=0.6,
     learning_rate=0.03,
     # Smaller than any norm: gradients count by their direction, as their norms grow a hundredfold within a few steps.
     clip=0.03,
-    penalty=400.0,
-    tighten=(24, 64),
+    penalty=800.0,
+    tighten=(14, 54),
 )
 
 # The paper's text says 40.25 mm; 83,200 particles and its step times fit 45.5 mm.

@@ -84,7 +84,8 @@ def numbers(found: Mapping[str, Any]) -> str:
     if found["stride"] is not None and not math.isnan(found["stride"]):
         stride = f"stride {1e3 * found['stride']:.2f} mm (mean of whole cycles)"
     limit = f"limit {found['C_limit']:g}{'' if found['C_within_limit'] else ' NOT MET'}"
-    return f"{stride}, C = {found['C']:.4f} ({limit}), mass {1e3 * found['mass']:.2f} g"
+    feet = f"feet {1e3 * found['feet']:.2f} mm, " if found.get("feet") is not None else ""
+    return f"{feet}{stride}, C = {found['C']:.4f} ({limit}), mass {1e3 * found['mass']:.2f} g"
 
 
 def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
@@ -157,8 +158,8 @@ def show(
         void: Simulate void, too.
 
     Returns:
-        Travel L [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and whether it is met, mass
-        [kg]; and the printable part.
+        Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
+        whether it is met, mass [kg]; and the printable part.
 
     Raises:
         ValueError: if the design has no connected body to print; movie and motion are written before.
@@ -173,6 +174,7 @@ def show(
     center = trajectory.center_of_gravity.cpu().double().numpy()
     found = {
         "L": float(outcome.travel),
+        "feet": float(outcome.feet),
         "stride": mean_stride(center @ np.array(robot.direction), time, start=s.settle, period=1 / s.frequency),
         "C": float(outcome.intermediate),
         "C_limit": s.c_max,

@@ -29,8 +29,8 @@ from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.ops.rollout import refuse_transforms, rollout
 from torchsoro.simulation.ops.scene import Inputs, Scene
-from torchsoro.simulation.tracing import uncompiled
 from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
+from torchsoro.simulation.tracing import uncompiled
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
