@@ -93,7 +93,7 @@ def test_what_is_unknown_or_mistyped_ends_with_code_two_and_names_it(arguments, 
 
 
 def test_the_help_names_every_setting_with_its_words_and_keeps_commands_on_their_lines(capsys, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as error:
         from_command_line(
             PRESETS,
