@@ -22,7 +22,7 @@ errors
 storage command_line
 simulation.laws simulation.axis
 simulation.kernels
-simulation.threads
+simulation.threads simulation.tracing
 simulation.runtime
 simulation.ops
 simulation
