@@ -1,6 +1,6 @@
-"""Every law once, as functions of numbers, which Taichi, Numba and plain Python all run from this text.
+"""Laws of contact, as functions of numbers, which Taichi, lanes of a CPU and plain Python all run from this text.
 
-``kernels.laws_taichi`` and ``kernels.laws_numba`` compile it. So that all three read it alike, and lanes of a vector
+``kernels.laws_taichi`` and ``kernels.laws_lanes`` compile it. So that all three read it alike, and lanes of a vector
 register go through it together, a law
 
 - takes numbers and returns a number or a tuple of them, once, at its end; vectors are taken apart;

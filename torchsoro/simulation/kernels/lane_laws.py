@@ -7,7 +7,7 @@ of a symmetric tensor, an off-diagonal component counts once.
 from torchsoro.simulation.kernels.lanes import larger, law, rough_cube_root, select, split
 
 # Least volume ratio that the solid's share of a partly void point feels: a grey point under pressure may be crushed.
-CRUSHED = 0.2
+CRUSHED = 0.20000000298023224  # 0.2 as float32, which Taichi takes
 
 
 @law
