@@ -33,7 +33,7 @@ def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[to
     steps back still falls, that is what is returned.
 
     Raises:
-        SimulationDiverged: if half, a quarter and an eighth of the way break down as well.
+        SimulationDiverged: if half and a quarter of the way, and the last good design, break down as well.
     """
     for left in (3, 2, 1, 0):
         gamma = robot.field()
@@ -45,7 +45,7 @@ def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[to
             if left == 0:
                 raise
         with torch.no_grad():
-            robot.field.phi.lerp_(good.to(robot.field.phi), 0.5)
+            robot.field.phi.lerp_(good.to(robot.field.phi), 0.5 if left > 1 else 1.0)
     raise AssertionError
 
 
