@@ -76,14 +76,14 @@ def off(folder):
     return np.sqrt(((course - same) ** 2).mean(0))[1:] / moved
 
 
-def test_loaded_cantilever_matches_the_twin_within_9_percent(updated, tmp_path):
+def test_loaded_cantilever_matches_the_twin_within_10_percent(updated, tmp_path):
     folder, other = experiment(tmp_path / "one", LOADED), experiment(tmp_path / "other", LOADED)
     assert updated.main(updated.Options(experiments=(folder, other), transfer="flip")) == 1
     tables = [(f / "trials" / "a" / "simulated.csv").read_text() for f in (folder, other)]
     assert tables[0] == tables[1]
     coarse = off(folder)
     assert updated.main(updated.Options(experiments=(folder,), transfer="flip", cells=6)) == 1
-    assert (off(folder) < np.minimum(0.09, 0.6 * coarse)).all()
+    assert (off(folder) < np.minimum(0.1, 0.6 * coarse)).all()
 
 
 def test_half_clamped_faces_oblique_planes_and_uneven_edges_are_refused(updated, tmp_path):

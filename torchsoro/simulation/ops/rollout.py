@@ -148,8 +148,7 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     end_bar, *seen_bar = bars
     integrator = _integrator(scene, inputs, first, samples if keep else ())
     if not keep:
-        if isinstance(integrator, TotalSegmentIntegrator):
-            integrator.checked = True  # the same bits as in the forward pass
+        integrator.checked = True  # the same bits as in the forward pass
         record = integrator.record(integrator.forward(state, keep=True, observe=lambda k, s: None))
         integrator.samples = tuple(samples)
     states: Any = integrator.restore(record)

@@ -59,6 +59,7 @@ class SegmentIntegrator:
 
     def __init__(self, scene: Scene, inputs: Inputs, *, first: int, samples: tuple[int, ...]) -> None:
         self.scene, self.inputs, self.first, self.samples = scene, inputs, first, samples
+        self.checked = False
         self.steps = inputs.gravity.shape[0]
         like = inputs.coefficients
         init(like.device)
