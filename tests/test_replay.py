@@ -51,7 +51,10 @@ def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, s
     for name in ("shape.stl", "shape.json"):
         assert (tmp_path / "out" / name).read_bytes() == (path / name).read_bytes()
     said = capsys.readouterr()
-    assert f"travel {1e3 * result['L']:.2f} mm; stride {1e3 * result['stride']:.2f} mm" in said.out
+    assert (
+        f"travel {1e3 * result['L']:.2f} mm; feet {1e3 * result['feet']:.2f} mm, stride {1e3 * result['stride']:.2f} mm"
+        in said.out
+    )
     assert "limit 0.0125 NOT MET" in said.out
     assert "simulating straight: 100 %" in said.err
 
