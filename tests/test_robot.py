@@ -118,8 +118,9 @@ def test_a_robot_without_its_void_goes_the_same_way():
     # Void under the belly and behind an edge at the front, 128 of 512 particles.
     gamma = 1 - ((x.abs() < 0.013) & (x > -0.008) & (z < 0.009) | (x > 0.009) & (z > 0.02)).float()
     whole, part = (robot(gamma, everything=True, void=void) for void in (True, False))
-    # Measured: 4e-3 of the travel, since nodal masses have the moments of inertia of all matter, 7e-8 m in the path, 2e-6 m and 1e-3 m/s at single particles; with the 100 times
-    # heavier void of the other tests 11 %, 6e-6 m, 3e-5 m and 1.5e-2 m/s, which these tolerances exclude.
+    # Measured: 4e-3 of the travel, as nodal masses have the moments of inertia of all matter, 7e-8 m in the path, 2e-6
+    # m and 1e-3 m/s at single particles; with the 100 times heavier void of the other tests 11 %, 6e-6 m, 3e-5 m and
+    # 1.5e-2 m/s, which these tolerances exclude.
     assert abs(float(whole.travel)) > 5e-5
     assert float(part.travel) == pytest.approx(float(whole.travel), rel=5e-3)
     here, there = part.trajectory, whole.trajectory
