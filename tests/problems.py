@@ -216,7 +216,7 @@ def problem(
         high=(reach, reach, reach),
         kind=kind,
         share=share.to(dtype),
-        plane_kind=torch.tensor([[2, 1, int(stick), 0, 0], [0, -1, 0, 0, 0], [1, 1, 0, 0, 0]], dtype=torch.int32),
+        plane_kind=torch.tensor([[2, 1, int(stick), 0], [0, -1, 0, 0], [1, 1, 0, 0]], dtype=torch.int32),
         springs=True,
         viscous=True,
         stiffens=True,

@@ -86,7 +86,6 @@ def test_gradcheck_with_oblique_planes_that_pull_from_afar(name, elastic):
     p.tensors["planes"][..., layout.PLANE_REACH] = 0.3
     p.scene.plane_kind[:, layout.PLANE_AXIS] = -1
     p.scene.plane_kind[:, layout.PLANE_ELASTIC] = elastic
-    p.scene.plane_kind[:, layout.PLANE_AFAR] = 1
     assert check(p, name)
 
 

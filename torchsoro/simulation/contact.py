@@ -113,7 +113,6 @@ class Plane:
             layout.PLANE_SIGN: self.side,
             layout.PLANE_STICK: int(self.sticks),
             layout.PLANE_ELASTIC: int(self.landing == "elastic"),
-            layout.PLANE_AFAR: int(self.pulls_from_afar),
         }
         return [found[place] for place in range(layout.PLANE_INTEGERS)]
 

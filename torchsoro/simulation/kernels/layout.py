@@ -38,8 +38,8 @@ PRONY = 3
 # (three); and its integers: the normal counts with the sign, and the axis is of the updated form.
 PLANE_OFFSET, PLANE_FRICTION, PLANE_ADHESION, PLANE_REACH, PLANE_NORMAL = 0, 1, 2, 3, 4
 PLANE = 7
-PLANE_AXIS, PLANE_SIGN, PLANE_STICK, PLANE_ELASTIC, PLANE_AFAR = 0, 1, 2, 3, 4
-PLANE_INTEGERS = 5
+PLANE_AXIS, PLANE_SIGN, PLANE_STICK, PLANE_ELASTIC = 0, 1, 2, 3
+PLANE_INTEGERS = 4
 
 # Nodes: mass and velocity with internal forces (kept for the adjoint); affine FLIP also needs, in a buffer of its own,
 # the velocity before any force; then the velocity after contact and the transferred one.

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.arena import Arena
+from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Scene
@@ -42,7 +43,7 @@ def fixed(scene: Scene, inputs: Inputs) -> Fixed:
         lattice, (c, prony, planes) = scene.lattice, (t.detach() for t in given)
         assert lattice is not None
         nodal = lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], scene.dt)
-        chamber = _chamber(scene, c, chambers)
+        chamber = chamber_means(scene, c, chambers)
         constants = numbers(lattice, scene.dt, scene.cell).to(c)
         return Fixed(
             tables=once(scene, "tables", [], lambda: Arena("integers", *_integers(scene, chambers))),
@@ -59,29 +60,3 @@ def _integers(scene: Scene, chambers: int) -> list[Tensor]:
     assert scene.lattice is not None
     found = tables(scene.lattice, scene.kind, chambers)
     return [scene.kind, scene.plane_kind, *(torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in found)]
-
-
-def _chamber(scene: Scene, coefficients: Tensor, chambers: int) -> Tensor:
-    rows = [coefficients.new_zeros(len(coefficients), 0, layout.CHAMBER)]
-    for c in range(chambers):
-        V, K = _air(scene, coefficients, c)
-        rows.append(torch.stack([(V * K).sum(-1) / V.sum(-1), V.sum(-1)], -1).unsqueeze(1))
-    return torch.cat(rows, 1)
-
-
-def _air(scene: Scene, coefficients: Tensor, c: int) -> tuple[Tensor, Tensor]:
-    """Volumes and bulk moduli of the gas in a chamber [B, n]."""
-    gas = scene.gas(c)
-    return coefficients[:, layout.VOLUME, gas], coefficients[:, layout.BULK, gas]
-
-
-def chamber_adjoint(scene: Scene, coefficients: Tensor, chamber: Tensor, bar: Tensor) -> Tensor:
-    """Gradient by the coefficients, from that by :attr:`Fixed.chamber`."""
-    found = torch.zeros_like(coefficients)
-    for c in range(chamber.shape[1]):
-        gas, (V, K) = scene.gas(c), _air(scene, coefficients, c)
-        k, whole = chamber[:, c, :1], chamber[:, c, 1:]
-        k_bar, whole_bar = bar[:, c, :1], bar[:, c, 1:]
-        found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
-        found[:, layout.BULK, gas] = k_bar * V / whole
-    return found

@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -20,6 +19,7 @@ from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, 
 from torchsoro.simulation.kernels.lane_points import ATTACHED, MAXWELL, NUMBERS
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.ops.chambers import chamber_adjoint, chamber_means
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
@@ -38,20 +38,11 @@ _PLANE = [
     *(layout.PLANE_NORMAL + c for c in range(3)),
     *(layout.PLANE_OFFSET, layout.PLANE_FRICTION, layout.PLANE_ADHESION, layout.PLANE_REACH),
 ]
-_layouts: WeakKeyDictionary[Scene, dict[tuple, Lanes]] = WeakKeyDictionary()
 
 
 @cache
 def _pool(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads)
-
-
-def _lanes_of(scene: Scene, batch: int, dtype: torch.dtype) -> Lanes:
-    assert scene.lattice is not None
-    known = _layouts.setdefault(scene, {})
-    if (batch, dtype) not in known:
-        known[batch, dtype] = lay_out(scene.lattice, scene.kind, batch, dtype)
-    return known[batch, dtype]
 
 
 def in_lanes(scene: Scene, like: Tensor) -> bool:
@@ -90,7 +81,7 @@ class LaneIntegrator:
         self.steps = inputs.gravity.shape[0]
         like = inputs.coefficients
         self.batch, self.elements = like.shape[0], inputs.prony.shape[1]
-        self.lanes = _lanes_of(scene, self.batch, like.dtype)
+        self.lanes: Lanes = lay_out(scene.lattice, scene.kind, self.batch, like.dtype)
         self.mesh: Mesh = self.lanes.mesh
         self.history = 6 * self.elements
         constants = [like, inputs.prony, inputs.planes]
@@ -98,7 +89,7 @@ class LaneIntegrator:
         self.case = case._replace(**self._supply())
 
     def _constants(self) -> tuple[Tensor, Case]:
-        """What the segments of a run have in common."""
+        """What the segments of a run have in common: all but what acts over time."""
         c = self.inputs.coefficients.detach()
         self.nodal = self.lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], self.scene.dt)
         return self.nodal, self._case()
@@ -118,17 +109,6 @@ class LaneIntegrator:
         V = lanes.from_points(values.unsqueeze(1))[:, :, :, 0]
         block, chamber = lanes.pairs.unbind(1)
         return torch.where(kind[:, block] == chamber[:, None, None], V[:, block], 0.0)
-
-    def _chamber(self) -> Tensor:
-        """Mean air stiffness and reference volume of each chamber [B, chambers, 2]."""
-        c = self.inputs.coefficients
-        rows = [c.new_zeros(self.batch, 0, layout.CHAMBER)]
-        for k in range(self.mesh.chambers):
-            gas = self.scene.kind == k
-            V = c[:, layout.VOLUME, gas]
-            stiffness = (V * c[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
-            rows.append(torch.stack([stiffness, V.sum(-1)], -1).unsqueeze(1))
-        return torch.cat(rows, 1)
 
     def _coefficients(self) -> Tensor:
         """Numbers of the points: gas counts as void, without a bulk modulus; what is absent as void without volume."""
@@ -153,14 +133,18 @@ class LaneIntegrator:
         there = self.scene.kind != layout.ABSENT
         return self.lanes.from_points(torch.cat([c[:, layout.SPRING : layout.SPRING + 1], ways], 1) * there)
 
+    def _signs(self, like: Tensor) -> Tensor:
+        """By which the numbers of planes count: normal and offset with the plane's sign [planes, PLANE]."""
+        sign = self.scene.plane_kind[:, layout.PLANE_SIGN, None].to(like)
+        return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+
     def _case(self) -> Case:
         i, s, lanes = self.inputs, self.scene, self.lanes
         like = i.coefficients
         mass = self.nodal[:, :1]
         there = mass > 0
         inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
-        sign = s.plane_kind[:, layout.PLANE_SIGN, None].to(like)
-        numbered = i.planes[..., _PLANE] * torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+        numbered = i.planes[..., _PLANE] * self._signs(like)
         count, elastic = s.plane_kind.shape[0], s.plane_kind[:, layout.PLANE_ELASTIC].bool()
         ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
         far = lanes.from_nodes((ways > 0).to(like)) if count else like.new_zeros(0)
@@ -188,10 +172,12 @@ class LaneIntegrator:
             moves=numbers(lanes.from_nodes(there.to(like))),
             drag_factor=numbers(lanes.from_nodes(self.nodal[:, 4:])),
             reach=numbers(lanes.from_nodes(self.nodal[:, 1:4])),
-            air=numbers(lanes.from_batch(self._chamber())),
+            air=numbers(lanes.from_batch(chamber_means(s, like, self.mesh.chambers))),
             share=shares.numpy(),
             share_there=(shares.view(len(shares), self.mesh.component // LANES, LANES) != 0).any(-1).numpy(),
-            **self._supply(),
+            pressure=none,
+            gravity=none,
+            force=none,
             force_start=np.full(len(shares), -1),
             tie_share=none,
             tie_stiffness=none,
@@ -338,7 +324,7 @@ class LaneIntegrator:
         Returns:
             Gradients by the tensors of ``Inputs``.
         """
-        _i, lanes, mesh, steps = self.inputs, self.lanes, self.mesh, self.steps
+        lanes, mesh, steps = self.lanes, self.mesh, self.steps
         nodes, groups, blocks = self.lattice.nodes, lanes.groups, len(mesh.block_at)
         states, histories, pushed, volumes = self.kept
         at = np.full(steps + 1, -1)
@@ -415,7 +401,8 @@ class LaneIntegrator:
             wide = c.new_zeros(groups, blocks, 8, 1, LANES)
             wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
             found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
-            found += self._chamber_adjoint(lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES)))
+            air_bar = lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES))
+            found += chamber_adjoint(s, c, chamber_means(s, c, mesh.chambers), air_bar)
         if s.springs:
             attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
             found[:, layout.SPRING : layout.ANCHOR + 3] += attached
@@ -438,16 +425,16 @@ class LaneIntegrator:
         if planes:
             by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
             by_plane = by_node.sum(-1).view(self.batch, planes, PLANE)
-            sign = s.plane_kind[:, layout.PLANE_SIGN, None].to(c)
-            planes_bar[..., _PLANE] = by_plane * torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+            planes_bar[..., _PLANE] = by_plane * self._signs(c)
         gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
         if {"gravity", "force"} & wanted:
             mass = self.nodal[:, :1]
+            share = self.lattice.to_nodes(s.share.to(c)) if len(s.share) else None
             for t in range(self.steps):
                 pull = lanes.to_nodes(pulls[t + 1])
                 gravity_bar[t] = (mass * pull).sum(-1)
-                if len(s.share):
-                    force_bar[t] = torch.einsum("bcn,gn->bgc", pull, self.lattice.to_nodes(s.share.to(c)))
+                if share is not None:
+                    force_bar[t] = torch.einsum("bcn,gn->bgc", pull, share)
         pressure_bar = torch.zeros_like(i.pressure)
         if mesh.chambers:
             by_step = tensor(sums.pressure, self.steps, groups, mesh.chambers, LANES)
@@ -465,15 +452,3 @@ class LaneIntegrator:
             "planes": planes_bar,
             "origin": torch.zeros_like(i.origin),
         }
-
-    def _chamber_adjoint(self, bar: Tensor) -> Tensor:
-        """Gradient by the coefficients, from that by :meth:`_chamber`."""
-        found, chamber = torch.zeros_like(self.inputs.coefficients), self._chamber()
-        for c in range(self.mesh.chambers):
-            gas = self.scene.kind == c
-            V, K = self.inputs.coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
-            k, whole = chamber[:, c, :1], chamber[:, c, 1:]
-            k_bar, whole_bar = bar[:, c, :1], bar[:, c, 1:]
-            found[:, layout.VOLUME, gas] = k_bar * (K - k) / whole + whole_bar
-            found[:, layout.BULK, gas] = k_bar * V / whole
-        return found

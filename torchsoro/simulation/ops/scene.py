@@ -34,7 +34,7 @@ class Scene:
         kind: int32 [N], -1 for solid, else the number of the gas chamber.
         share: [groups, N], each particle's share of its group's force.
         plane_kind: int32 [planes, PLANE_INTEGERS]: axis (-1 if oblique), side (+1 or -1), 1 for stick or 0 for Coulomb,
-            1 for elastic landing or 0, 1 for adhesion with a reach or 0.
+            1 for elastic landing or 0.
         springs: Whether any particle has a spring or drag, be it of zero.
         viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
         stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.

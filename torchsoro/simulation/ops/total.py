@@ -11,8 +11,9 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout, total, total_adjoint
 from torchsoro.simulation.ops.arena import Arena
+from torchsoro.simulation.ops.chambers import chamber_adjoint
 from torchsoro.simulation.ops.divergence import outside, report
-from torchsoro.simulation.ops.fixed import chamber_adjoint, fixed
+from torchsoro.simulation.ops.fixed import fixed
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
