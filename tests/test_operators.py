@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -11,17 +11,19 @@ from torch import Tensor, nn
 from torch.autograd import forward_ad
 
 from torchsoro import Prony, ground
-from torchsoro.simulation.ops.scene import scene_of
+from torchsoro.simulation.ops.scene import Inputs, scene_of
 
 FORMS = {"apic": {"blend": 0.0}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}
 forms = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
-NAMES = ("state", "weight", "coefficients", "prony", "pressure", "gravity", "force", "planes", "origin")
+NAMES = ("state", "weight", *(f.name for f in fields(Inputs)))
 
 
 def arguments(p: Problem, keep: bool) -> tuple:
-    """Arguments of ``torch.ops.torchsoro.rollout`` for a problem, all tensors requiring gradients."""
+    """Arguments of ``torch.ops.torchsoro.rollout`` for a problem, whose tensors require gradients."""
     leaves = p.leaves()
-    return *(leaves[name] for name in NAMES), p.scene.handle, 0, list(p.samples), keep
+    state, weight = leaves.pop("state"), leaves.pop("weight")
+    inputs = Inputs(**leaves)
+    return state, weight, *(getattr(inputs, name) for name in NAMES[2:]), p.scene.handle, 0, list(p.samples), keep
 
 
 # ------------------------------------------------------------------------------------------------------- registration

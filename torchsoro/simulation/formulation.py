@@ -173,13 +173,14 @@ class Total:
     def initial(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
         """State [B, L]."""
         assert scene.lattice is not None
-        return total_state(scene.lattice, x, velocity, scene.kind != layout.ABSENT, inputs.prony.shape[1])
+        present, elements = scene.kind != layout.ABSENT, inputs.prony.shape[1]
+        return total_state(scene.lattice, x, velocity, present, elements, scene.softens)
 
     def state_shape(self, scene: Scene, inputs: Inputs) -> tuple[int, ...]:
         """[B, L]."""
         assert scene.lattice is not None
         batch, _, points = inputs.coefficients.shape
-        return batch, layout.lattice_components(scene.lattice.nodes, points, inputs.prony.shape[1])
+        return batch, layout.lattice_components(scene.lattice.nodes, points, inputs.prony.shape[1], scene.softens)
 
     def node_share(self, scene: Scene, state: Tensor) -> float:
         """One vector of the nodes is kept beside a state."""

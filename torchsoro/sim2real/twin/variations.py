@@ -16,7 +16,7 @@ from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.kernels.variations import Case as Numbers
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
-from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.lattice import Lattice, Walls
 
 real = np.float32
 
@@ -29,34 +29,16 @@ def lanes_of(twin: Twin) -> Lanes:
     kind = np.full(shape, layout.ABSENT)
     kind[tuple(grid.cells.T)] = -1
     wide = np.broadcast_to(kind[:, None, :, None, :, None], (shape[0], 2, shape[1], 2, shape[2], 2))
-    found = lay_out(Lattice(axes=grid.axes), torch.from_numpy(wide.reshape(-1).copy()), LANES, torch.float32)
+    walls = _walls(grid.walls) if len(grid.walls[-1]) else None
+    lattice = Lattice(axes=grid.axes, walls=walls)
+    found = lay_out(lattice, torch.from_numpy(wide.reshape(-1).copy()), LANES, torch.float32)
     assert found.variations
-    return _walled(found, twin)
+    return found
 
 
-def _walled(lanes: Lanes, twin: Twin) -> Lanes:
-    """With the points of the chambers' walls, each with the first item of the layer whose nodes it uses."""
-    nodes, values, places, axes, areas, chambers = twin.grid.walls
-    mesh = lanes.mesh
-    if not len(axes):
-        return lanes
-    low = np.unravel_index(nodes[:, 0], twin.grid.counts)
-    item = np.array([int(np.flatnonzero(mesh.item_plane == p)[0]) for p in low[0]])
-    order = np.argsort(item, kind="stable")
-    item_gas = np.zeros((len(mesh.item_plane), int(chambers.max()) + 1), bool)
-    item_gas[item, chambers] = True
-    walls = mesh._replace(
-        chambers=item_gas.shape[1],
-        item_gas=item_gas,
-        wall_begin=np.searchsorted(item[order], np.arange(len(mesh.item_plane) + 1)).astype(np.int64),
-        wall_at=(low[1] * mesh.row + low[2] * mesh.unit)[order].astype(np.int64),
-        wall_value=values[order].astype(real).reshape(-1),
-        wall_place=places[order].astype(real).reshape(-1),
-        wall_axis=axes[order].astype(np.int64),
-        wall_area=areas[order].astype(real),
-        wall_chamber=chambers[order].astype(np.int64),
-    )
-    return Lanes(**{**vars(lanes), "mesh": walls})
+def _walls(arrays: tuple[np.ndarray, ...]) -> Walls:
+    nodes, values, places, axes, areas, chambers = map(torch.from_numpy, arrays)
+    return Walls(nodes=nodes, values=values, places=places, axes=axes, areas=areas, chambers=chambers)
 
 
 def _nodal(lanes: Lanes, values: np.ndarray) -> np.ndarray:

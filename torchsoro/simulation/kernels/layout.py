@@ -60,13 +60,14 @@ NOW, ACTIVE = 0, 2
 FLAG_LEFT_BOX, FLAG_COLLAPSED = 0, 1
 
 # The total-Lagrangian form. Its state, one flat vector for each simulation: displacement and velocity of the nodes,
-# component by component; then 6 numbers Z for every Maxwell element of every point, component by component.
+# component by component; then 6 numbers Z for every Maxwell element of every point, component by component; then, where
+# solids soften, the largest I1b - 3 of every point so far.
 # Z = H - b S needs no stress of the substep before: H' = a H + b (S' - S) is Z' = a Z - b (1 - a) S.
 
 
-def lattice_components(nodes: int, points: int, elements: int) -> int:
+def lattice_components(nodes: int, points: int, elements: int, softens: bool = False) -> int:
     """Length of that vector."""
-    return 6 * nodes + 6 * elements * points
+    return 6 * nodes + (6 * elements + softens) * points
 
 
 # Its kernels take few buffers. The integers begin with what kernels change (first substep at which a solid collapsed;

@@ -36,13 +36,13 @@ class Fixed:
 
 def fixed(scene: Scene, inputs: Inputs) -> Fixed:
     """The constants of a run, computed once for the same coefficients, Maxwell elements and planes."""
-    given = [inputs.coefficients, inputs.prony, inputs.planes]
+    given = [inputs.coefficients, inputs.prony, inputs.planes, inputs.attached]
     chambers = inputs.pressure.shape[2]
 
     def compute() -> Fixed:
-        lattice, (c, prony, planes) = scene.lattice, (t.detach() for t in given)
+        lattice, (c, prony, planes, attached) = scene.lattice, (t.detach() for t in given)
         assert lattice is not None
-        nodal = lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], scene.dt)
+        nodal = lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], scene.dt, attached)
         chamber = chamber_means(scene, c, chambers)
         constants = numbers(lattice, scene.dt, scene.cell).to(c)
         return Fixed(

@@ -83,15 +83,16 @@ class LaneIntegrator:
         self.batch, self.elements = like.shape[0], inputs.prony.shape[1]
         self.lanes: Lanes = lay_out(scene.lattice, scene.kind, self.batch, like.dtype)
         self.mesh: Mesh = self.lanes.mesh
-        self.history = 6 * self.elements
-        constants = [like, inputs.prony, inputs.planes]
+        self.history = 6 * self.elements + scene.softens
+        constants = [like, inputs.prony, inputs.planes, inputs.softening, inputs.fluid, inputs.ties]
+        constants += [inputs.air, inputs.attached]
         self.nodal, case = once(scene, "case", constants, self._constants)
         self.case = case._replace(**self._supply())
 
     def _constants(self) -> tuple[Tensor, Case]:
         """What the segments of a run have in common: all but what acts over time."""
-        c = self.inputs.coefficients.detach()
-        self.nodal = self.lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], self.scene.dt)
+        c, attached = self.inputs.coefficients.detach(), self.inputs.attached.detach()
+        self.nodal = self.lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], self.scene.dt, attached)
         return self.nodal, self._case()
 
     def _supply(self) -> dict[str, np.ndarray]:
@@ -141,56 +142,74 @@ class LaneIntegrator:
     def _case(self) -> Case:
         i, s, lanes = self.inputs, self.scene, self.lanes
         like = i.coefficients
-        mass = self.nodal[:, :1]
+        mass, faces, walls = self.nodal[:, :1], self.lattice.faces, self.lattice.walls
         there = mass > 0
+        moves = there if s.held is None else there & ~s.held
         inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
         numbered = i.planes[..., _PLANE] * self._signs(like)
-        count, elastic = s.plane_kind.shape[0], s.plane_kind[:, layout.PLANE_ELASTIC].bool()
+        elastic = s.plane_kind[:, layout.PLANE_ELASTIC].bool()
         ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
-        far = lanes.from_nodes((ways > 0).to(like)) if count else like.new_zeros(0)
-        share = self.lattice.to_nodes(s.share.to(like)) if len(s.share) else like.new_zeros(0, self.lattice.nodes)
-        wide = share.unsqueeze(0).expand(self.batch, -1, -1) if len(share) else share.unsqueeze(0)
-        shares = lanes.from_nodes(wide)[0] if len(share) else like.new_zeros(0, self.mesh.component)
+        far, area = (ways > 0).to(like), torch.full_like(ways, s.cell**2)
+        touches = torch.ones_like(mass[0])
+        if faces is not None:
+            far, area = torch.ones_like(far), faces.facing(numbered[..., :3]).to(like)
+            touches = faces.touches.to(like).unsqueeze(0)
+        shares = [self.lattice.to_nodes(s.share.to(like)), *([] if s.node_share is None else [s.node_share.to(like)])]
+        shares = lanes.from_common_nodes(torch.cat(shares))
+        ties = like.new_zeros(self.batch, 0, self.lattice.nodes) if s.tie_share is None else s.tie_share.to(like)
+        none = np.zeros(0, numbers(like).dtype)
+        quadratic = none
+        if s.immersed:
+            assert faces is not None
+            quadratic = numbers(lanes.from_nodes(faces.front.T.to(like) * i.fluid.view(-1, 1, 1) / 2))
+        air = chamber_means(s, like, s.gas_chambers)
+        if walls is not None:
+            hollow = torch.stack([i.air, walls.volume.to(like).expand_as(i.air)], -1)
+            air = torch.cat([air, hollow], 1)
         prony = i.prony[..., _PRONY]
         prony = torch.cat([prony, prony[..., 1:2] * (1 - prony[..., 2:])], -1)
         assert prony.shape[-1] == MAXWELL
-        softening = like.new_zeros(lanes.groups, 2, LANES)
-        softening[:, 1] = 1
-        none = np.zeros(0, numbers(like).dtype)
         return Case(
             dt=float(s.dt),
             groups=lanes.groups,
             elements=self.elements,
             history=self.history,
-            flags=(bool(s.stiffens), False, bool(s.viscous), False, bool(s.springs)),
+            flags=(bool(s.stiffens), bool(s.softens), bool(s.viscous), False, bool(s.springs)),
             numbers=numbers(self._coefficients()),
             attached=numbers(self._attached()),
             gas=numbers(self._gas(like[:, layout.VOLUME])),
             maxwell=numbers(lanes.from_batch(prony)),
-            softening=numbers(softening),
+            softening=numbers(lanes.from_batch(i.softening)),
             inverse_mass=numbers(lanes.from_nodes(inverse)),
-            moves=numbers(lanes.from_nodes(there.to(like))),
+            moves=numbers(lanes.from_nodes(moves.to(like))),
             drag_factor=numbers(lanes.from_nodes(self.nodal[:, 4:])),
             reach=numbers(lanes.from_nodes(self.nodal[:, 1:4])),
-            air=numbers(lanes.from_batch(chamber_means(s, like, self.mesh.chambers))),
+            air=numbers(lanes.from_batch(air)),
             share=shares.numpy(),
             share_there=(shares.view(len(shares), self.mesh.component // LANES, LANES) != 0).any(-1).numpy(),
             pressure=none,
             gravity=none,
             force=none,
-            force_start=np.full(len(shares), -1),
-            tie_share=none,
-            tie_stiffness=none,
-            quadratic=none,
+            force_start=self._starts(),
+            tie_share=lanes.from_nodes(ties).numpy().reshape(-1),
+            tie_stiffness=lanes.from_batch(i.ties).numpy().reshape(-1),
+            quadratic=quadratic,
             plane_numbers=numbers(lanes.from_batch(numbered)),
             plane_stick=s.plane_kind[:, layout.PLANE_STICK].bool().numpy(),
             plane_elastic=elastic.numpy(),
             keeps=bool(elastic.any()),
-            area=numbers(torch.full_like(far, s.cell**2)),
-            far=numbers(far),
-            touches=np.ones(self.mesh.component, none.dtype),
+            area=numbers(lanes.from_nodes(area)),
+            far=numbers(lanes.from_nodes(far)),
+            touches=lanes.from_common_nodes(touches)[0].numpy(),
             spacing=float(s.cell),
         )
+
+    def _starts(self) -> np.ndarray:
+        """First substep at which each force acts, counted within the segment; -1 for one that changes in time."""
+        starts = self.scene.force_start
+        if starts is None:
+            return np.full(self.scene.forces, -1)
+        return np.maximum(np.array(starts, np.int64) - self.first, 0)
 
     def _march(self, work: Work, kernel, *settings) -> list:
         """Run a kernel on all threads."""
@@ -232,7 +251,7 @@ class LaneIntegrator:
         work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
         if 0 in self.samples:
             observe(0, start)
-        done = min(self._march(work, march, self.steps, ring, past, True))
+        done = min(self._march(work, march, self.steps, ring, past, not self.scene.apart))
         self.kept = (states, histories, pushed, volumes)
         if done < self.steps:
             last = lanes.to_nodes(states[done % ring].view(groups, 6, -1)).reshape(self.batch, -1)
@@ -248,7 +267,7 @@ class LaneIntegrator:
 
     def _check(self, step: int, state: Tensor) -> None:
         """Raise ``SimulationDiverged`` if a state is not finite or outside of the box."""
-        if self.checked:
+        if self.checked or self.scene.apart:
             return
         if not bool(torch.isfinite(state).all()) or bool(outside(self.scene, self.inputs, state).any()):
             report(self.scene, self.inputs, self.first + step, state)
@@ -401,8 +420,8 @@ class LaneIntegrator:
             wide = c.new_zeros(groups, blocks, 8, 1, LANES)
             wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
             found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
-            air_bar = lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES))
-            found += chamber_adjoint(s, c, chamber_means(s, c, mesh.chambers), air_bar)
+            air_bar = lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES))[:, : s.gas_chambers]
+            found += chamber_adjoint(s, c, chamber_means(s, c, s.gas_chambers), air_bar)
         if s.springs:
             attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
             found[:, layout.SPRING : layout.ANCHOR + 3] += attached
@@ -413,7 +432,9 @@ class LaneIntegrator:
             ],
             1,
         )
-        mass_bar, drag_bar = self.lattice.nodal_adjoint(c[:, layout.MASS], c[:, layout.DRAG], s.dt, nodal)
+        mass_bar, drag_bar, attached_bar = self.lattice.nodal_adjoint(
+            c[:, layout.MASS], c[:, layout.DRAG], s.dt, i.attached, nodal
+        )
         found[:, layout.MASS] += mass_bar
         found[:, layout.DRAG] += drag_bar
         prony_bar = torch.zeros_like(i.prony)
@@ -450,5 +471,5 @@ class LaneIntegrator:
             "gravity": gravity_bar,
             "force": force_bar,
             "planes": planes_bar,
-            "origin": torch.zeros_like(i.origin),
+            "attached": attached_bar,
         }

@@ -103,8 +103,16 @@ class Lanes:
         if self.variations:
             at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
             rows = values[self._row.reshape(-1)].unflatten(0, (self.groups, LANES))
-            return found.index_copy_(2, at, rows.permute(0, 2, 3, 1).reshape(self.groups, count, -1))
+            return found.index_copy_(2, at, rows.permute(0, 2, 3, 1).flatten(2))
         return found.index_copy_(2, self.nodes, values)
+
+    def from_common_nodes(self, values: Tensor) -> Tensor:
+        """Values by node that all simulations have in common [K, nodes] as [K, component]."""
+        found = values.new_zeros(len(values), self.mesh.component)
+        if self.variations:
+            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
+            return found.index_copy_(1, at, values.repeat_interleave(LANES, 1))
+        return found.index_copy_(1, self.nodes, values)
 
     def to_nodes(self, lanes: Tensor) -> Tensor:
         """The opposite of :meth:`from_nodes`."""
@@ -156,7 +164,9 @@ MOST = 16  # layouts that are remembered
 
 def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
     """:func:`_laid_out`, remembered: every call of a simulator asks again for the same body."""
-    key = (*((a.knots.tobytes(), a.first.tobytes()) for a in lattice.axes), kind.cpu().numpy().tobytes(), batch, dtype)
+    axes = ((a.knots.tobytes(), a.first.tobytes()) for a in lattice.axes)
+    walls = None if lattice.walls is None else lattice.walls.key
+    key = (*axes, walls, kind.cpu().numpy().tobytes(), batch, dtype)
     if key not in _known:
         _known[key] = _laid_out(lattice, kind, batch, dtype)
         if len(_known) > MOST:
@@ -227,12 +237,18 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
     points = np.stack([where for _, where, _, _ in blocks])
     flat = kind.cpu().numpy()
     of = np.where(points >= 0, flat[np.maximum(points, 0)], -1)
-    chambers = int(flat.max()) + 1 if (flat >= 0).any() else 0
+    gas = int(flat.max()) + 1 if (flat >= 0).any() else 0
+    chambers = gas + (0 if lattice.walls is None else lattice.walls.count)
     pairs = [(b, c) for b in range(len(blocks)) for c in range(chambers) if (of[b] == c).any()]
     item_gas = np.zeros((len(items), max(chambers, 1)), bool)
     for i, (_, a, b) in enumerate(items):
         for block, c in pairs:
             item_gas[i, c] |= a <= block < b
+    walls = _walls(lattice, row, unit, np.array([first[0][i[0]] for i in items]), gas, real)
+    for item, chamber in zip(
+        np.repeat(np.arange(len(items)), np.diff(walls["wall_begin"])), walls["wall_chamber"], strict=True
+    ):
+        item_gas[item, chamber] = True
     entries = defaultdict(list)
     for i, (layer, _, _) in enumerate(items):
         for slot in range(3):
@@ -264,13 +280,7 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         plane_slot=np.array([s for e in listed for _, s in e], whole),
         places=places.numpy().reshape(-1),
         own=(np.arange(LANES) < unit).astype(real),
-        wall_begin=np.zeros(len(items) + 1, whole),
-        wall_at=np.zeros(0, whole),
-        wall_value=np.zeros(0, real),
-        wall_place=np.zeros(0, real),
-        wall_axis=np.zeros(0, whole),
-        wall_area=np.zeros(0, real),
-        wall_chamber=np.zeros(0, whole),
+        **walls,
     )  # fmt: skip
     return Lanes(
         mesh=mesh,
@@ -282,3 +292,36 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         variations=bool(variations),
         absent=bool((points < 0).any()),
     )
+
+
+def _walls(lattice: Lattice, row: int, unit: int, planes: np.ndarray, gas: int, real: type) -> dict[str, np.ndarray]:
+    """The points of the walls of hollow chambers, by the first item of the layer whose nodes they use.
+
+    Args:
+        lattice: Of the bodies.
+        row: Numbers between two nodes along y.
+        unit: Likewise along z.
+        planes: Lowest plane of nodes of each item.
+        gas: Number of chambers of gas particles.
+        real: Of the kernels' numbers.
+    """
+    count, w = len(planes), lattice.walls
+    whole, begin = np.int64, np.zeros(len(planes) + 1, np.int64)
+    at, chamber, axis, area = (np.zeros(0, kind) for kind in (whole, whole, whole, real))
+    value, place = np.zeros(0, real), np.zeros(0, real)
+    if w is not None:
+        x, y, z = np.unravel_index(w.nodes[:, 0].numpy(), lattice.shape)
+        item = np.searchsorted(planes, x)
+        order = np.argsort(item, kind="stable")
+        begin = np.searchsorted(item[order], np.arange(count + 1))
+        at, chamber, axis = (y * row + z * unit)[order], gas + w.chambers.numpy()[order], w.axes.numpy()[order]
+        value, place, area = (t.numpy()[order].astype(real) for t in (w.values, w.places, w.areas))
+    return {
+        "wall_begin": begin.astype(whole),
+        "wall_at": at.astype(whole),
+        "wall_value": value.reshape(-1),
+        "wall_place": place.reshape(-1),
+        "wall_axis": axis.astype(whole),
+        "wall_area": area,
+        "wall_chamber": chamber.astype(whole),
+    }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -45,16 +45,101 @@ def _gaps(axis: Axis, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Walls:
+    """Points on the walls of hollow chambers, which hold no gas particles; float64.
+
+    The pressure of a chamber acts on the body at a wall point by -p N_i (t1 x t2) dA on node i, with the tangents
+    t1, t2 along the two axes that follow the normal one (cyclically); its volume is the sum of x . (t1 x t2) dA / 3.
+
+    Attributes:
+        nodes: int64 [W, 27] of each point.
+        values: [W, 27, 3] their weights, and slopes along the two axes [1/m].
+        places: [W, 3] m in the undeformed body.
+        axes: int64 [W], axis that the wall is normal to.
+        areas: [W] m2, positive if the chamber is on the lower side.
+        chambers: int64 [W], number of the hollow chamber, from 0 on; in pressures they follow those of gas particles.
+    """
+
+    nodes: Tensor
+    values: Tensor
+    places: Tensor
+    axes: Tensor
+    areas: Tensor
+    chambers: Tensor
+
+    @cached_property
+    def key(self) -> bytes:
+        """What tells walls from others."""
+        return b"".join(getattr(self, f.name).numpy().tobytes() for f in fields(self))
+
+    @cached_property
+    def count(self) -> int:
+        """Number of hollow chambers."""
+        return int(self.chambers.max()) + 1
+
+    @cached_property
+    def volume(self) -> Tensor:
+        """Of each chamber in the undeformed body [hollow] m3."""
+        along = self.places.gather(1, self.axes[:, None])[:, 0]
+        return self.areas.new_zeros(self.count).index_add(0, self.chambers, self.areas * along / 3)
+
+    def enclosed(self, d: Tensor) -> Tensor:
+        """Volume of each chamber [B, hollow] m3, with displacements of the nodes [B, 3, nodes] m."""
+        x, a, b = self._along(d)
+        parts = (x * torch.linalg.cross(a, b)).sum(-1) * self.areas.to(d) / 3
+        return d.new_zeros(len(d), self.count).index_add(1, self.chambers.to(d.device), parts)
+
+    def enclosed_adjoint(self, d: Tensor, bar: Tensor) -> Tensor:
+        """What each wall point adds to the gradient by its nodes [B, 3, W, 27], from that by :meth:`enclosed`."""
+        x, a, b = self._along(d)
+        by_volume = bar[:, self.chambers.to(d.device)] * self.areas.to(d) / 3
+        sides = torch.stack([torch.linalg.cross(*pair) for pair in ((a, b), (b, x), (x, a))], -1)
+        return torch.einsum("bwck,wnk,bw->bcwn", sides, self.values.to(d), by_volume)
+
+    def _along(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Places of the points [B, W, 3] m, and their tangents."""
+        moved = torch.einsum("bcwn,wnk->kbwc", d[:, :, self.nodes.to(d.device)], self.values.to(d))
+        turned = torch.eye(3).to(d)[torch.stack([self.axes + 1, self.axes + 2]) % 3]
+        return self.places.to(d) + moved[0], turned[0] + moved[1], turned[1] + moved[2]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Faces:
+    """Outer faces of a body whose outermost nodes lie on them; float64.
+
+    Attributes:
+        touches: bool [nodes], which nodes meet planes.
+        ends: [3, 2, nodes] m2, area of the body on the lower and the upper end of each axis, as shares of nodes.
+        front: [nodes, 3] m2, area of the body across each axis, the mean of both sides, as shares of nodes.
+    """
+
+    touches: Tensor
+    ends: Tensor
+    front: Tensor
+
+    def facing(self, normals: Tensor) -> Tensor:
+        """Area of the nodes on the face that faces planes with normals [..., 3] most [..., nodes] m2."""
+        axis = normals.abs().argmax(-1)
+        upper = normals.gather(-1, axis.unsqueeze(-1)).squeeze(-1) < 0
+        return self.ends[axis, upper.long()]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Lattice:
     """A box of 2 x 2 x 2 points per cell around a body, and its nodes.
 
     Attributes:
         axes: Along x, y, z.
         index: int64 [N], the point of each particle; None if there is one for each, in the same order.
+        walls: Of hollow chambers; None if there are none.
+        faces: Where nodes meet planes, if they lie on the body's faces; None for a surface that is found by the mass
+            around each node, see :meth:`nodal`.
     """
 
     axes: tuple[Axis, Axis, Axis]
     index: Tensor | None = None
+    walls: Walls | None = None
+    faces: Faces | None = None
 
     @classmethod
     def uniform(
@@ -186,25 +271,33 @@ class Lattice:
         kinds = [along[1] if along and a == along[0] else kind for a in range(3)]
         return [_matrix(k, a, like.dtype, like.device) for k, a in zip(kinds, self.axes, strict=True)]
 
-    def nodal(self, mass: Tensor, drag: Tensor, dt: float) -> Tensor:
+    def nodal(self, mass: Tensor, drag: Tensor, dt: float, attached: Tensor | None = None) -> Tensor:
         """What kernels need to know of the nodes.
 
         Args:
             mass: Of the points [B, points] kg.
             drag: Drag coefficient of the points [B, points] N s/m.
             dt: Substep [s].
+            attached: Mass and drag coefficient attached to the nodes [B, 2, nodes], or [B, 2, 0] or None for none.
 
         Returns:
             [B, 5, nodes], differentiable: mass in kg; the way from the node to the surface of the matter that it
-            carries, along x, y, z, as share of that to the next node; what drag, taken implicitly, leaves of its
-            velocity in a substep.
+            carries, along x, y, z, as share of that to the next node (zero if the lattice has ``faces``); what drag,
+            taken implicitly, leaves of its velocity in a substep.
         """
         lumped = self.to_nodes(mass)
         there = lumped > 0
         safe = torch.where(there, lumped, torch.ones_like(lumped))
-        ways = [torch.where(there, self._reach(mass, safe, axis)[0], torch.zeros_like(lumped)) for axis in range(3)]
-        factor = safe / (safe + dt * self.to_nodes(drag))
-        return torch.stack([self._matching(lumped).matched.to(mass), *ways, factor], 1)
+        none = torch.zeros_like(lumped)
+        ways = [none] * 3
+        if self.faces is None:
+            ways = [torch.where(there, self._reach(mass, safe, axis)[0], none) for axis in range(3)]
+        more, sink = (none, none) if attached is None or not attached.shape[2] else attached.unbind(1)
+        heavy = safe + more
+        factor = heavy / (heavy + dt * (self.to_nodes(drag) + sink))
+        # A node without the body's matter cannot move what is attached to it.
+        matched = self._matching(lumped).matched.to(mass)
+        return torch.stack([matched + torch.where(there, more, none), *ways, factor], 1)
 
     def _reach(self, mass: Tensor, total: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
         """The reaches of :meth:`nodal` along an axis, the centre of mass from the node [m], and d reach / d centre.
@@ -239,21 +332,27 @@ class Lattice:
         """Gradient by the masses of the points, from that by :meth:`nodal_mass`."""
         return self.to_points(self._matching(self.to_nodes(mass)).adjoint(bar).to(mass))
 
-    def nodal_adjoint(self, mass: Tensor, drag: Tensor, dt: float, bar: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients by mass and drag [B, points], from that by :meth:`nodal` [B, 5, nodes]."""
-        lumped, resistance = self.to_nodes(mass), dt * self.to_nodes(drag)
-        there = lumped > 0
+    def nodal_adjoint(
+        self, mass: Tensor, drag: Tensor, dt: float, attached: Tensor, bar: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Gradients by mass and drag [B, points] and ``attached``, from that by :meth:`nodal` [B, 5, nodes]."""
+        lumped = self.to_nodes(mass)
+        there, none = lumped > 0, torch.zeros_like(lumped)
+        more, sink = attached.unbind(1) if attached.shape[2] else (none, none)
         safe = torch.where(there, lumped, torch.ones_like(lumped))
-        by_factor = bar[:, 4] / (safe + resistance) ** 2
-        total_bar = self._matching(lumped).adjoint(bar[:, 0]).to(mass)
-        total_bar = total_bar + torch.where(there, by_factor * resistance, torch.zeros_like(lumped))
+        heavy, resistance = safe + more, dt * (self.to_nodes(drag) + sink)
+        by_factor = bar[:, 4] / (heavy + resistance) ** 2
+        sink_bar, by_mass = -dt * by_factor * heavy, torch.where(there, by_factor * resistance, none)
+        more_bar = torch.where(there, bar[:, 0], none) + by_factor * resistance
+        attached_bar = torch.stack([more_bar, sink_bar], 1) if attached.shape[2] else torch.zeros_like(attached)
+        total_bar = self._matching(lumped).adjoint(bar[:, 0]).to(mass) + by_mass
         mass_bar = torch.zeros_like(mass)
-        for axis in range(3):
+        for axis in range(3) if self.faces is None else ():
             _, center, slope = self._reach(mass, safe, axis)
             moment_bar = torch.where(there, bar[:, 1 + axis] * slope / safe, torch.zeros_like(lumped))
             total_bar = total_bar - moment_bar * center
             mass_bar += self.to_points(moment_bar, along=(axis, "moment"))
-        return mass_bar + self.to_points(total_bar), -dt * self.to_points(by_factor * safe)
+        return mass_bar + self.to_points(total_bar), self.to_points(sink_bar), attached_bar
 
     def gradient(self, field: Tensor) -> Tensor:
         """Gradient at all places of quadrature of a nodal vector field: [B, 3, nodes] to [B, 3, 3, points]."""

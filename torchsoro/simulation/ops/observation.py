@@ -2,7 +2,7 @@
 
 The observations are six tensors: positions and velocities of the probes [B, P, 3] (m, m/s), position and velocity of
 the centre of gravity [B, 3], volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An
-adjoint takes the six gradients by them and returns those by state, weight, coefficients and pressure.
+adjoint takes the six gradients by them and returns those by the arguments.
 """
 
 from __future__ import annotations
@@ -17,33 +17,24 @@ from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE
 from torchsoro.simulation.ops.scene import Scene
 
-Arguments = tuple[Tensor, Tensor, Tensor, Tensor]
+Arguments = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+"""State [B, S, N], or [B, L] of the total-Lagrangian form; particle weights of the centre of gravity [B, N];
+coefficients [B, COEFFICIENTS, N]; supply pressure of each chamber now [B, chambers] in Pa; ``Inputs.air``."""
 
 
-def observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene) -> tuple[Tensor, ...]:
-    """Observations of a state.
-
-    Args:
-        state: [B, S, N], or [B, L] of the total-Lagrangian form.
-        weight: Particle weights of the centre of gravity [B, N].
-        coefficients: [B, COEFFICIENTS, N].
-        pressure: Supply pressure of each chamber now [B, chambers] in Pa.
-        scene: For the chambers and the probes.
-
-    Returns:
-        The six observations.
-    """
+def observe(arguments: Arguments, scene: Scene) -> tuple[Tensor, ...]:
+    """The six observations."""
     form = _observe if scene.lattice is None else _total_observe
-    return form(state, weight, coefficients, pressure, scene)
+    return form(*arguments, scene)
 
 
 def observe_adjoint(arguments: Arguments, bars: Sequence[Tensor], scene: Scene) -> Arguments:
-    """Gradients by the tensors that :func:`observe` takes, from those by the six observations."""
+    """Gradients by the arguments of :func:`observe`, from those by the six observations."""
     form = _observe_adjoint if scene.lattice is None else _total_observe_adjoint
     return form(*arguments, bars, scene)
 
 
-def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene):
+def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
     x, v = state[:, : layout.VELOCITY], state[:, layout.VELOCITY : layout.AFFINE]
     share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
@@ -64,7 +55,7 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
     )
 
 
-def _observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tensor], scene: Scene) -> Arguments:
+def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene) -> Arguments:
     x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
     found = torch.zeros_like(state), *_zeros(coefficients, pressure)
     state_bar, coefficients_bar, pressure_bar = found
@@ -88,10 +79,10 @@ def _observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tenso
         coefficients_bar[:, layout.VOLUME, gas] += parts_bar * J
         coefficients_bar[:, layout.BULK, gas] += local_bar * (1 - J)
         pressure_bar[:, c] += local_bar.sum(-1)
-    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar
+    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar, torch.zeros_like(air)
 
 
-def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, scene: Scene):
+def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
     lattice = scene.lattice
     assert lattice is not None
     d, v = _motion(state, lattice.nodes)
@@ -101,12 +92,16 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
     nodal = lattice.nodal_mass(share).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
-    for c in range(pressure.shape[1]):
+    for c in range(scene.gas_chambers):
         gas, _, _, F = _chamber(d, c, scene)
         J, V = torch.linalg.det(F), coefficients[:, layout.VOLUME, gas]
         k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
         volumes.append((V * J).sum(-1, keepdim=True))
         means.append((pressure[:, c] - k * (volumes[-1][:, 0] / V.sum(-1) - 1)).unsqueeze(-1))
+    if lattice.walls is not None:
+        volumes.append(lattice.walls.enclosed(d))
+        growth = volumes[-1] / lattice.walls.volume.to(d) - 1
+        means.append(pressure[:, scene.gas_chambers :] - air * growth)
     return (
         places[scene.probes] + (d[:, :, at] * how).sum(-1).transpose(1, 2),
         (v[:, :, at] * how).sum(-1).transpose(1, 2),
@@ -117,7 +112,7 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     )
 
 
-def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence[Tensor], scene: Scene) -> Arguments:
+def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
     lattice = scene.lattice
     assert lattice is not None
     x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
@@ -134,7 +129,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence
         nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
         _add_at(field_bar, at, at_probes.transpose(1, 2).unsqueeze(-1) * how)
     share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.on("places", state).T
-    for c in range(pressure.shape[1]):
+    for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
         whole = V.sum(-1, keepdim=True)
@@ -151,7 +146,14 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, bars: Sequence
         pressure_bar[:, c] += by_mean[:, 0]
         by_nodes = torch.einsum("bpca,pan->bcpn", (swept_bar * V)[..., None, None] * cofactor, slopes)
         _add_at(motion_bar[0], at, by_nodes)
-    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar
+    air_bar = torch.zeros_like(air)
+    if lattice.walls is not None:
+        by_mean, whole = mean_bar[:, scene.gas_chambers :], lattice.walls.volume.to(state)
+        pressure_bar[:, scene.gas_chambers :] += by_mean
+        air_bar -= by_mean * (lattice.walls.enclosed(motion[0]) / whole - 1)
+        swept_bar = volume_bar[:, scene.gas_chambers :] - by_mean * air / whole
+        _add_at(motion_bar[0], lattice.walls.nodes, lattice.walls.enclosed_adjoint(motion[0], swept_bar))
+    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar, air_bar
 
 
 def _zeros(*tensors: Tensor) -> tuple[Tensor, ...]:

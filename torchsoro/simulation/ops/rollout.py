@@ -24,6 +24,7 @@ from torch.autograd import forward_ad
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lane_segment import LaneIntegrator, in_lanes
+from torchsoro.simulation.ops.limits import refuse_gradient, refuse_without_lanes
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.observation import observe, observe_adjoint
 from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
@@ -86,7 +87,9 @@ def _forward(*arguments) -> tuple[Tensor, ...]:
     states = integrator.forward(
         state,
         keep=keep,
-        observe=lambda k, s: seen.append(observe(s, weight, inputs.coefficients, inputs.pressure[k], scene)),
+        observe=lambda k, s: seen.append(
+            observe((s, weight, inputs.coefficients, inputs.pressure[k], inputs.air), scene)
+        ),
     )
     end = states[integrator.steps % states.shape[0]].clone()
     shapes = _observed(scene, inputs, samples)
@@ -154,23 +157,24 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     states: Any = integrator.restore(record)
     bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
     weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(inputs.coefficients)
-    pressure_bar = torch.zeros_like(inputs.pressure)
+    pressure_bar, air_bar = torch.zeros_like(inputs.pressure), torch.zeros_like(inputs.air)
 
     def add(k: int, bar: Tensor) -> None:
         at = samples.index(k)
-        arguments = states[k], weight, inputs.coefficients, inputs.pressure[k]
+        arguments = states[k], weight, inputs.coefficients, inputs.pressure[k], inputs.air
         given = [zero if g is None else g[at] for g, zero in zip(seen_bar, nothing, strict=True)]
         parts = observe_adjoint(arguments, given, scene)
-        for total, part in zip((bar, weight_bar, coefficients_bar, pressure_bar[k]), parts, strict=True):
+        for total, part in zip((bar, weight_bar, coefficients_bar, pressure_bar[k], air_bar), parts, strict=True):
             total += part
 
     nothing = [state.new_zeros(shape[1:]) for shape in _observed(scene, inputs, ())]
     observed = any(g is not None for g in seen_bar)
     names = frozenset(name for name, needed in zip(_TENSORS, wanted, strict=True) if needed)
     sums = integrator.backward(states, bar, add if observed else lambda k, s: None, wanted=names)
-    sums["coefficients"] += coefficients_bar
-    sums["pressure"] += pressure_bar
-    return bar, weight_bar, *(sums[name] for name in _INPUTS)
+    found = {name: torch.zeros_like(getattr(inputs, name)) for name in _INPUTS} | sums
+    for name, more in (("coefficients", coefficients_bar), ("pressure", pressure_bar), ("air", air_bar)):
+        found[name] += more
+    return bar, weight_bar, *(found[name] for name in _INPUTS)
 
 
 @torch.library.register_fake(_BACKWARD)
@@ -243,11 +247,13 @@ def rollout(
     refuse_transforms(state, weight, *tensors.values())
     batch, _, count = inputs.coefficients.shape
     elements, steps = inputs.prony.shape[1], inputs.gravity.shape[0]
-    chambers, groups, planes = inputs.pressure.shape[-1], scene.share.shape[0], scene.plane_kind.shape[0]
-    lattice = scene.lattice
+    chambers, planes, lattice = inputs.pressure.shape[-1], scene.plane_kind.shape[0], scene.lattice
+    hollow = 0 if lattice is None or lattice.walls is None else lattice.walls.count
+    ties = 0 if scene.tie_share is None else scene.tie_share.shape[1]
+    attached = 0 if lattice is None or not inputs.attached.shape[2] else lattice.nodes
     whole = (batch, layout.state_components(elements), count)
     if lattice is not None:
-        whole = (batch, layout.lattice_components(lattice.nodes, count, elements))
+        whole = (batch, layout.lattice_components(lattice.nodes, count, elements, scene.softens))
     shapes = {
         "state": (state, whole),
         "weight": (weight, (batch, count)),
@@ -255,9 +261,14 @@ def rollout(
         "prony": (inputs.prony, (batch, elements, layout.PRONY)),
         "pressure": (inputs.pressure, (steps + 1, batch, chambers)),
         "gravity": (inputs.gravity, (steps, batch, 3)),
-        "force": (inputs.force, (steps, batch, groups, 3)),
+        "force": (inputs.force, (steps if scene.force_start is None else 1, batch, scene.forces, 3)),
         "planes": (inputs.planes, (batch, planes, layout.PLANE)),
         "origin": (inputs.origin, (batch, 3)),
+        "softening": (inputs.softening, (batch, 2)),
+        "fluid": (inputs.fluid, (batch,)),
+        "ties": (inputs.ties, (batch, ties)),
+        "air": (inputs.air, (batch, hollow)),
+        "attached": (inputs.attached, (batch, 2, attached)),
     }
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != shape:
@@ -266,8 +277,12 @@ def rollout(
             raise ValueError(f"{name}: dtype {tensor.dtype}, wanted {state.dtype} (float32 or float64)")
         if tensor.device != state.device:
             raise ValueError(f"{name}: on {tensor.device}, wanted {state.device}, the device of the state")
-    if scene.last_chamber >= chambers:
-        raise ValueError(f"kind: chamber {scene.last_chamber}, wanted less than the {chambers} of pressure")
+    if scene.chambers > chambers:
+        raise ValueError(f"kind: {scene.chambers} chambers, wanted at most the {chambers} of pressure")
+    if not in_lanes(scene, state):
+        refuse_without_lanes(scene, inputs)
+    if torch.is_grad_enabled() and any(t.requires_grad for t in (state, weight, *tensors.values())):
+        refuse_gradient(scene, inputs)
     if list(samples) != sorted(set(samples)) or (samples and not 0 <= samples[0] <= samples[-1] <= steps):
         raise ValueError(f"samples = {samples}: wanted increasing substeps from 0 to {steps}")
     values = [t.contiguous() for t in (state, weight, *tensors.values())]

@@ -6,6 +6,7 @@ import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 from weakref import WeakValueDictionary
 
 from torch import Tensor
@@ -38,9 +39,18 @@ class Scene:
         springs: Whether any particle has a spring or drag, be it of zero.
         viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
         stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
+        softens: Whether solids soften below their largest stretch; a number more of every point in the state.
+        immersed: Whether what surrounds the body resists it by the square of its velocity; wants ``Lattice.faces``.
+        held: bool [nodes], nodes of the lattice that keep their state; None if there are none.
+        node_share: [more, nodes], each node's share of the forces that follow those of ``share`` in ``Inputs.force``.
+        force_start: First substep of the run at which each force acts, if ``Inputs.force`` has one row for all
+            substeps; None if it has one for each. In lanes without gradient only.
+        tie_share: [B, Q, nodes], each node's share of the groups whose mean displacement a spring resists; None if
+            there are none.
         probes: int64 [P], particles whose motion is recorded.
         lattice: Of the total-Lagrangian form; None for the updated form.
         lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
+        apart: Whether simulations that diverge go on with what is not finite, and the others are not disturbed.
         steady: Whether the scene is of one run, whose segments have the same coefficients, Maxwell elements and planes.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
@@ -57,8 +67,15 @@ class Scene:
     viscous: bool
     stiffens: bool
     probes: Tensor
+    softens: bool = False
+    immersed: bool = False
+    held: Tensor | None = None
+    node_share: Tensor | None = None
+    force_start: tuple[int, ...] | None = None
+    tie_share: Tensor | None = None
     lattice: Lattice | None = None
     lanes: bool = True
+    apart: bool = False
     steady: bool = False
     handle: int = field(init=False, default_factory=_handles.__next__)
 
@@ -67,9 +84,20 @@ class Scene:
         _scenes[self.handle] = self
 
     @cached_property
-    def last_chamber(self) -> int:
-        """Highest number of a chamber, below 0 if there is none."""
-        return int(self.kind.max())
+    def gas_chambers(self) -> int:
+        """Number of chambers of gas particles; hollow ones follow them."""
+        return int(self.kind.max()) + 1 if bool((self.kind >= 0).any()) else 0
+
+    @property
+    def chambers(self) -> int:
+        """Number of chambers."""
+        walls = None if self.lattice is None else self.lattice.walls
+        return self.gas_chambers + (0 if walls is None else walls.count)
+
+    @property
+    def forces(self) -> int:
+        """Number of forces."""
+        return len(self.share) + (0 if self.node_share is None else len(self.node_share))
 
     @cached_property
     def absent(self) -> Tensor | None:
@@ -93,18 +121,30 @@ def scene_of(handle: int) -> Scene:
     return _scenes[handle]
 
 
+_NONE: Any = None
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Inputs:
     """The differentiable tensors of a segment of T substeps, one row per simulation.
+
+    Those from ``softening`` on are of the total-Lagrangian form; none of them acts if they are left out.
 
     Attributes:
         coefficients: [B, COEFFICIENTS, N], see ``kernels.layout``.
         prony: [B, elements, 3]: decay, gain, modulus of each Maxwell element.
         pressure: [T + 1, B, chambers] supply pressure at each substep and after the last [Pa].
         gravity: [T, B, 3] [m/s2].
-        force: [T, B, groups, 3] [N].
+        force: [T, B, forces, 3] [N], those on particles, then those on nodes; see also ``Scene.force_start``.
         planes: [B, planes, PLANE]: offset [m], Coulomb coefficient, adhesive traction [Pa], its reach [m], normal.
         origin: [B, 3] a grid node [m].
+        softening: [B, 2] depth d and range r of the shear modulus' factor 1 - d u / (u + r), where u is by how much
+            x = I1b - 3 is less than its largest so far.
+        fluid: [B] density of what surrounds the body times its drag coefficient [kg/m3]: along each axis a force of
+            half of it times the area (``Faces.front``) times v |v|, taken implicitly.
+        ties: [B, Q] stiffness of springs to the mean displacement of some nodes (``Scene.tie_share``) [N/m].
+        air: [B, hollow chambers] pressure that the air in each loses as its volume doubles [Pa].
+        attached: [B, 2, nodes] mass [kg] and drag coefficient [N s/m] attached to nodes; [B, 2, 0] for none.
     """
 
     coefficients: Tensor
@@ -114,3 +154,18 @@ class Inputs:
     force: Tensor
     planes: Tensor
     origin: Tensor
+    softening: Tensor = _NONE
+    fluid: Tensor = _NONE
+    ties: Tensor = _NONE
+    air: Tensor = _NONE
+    attached: Tensor = _NONE
+
+    def __post_init__(self) -> None:
+        """Fill in what is left out."""
+        like = self.coefficients
+        none = {"fluid": (len(like),), "ties": (len(like), 0), "air": (len(like), 0), "attached": (len(like), 2, 0)}
+        for name, shape in none.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, like.new_zeros(shape))
+        if self.softening is None:
+            object.__setattr__(self, "softening", like.new_tensor([0.0, 1.0]).expand(len(like), 2))

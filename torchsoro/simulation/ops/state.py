@@ -27,7 +27,9 @@ def updated_state(x: Tensor, v: Tensor, elements: int, affine: Tensor | None = N
     return torch.cat([x.transpose(1, 2), v.transpose(1, 2), C, F, H], dim=1)
 
 
-def total_state(lattice: Lattice, x: Tensor, v: Tensor, present: Tensor, elements: int) -> Tensor:
+def total_state(
+    lattice: Lattice, x: Tensor, v: Tensor, present: Tensor, elements: int, softens: bool = False
+) -> Tensor:
     """State of an undeformed body without history.
 
     Args:
@@ -36,11 +38,12 @@ def total_state(lattice: Lattice, x: Tensor, v: Tensor, present: Tensor, element
         v: Velocities [B, points, 3] in m/s.
         present: bool [points], where there is a particle.
         elements: Number of Maxwell elements.
+        softens: Whether solids soften.
 
     Returns:
         State [B, L], differentiable by x (as a shift of the whole) and v.
     """
     shift = (x - lattice.places.to(x))[:, present].mean(1)
     d = shift.unsqueeze(-1).expand(-1, -1, lattice.nodes)
-    rest = x.new_zeros(x.shape[0], 6 * elements * lattice.count)
+    rest = x.new_zeros(x.shape[0], (6 * elements + softens) * lattice.count)
     return torch.cat([d.flatten(1), lattice.project(v, present).flatten(1), rest], 1)

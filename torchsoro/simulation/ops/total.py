@@ -166,7 +166,7 @@ class TotalSegmentIntegrator:
         *views, nodal_bar, chamber_bar = sums.views
         found: dict[str, Tensor] = dict(zip(_SUMS, views, strict=True))
         mass, drag = i.coefficients[:, layout.MASS], i.coefficients[:, layout.DRAG]
-        mass_bar, drag_bar = self.lattice.nodal_adjoint(mass, drag, self.scene.dt, nodal_bar)
+        mass_bar, drag_bar, attached_bar = self.lattice.nodal_adjoint(mass, drag, self.scene.dt, i.attached, nodal_bar)
         by_chamber = chamber_adjoint(self.scene, i.coefficients, self.chamber, chamber_bar)
         found["coefficients"] = found["coefficients"] + by_chamber
         found["coefficients"][:, layout.MASS] += mass_bar
@@ -174,7 +174,7 @@ class TotalSegmentIntegrator:
         found |= {name: found[name].sum(-1) for name in ("prony", "planes")}
         found |= {name: found[name].sum(1) for name in ("gravity", "force")}
         found["pressure"] = found["pressure"].clone()
-        return {**found, "origin": torch.zeros_like(i.origin)}
+        return {**found, "attached": attached_bar}
 
     def _march(self, on_gpu, on_cpu, *buffers: Tensor, backward: bool = False) -> Callable[[int, int], None]:
         """A function that takes the substeps from its first number to before its second, or these back."""
