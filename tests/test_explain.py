@@ -272,12 +272,6 @@ def test_a_wrong_frequency_is_found_over_many_swings(made):
     assert told.chosen[0].fit.values[0][0] == pytest.approx(0.9, abs=0.01)
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_a_gpu_that_is_not_there_is_refused(made):
-    with pytest.raises(ValueError, match="device = 'cuda'"):
-        Ensemble(made[0], device="cuda")
-
-
 # The whole --------------------------------------------------------------------------------------------------------
 
 

@@ -11,7 +11,6 @@ from pathlib import Path
 import hypothesis
 import numpy as np
 import pytest
-import torch
 from hypothesis import strategies as st
 from setups import CLAMP, marker, material
 
@@ -142,11 +141,6 @@ def test_a_good_experiment_is_accepted_with_byte_order_marks(folder):
 )
 def test_options_out_of_range_are_refused_by_name(folder, options, message):
     refuse(folder, message, **options)
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_cuda_without_a_gpu_is_refused(folder):
-    refuse(folder, "device = 'cuda': no GPU", device="cuda")
 
 
 def test_an_output_folder_that_cannot_be_made_is_refused(folder):

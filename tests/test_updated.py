@@ -68,7 +68,7 @@ def off(folder):
     """How far the particles' motion is from the twin's, over that, along y and z."""
     (trial,) = read_experiment(folder).trials
     twin = Twin(trial.setup, edge=0.004)
-    (motion,) = Ensemble(twin, 1, "cpu")([twin.scenario(trial)])
+    (motion,) = Ensemble(twin, 1)([twin.scenario(trial)])
     course, own = motion.alone().position[:, 0], trial.simulated
     same = np.stack([np.interp(motion.time, own.time, own.position[:, 0, k]) for k in range(3)], 1)
     moved = np.sqrt(((course - course[:1]) ** 2).mean(0))[1:]

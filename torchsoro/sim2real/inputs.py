@@ -83,9 +83,9 @@ def read_inputs(options: Options) -> Inputs:
                 scenarios[trial.name] = twin.scenario(trial)
     if effects and not any(e.applies(scenarios[t.name], twin) for e in effects for t in trials):
         raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
-    ensemble = Ensemble(twin, options.threads or THREADS, options.device)
+    ensemble = Ensemble(twin, options.threads or THREADS)
     with named_in(experiment.folder):
-        fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads, options.device)
+        fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads)
     return Inputs(
         experiment=experiment,
         trials=trials,

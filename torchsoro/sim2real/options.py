@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -31,5 +30,3 @@ class Options:
     """Names of the effects to consider; the whole library if none is given."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """What simulates; "auto" is a GPU where there is one and the package numba-cuda."""

@@ -69,7 +69,7 @@ def predict_markers(options: Options) -> dict[str, np.ndarray]:
     check_folder("out", out.parent, [out.name])
     model = read_model(Path(options.predict))
     threads = options.threads or THREADS
-    columns = predict_trial(model, Path(options.trial), Path(options.predict), threads, options.device)
+    columns = predict_trial(model, Path(options.trial), Path(options.predict), threads)
     write_table(out, columns)
     return columns
 

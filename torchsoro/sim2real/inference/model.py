@@ -133,9 +133,7 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **dict(file.model))
 
 
-def predict_trial(
-    model: Model, trial: Path, source: Path, threads: int = THREADS, device: str = "auto"
-) -> dict[str, np.ndarray]:
+def predict_trial(model: Model, trial: Path, source: Path, threads: int = THREADS) -> dict[str, np.ndarray]:
     """Markers in a trial that nobody has recorded yet, by the finer twin alone: no ``simulated.csv`` counts here.
 
     Args:
@@ -143,7 +141,6 @@ def predict_trial(
         trial: Its trial.toml; a pressure.csv stands beside it where the body has a chamber.
         source: Where the model comes from, for messages.
         threads: That simulate.
-        device: See :class:`Ensemble`.
 
     Returns:
         Columns of a markers.csv.
@@ -155,7 +152,7 @@ def predict_trial(
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
     twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
-    motion = Ensemble(twin, threads, device)([model.apply(twin.scenario(told), twin)])[0].alone()
+    motion = Ensemble(twin, threads)([model.apply(twin.scenario(told), twin)])[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
     axes = told.setup.axes

@@ -1,4 +1,4 @@
-"""Simulations of one body in many variations: groups of sixteen, one group to a thread, or all of them on a GPU."""
+"""Simulations of one body in many variations: groups of sixteen, one group to a thread."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.sim2real.twin.variations import simulate
 from torchsoro.simulation.actuation import Waveform
-from torchsoro.simulation.kernels import cuda_ensemble
 from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.lanes import LANES
-from torchsoro.simulation.kernels.variations import Case, Mesh
+from torchsoro.simulation.kernels.variations import Case
 from torchsoro.simulation.material import Prony
 from torchsoro.simulation.ops.inertia import Matching
 
@@ -47,40 +46,23 @@ class Ensemble:
     Attributes:
         twin: The body.
         threads: Number of threads.
-        device: "cpu", "cuda", or "auto" for a GPU where there is one.
         safety: Step over the bound of a stable one near rest; chosen by the body's cells if None.
         even: Whether all variations of a call take the same time step, so that its error cancels in their differences.
-
-    Raises:
-        ValueError: for "cuda" without a GPU that Numba can use.
     """
 
     twin: Twin
     threads: int = THREADS
-    device: str = "auto"
     safety: float | None = None
     even: bool = False
 
     def __post_init__(self) -> None:
-        """Check the device."""
-        if self.device == "cuda" and not cuda_ensemble.available():
-            raise ValueError("device = 'cuda': no GPU with CUDA that numba-cuda can use; wanted 'cpu', 'auto', or one")
+        """Make sure that no code of another version is run."""
         remove_stale_code()
-
-    @cached_property
-    def mesh(self) -> Mesh:
-        """The body for the kernels."""
-        return mesh_of(self.twin)
-
-    @cached_property
-    def body(self) -> cuda_ensemble.GpuMesh | None:
-        """The same on a GPU; None where simulations run on the CPU."""
-        return cuda_ensemble.body_of(self.mesh) if self.device != "cpu" and cuda_ensemble.available() else None
 
     @property
     def room(self) -> int:
         """Number of variations that take as long as one."""
-        return LANES * self.threads if self.body is None else cuda_ensemble.ROOM
+        return LANES * self.threads
 
     @cached_property
     def spreads(self) -> Tensor:
@@ -130,31 +112,17 @@ class Ensemble:
         samples = math.ceil(longest / SAMPLE - 1e-9) + 1
         seen = [np.zeros((s.batch, samples, markers, 5, 3)) for s in scenarios]
 
-        def prepared(group: list[Lane]) -> Case:
+        def run(group: list[Lane]) -> float:
             dt = min(steps[i][b] for i, b in group)
             every = math.ceil(SAMPLE / dt)
-            return self.case(scenarios, group, SAMPLE / every, every, samples)
-
-        def run(group: list[Lane]) -> float:
-            case = prepared(group)
+            case = self.case(scenarios, group, SAMPLE / every, every, samples)
             found = looked_at(simulate(self.twin, case, samples), nodes, values)
             for k, (i, b) in enumerate(group):
                 seen[i][b] = found[..., k]
             return case.dt
 
-        def run_there(kind: list[list[Lane]]) -> float:
-            assert self.body is not None
-            cases = [prepared(group) for group in kind]
-            found = cuda_ensemble.march_all(self.body, cases, [len(group) for group in kind], samples)
-            for (i, b), one in zip(itertools.chain(*kind), found, strict=True):
-                seen[i][b] = one
-            return max(case.dt for case in cases)
-
-        if self.body is None:
-            with ThreadPoolExecutor(self.threads) as pool:
-                largest = max(pool.map(run, itertools.chain(*kinds)))
-        else:
-            largest = max(run_there(kind) for kind in kinds)
+        with ThreadPoolExecutor(self.threads) as pool:
+            largest = max(pool.map(run, itertools.chain(*kinds)))
         at = np.array([m.at for m in self.twin.setup.markers], float)
         time = np.arange(samples) * SAMPLE
         return [
@@ -353,40 +321,3 @@ def _forces(full: Sequence[Lane], varied: Sequence[Scenario], dt: float) -> dict
         "push": np.array(values, np.float32).reshape(-1, 3, LANES),
         "push_start": np.array(starts, np.int64),
     }
-
-
-def mesh_of(twin: Twin) -> Mesh:
-    """The body for the kernels."""
-    grid = twin.grid
-    f32, whole = np.float32, np.int64
-    most = max(a.cells for a in grid.axes)
-    weights, slopes = np.zeros((2, 3, most, 2, 3), f32)
-    for i, axis in enumerate(grid.axes):
-        weights[i, : axis.cells], slopes[i, : axis.cells] = axis.table
-    wall_node, wall_value, places, axes, areas, chambers = grid.walls
-    there = np.abs(wall_value[..., 0]) > 1e-12
-    mark_node, mark_value = twin.marks()
-    sx, sy = grid.strides
-    weight = grid.collect(grid.volumes)
-    return Mesh(
-        corners=grid.corner(grid.cells).astype(whole),
-        cells=grid.cells.astype(whole),
-        weights=weights,
-        slopes=slopes,
-        stride_x=int(sx),
-        stride_y=int(sy),
-        held=twin.held | (weight == 0),
-        places=grid.places.astype(f32),
-        surface=grid.rim.astype(whole),
-        front=grid.front.astype(f32),
-        wall_begin=np.concatenate([[0], np.cumsum(there.sum(-1))]).astype(whole),
-        wall_node=wall_node[there].astype(whole),
-        wall_value=wall_value[there].astype(f32),
-        wall_place=places.astype(f32),
-        wall_axis=axes.astype(whole),
-        wall_area=areas.astype(f32),
-        wall_chamber=chambers.astype(whole),
-        mark_begin=np.arange(len(mark_node) + 1) * 27,
-        mark_node=mark_node.reshape(-1).astype(whole),
-        mark_value=mark_value.reshape(-1, 4).astype(f32),
-    )

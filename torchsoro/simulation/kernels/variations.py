@@ -1,58 +1,10 @@
-"""Numbers of up to sixteen variations of a body, as they differ between the lanes of a CPU or the blocks of a GPU."""
+"""Numbers of up to sixteen variations of a body, as they differ between lanes."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-
-
-class Mesh(NamedTuple):
-    """The body's shape; lengths in m.
-
-    Attributes:
-        corners: Lowest node of each cell [C].
-        cells: Number of each cell along x, y, z [C, 3].
-        weights: Of an axis' three nodes at a cell's two points [3, cells, 2, 3].
-        slopes: The same, of the derivatives of the weights.
-        stride_x: Between nodes along x.
-        stride_y: Between nodes along y.
-        held: Nodes that stay where they are, bool [n].
-        places: Of nodes in the undeformed body [n, 3].
-        surface: Nodes of the surface, which may meet planes [F].
-        front: Area of the body that moves along x, y, z, as shares of nodes [n, 3].
-        wall_begin: First entry of each point of the chambers' walls, and the end [W + 1].
-        wall_node: Node of each entry [E].
-        wall_value: Its weight and two slopes along the wall [E, 3].
-        wall_place: Of wall points in the undeformed body [W, 3].
-        wall_axis: Axis normal to the wall [W].
-        wall_area: Area of the point, positive if the chamber is on the lower side [W].
-        wall_chamber: Number of the chamber [W].
-        mark_begin: First entry of each marker, and the end [M + 1].
-        mark_node: Node of each entry [K].
-        mark_value: Its weight and slopes by x, y, z [K, 4].
-    """
-
-    corners: np.ndarray
-    cells: np.ndarray
-    weights: np.ndarray
-    slopes: np.ndarray
-    stride_x: int
-    stride_y: int
-    held: np.ndarray
-    places: np.ndarray
-    surface: np.ndarray
-    front: np.ndarray
-    wall_begin: np.ndarray
-    wall_node: np.ndarray
-    wall_value: np.ndarray
-    wall_place: np.ndarray
-    wall_axis: np.ndarray
-    wall_area: np.ndarray
-    wall_chamber: np.ndarray
-    mark_begin: np.ndarray
-    mark_node: np.ndarray
-    mark_value: np.ndarray
 
 
 class Case(NamedTuple):
