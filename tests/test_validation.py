@@ -53,6 +53,19 @@ def test_flip_hardly_damps_a_bar_and_the_total_form_not_at_all(recipes):
     assert apic["damping"] > 2 * flip["damping"]
 
 
+@pytest.mark.slow
+def test_held_bent_positions_of_the_updated_form_leave_f_behind_and_those_of_the_total_do_not(recipes):
+    creep = importlib.import_module("creep").creep
+    rows = creep(cases=(("total", 3, 0.0), ("apic", 3, 0.0)), ends=(0.1, 0.3))
+    ratio = {
+        form: [r["positions' curvature [1/m]"] / r["that of F [1/m]"] for r in rows if r["form"] == form]
+        for form in ("total", "apic")
+    }
+    assert ratio["total"][1] == pytest.approx(ratio["total"][0], rel=1e-3)
+    assert ratio["apic"][1] > 1.02 * ratio["apic"][0]
+    assert ratio["apic"][1] > 1.07 * ratio["total"][1]
+
+
 def test_pressurised_sphere_follows_lame(recipes):
     _, structures = recipes
     for row in structures.sphere(cells=(4, 6)):

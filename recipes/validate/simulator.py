@@ -2,6 +2,7 @@
 
     python recipes/validate/simulator.py damping      # numerical damping of a cantilever by formulation, step and cell
     python recipes/validate/simulator.py bar          # frequency of a cantilever against a Timoshenko beam
+    python recipes/validate/simulator.py creep        # a bar that is held bent: positions part from F
     python recipes/validate/simulator.py sphere       # pressurised thick sphere against Lame's solution
     python recipes/validate/simulator.py rheology     # Maxwell elements against Eq. 17 and a shear ramp
     python recipes/validate/simulator.py restitution  # rebound of a dropped block with 0, 3 and 5 Maxwell elements
@@ -29,6 +30,7 @@ import matplotlib.pyplot as plt
 import torch
 import tyro
 from contact_checks import Curve, ball_drop, couple, first_blow, restitution, sliding, standing
+from creep import creep
 from motion_checks import PAPER_STEP, fall, ramp, rheology, stability
 from structures import EXACT, FORMS, bar, damping, shifted, sphere
 from tables import Row, show
@@ -128,7 +130,8 @@ def draw_walking(path: Path, rows: Sequence[Row], courses: Mapping[tuple[int, st
 
 
 Check = Literal[
-    "damping", "bar", "sphere", "rheology", "restitution", "ball", "contact", "stability", "fall", "walking", "all"
+    *("damping", "bar", "creep", "sphere", "rheology", "restitution", "ball", "contact", "stability", "fall"),
+    *("walking", "all"),
 ]
 
 
@@ -177,6 +180,8 @@ def main(check: tyro.conf.Positional[Check], out: Path | None = None) -> None:
         print("\n".join(f"order of the error at nu = 0, {form}: {order:.2f}" for form, order in found.items()))
         if out is not None:
             draw_bar(out / "bar.png", rows)
+    if wanted("creep"):
+        show("Bar of 60 x 10 x 10 mm held bent by 0.25 N", creep())
     if wanted("walking"):
         rows, apart, courses = walking()
         show("One cycle of a walker", rows)
