@@ -72,10 +72,9 @@ def test_both_engines_give_the_same_results_and_gradients(lattice):
     found = []
     for lanes in (True, False):
         p = problem(formulation="total", lattice=lattice, batch=2, steps=12, samples=(0, 5, 12), lanes=lanes)
-        # Void and gas have no history, and void no viscosity.
+        # Void and gas have no history.
         c, nodes = p.tensors["coefficients"], p.scene.lattice.nodes  # type: ignore[union-attr]
         solid = (p.scene.kind == -1) & (c[:, layout.VOID_FRACTION] < 1)
-        c[:, layout.VISCOSITY : layout.VOLUME_VISCOSITY + 1] *= solid.unsqueeze(1)
         p.tensors["state"][:, 6 * nodes :].view(2, 12, -1).mul_(solid.unsqueeze(1))
         leaves = p.leaves()
         outputs = p.run(leaves)
@@ -83,8 +82,6 @@ def test_both_engines_give_the_same_results_and_gradients(lattice):
         loss = torch.stack([(w * o).sum() for w, o in zip(weights, outputs, strict=True)]).sum()
         found.append([*(o.detach() for o in outputs), *torch.autograd.grad(loss, list(leaves.values()))])
     for name, one, other in zip([*(["output"] * 7), *leaves], *found, strict=True):
-        if name == "coefficients":
-            one, other = one * solid.unsqueeze(1), other * solid.unsqueeze(1)
         if name == "state":
             one, other = (t[:, : 6 * nodes] for t in (one, other))
         if name == "planes":  # the normals of axes are constants

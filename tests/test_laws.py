@@ -34,7 +34,7 @@ def arguments(name: str) -> np.ndarray:
             column = rng.integers(0, 2, STATES)
         elif argument == "push":
             column = rng.choice([0.0, 0.5], STATES)
-        elif argument in ("dt", "reach"):
+        elif argument in ("dt", "reach", "sink"):
             column = rng.uniform(0.2, 1, STATES)
         elif argument == "touch":
             column = rng.uniform(0.05, 0.2, STATES)
@@ -75,8 +75,11 @@ def by_taichi(name: str, given: np.ndarray, results: int) -> np.ndarray:
     def run(a: ti.types.ndarray(), out: ti.types.ndarray()):
         for i in range(count):
             found = law(*[a[i, k] for k in ti.static(range(width))])
-            for k in ti.static(range(results)):
-                out[i, k] = found[k] if ti.static(results > 1) else found
+            if ti.static(results == 1):
+                out[i, 0] = found
+            else:
+                for k in ti.static(range(results)):
+                    out[i, k] = found[k]
 
     out = np.zeros((count, results), given.dtype)
     run(given, out)

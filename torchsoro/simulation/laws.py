@@ -1,4 +1,4 @@
-"""Laws of contact, as functions of numbers, which Taichi, lanes of a CPU and plain Python all run from this text.
+"""Laws of contact and drag, as functions of numbers: one text, which Taichi, lanes of a CPU and plain Python run.
 
 ``kernels.laws_taichi`` and ``kernels.laws_lanes`` compile it. So that all three read it alike, and lanes of a vector
 register go through it together, a law
@@ -272,3 +272,20 @@ def plane_contact_adjoint(
         friction_bar,
         hold_bar,
     )
+
+
+def quadratic_drag(u, sink):
+    """Component of a node's velocity after a step of drag that grows with its square, taken implicitly.
+
+    Args:
+        u: Velocity before [m/s].
+        sink: Step times half the density of what surrounds the body, drag coefficient and area, over the mass [s/m].
+    """
+    return u / (1 + sink * abs(u))
+
+
+def quadratic_drag_adjoint(u, sink, r_bar):
+    """Adjoint of :func:`quadratic_drag`: gradients by velocity and sink."""
+    left = 1 / (1 + sink * abs(u))
+    u_bar = r_bar * left * left
+    return u_bar, -u * abs(u) * u_bar

@@ -152,7 +152,7 @@ def simulate(twin: Twin, n: Numbers, samples: int) -> np.ndarray:
         forces=np.zeros(items * 9 * mesh.patch, real),
         areas=np.zeros(max(LANES, items * mesh.chambers * 9 * mesh.patch), real),
         swept=np.zeros(max(LANES, items * mesh.chambers * LANES), real),
-        stretch=np.zeros(3 * len(case.tie_stiffness), real),
+        tension=np.zeros(3 * len(case.tie_stiffness), real),
         collapsed=np.full(8, NEVER),
         sync=np.zeros(SYNC, np.int64),
         scratch=np.zeros(SCRATCH, real),

@@ -10,51 +10,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchsoro.simulation.kernels.lane_contact import meets_adjoint, spread
-from torchsoro.simulation.kernels.lane_laws import (
-    cofactor,
-    contract,
-    cross,
-    excess,
-    least_ratio,
-    piola_adjoint,
-    plus,
-    pull_back,
-    pull_back_adjoint,
-    viscous_piola_adjoint,
-)
-from torchsoro.simulation.kernels.lane_march import SCRATCH, clear
-from torchsoro.simulation.kernels.lane_nodes import (
-    chamber_pressure,
-    gravity_row,
-    sum_areas,
-    sum_chamber,
-    sum_items,
-    touches,
-)
-from torchsoro.simulation.kernels.lane_points import (
-    ATTACHED,
-    BULK,
-    MAXWELL,
-    NUMBERS,
-    ROOM,
-    SHEAR,
-    STIFFENING,
-    VISCOSITY,
-    VOID_FRACTION,
-    VOLUME,
-    VOLUME_VISCOSITY,
-    deformed,
-    gather,
-    hand_on,
-    keep,
-    plain,
-    scatter,
-    stretch,
-    value,
-)
+from torchsoro.simulation.kernels.lane_contact import add_vector, meets_adjoint, spread, store_vector, vector
+from torchsoro.simulation.kernels.lane_march import SCRATCH
+from torchsoro.simulation.kernels.lane_nodes import gravity_row, slow, sum_areas, sum_chamber, sum_items, tied, touches
+from torchsoro.simulation.kernels.lane_points import ROOM
+from torchsoro.simulation.kernels.lane_points_adjoint import add, gas_end, points_backward
 from torchsoro.simulation.kernels.lane_threads import meet
-from torchsoro.simulation.kernels.lanes import fast, larger, law, load, select, store
+from torchsoro.simulation.kernels.lane_walls import ties_backward
+from torchsoro.simulation.kernels.lanes import fast, load, select, store
+from torchsoro.simulation.kernels.laws_lanes import laws
+
+quadratic_drag_adjoint = laws.quadratic_drag_adjoint
 
 
 class Sums(NamedTuple):
@@ -75,273 +41,12 @@ class Sums(NamedTuple):
     softening: np.ndarray
     mass: np.ndarray
     drag_factor: np.ndarray
+    quadratic: np.ndarray
+    ties: np.ndarray
     reach: np.ndarray
     planes: np.ndarray
     air: np.ndarray
     pressure: np.ndarray
-
-
-@law
-def add(a, at, value):
-    """Add to sixteen numbers."""
-    store(a, at, load(a, at) + value)
-
-
-@law
-def point_adjoint(
-    G,
-    B,
-    rates,
-    at,
-    numbers,
-    n,
-    past,
-    before,
-    bars,
-    after,
-    elements,
-    maxwell,
-    m,
-    flags,
-    softens,
-    sums,
-    number_sums,
-    e_sums,
-    s_sums,
-):
-    """Gradient by F of a point, stored in place of its gradient, from that by the stress, which is in B."""
-    F = deformed(G, at)
-    W = plain(B, at)
-    volume, void_fraction = load(numbers, n), load(numbers, n + 16 * VOID_FRACTION)
-    bulk, shear = load(numbers, n + 16 * BULK), load(numbers, n + 16 * SHEAR)
-    cof = cofactor(F)
-    ratio = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
-    least = least_ratio(void_fraction)
-    there = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
-    factor, left, solid = there, 0 * volume + 1, shear
-    x, shrink, linear, square = 0 * volume, 0 * volume, 0 * volume, 0 * volume
-    below, _largest, depth, reach = 0 * volume, 0 * volume, 0 * volume, 0 * volume + 1
-    end = 96 * elements
-    if flags[0] or flags[1]:
-        x, shrink = excess(F, larger(ratio, least))
-        if flags[0]:
-            linear, square = load(numbers, n + 16 * STIFFENING), load(numbers, n + 16 * STIFFENING + 16)
-            factor = there * (1 + x * (linear + square * x))
-        if flags[1]:
-            depth, reach = load(softens, 0), load(softens, 16)
-            below = larger(load(past, before + end) - x, 0.0)
-            left = 1 - depth * below / (below + reach)
-            solid = shear * left
-    T = (0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor)
-    Q0, Q1, Q2, Q3, Q4, Q5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
-    if elements > 0:
-        T = pull_back(F, least)
-    S = (factor * T[0], factor * T[1], factor * T[2], factor * T[3], factor * T[4], factor * T[5])
-    for e in range(elements):
-        g, b = load(maxwell, m + 64 * e), load(maxwell, m + 64 * e + 16)
-        gb, i = g * b, before + 96 * e
-        Q0, Q1 = Q0 + g * load(past, i) + gb * S[0], Q1 + g * load(past, i + 16) + gb * S[1]
-        Q2, Q3 = Q2 + g * load(past, i + 32) + gb * S[2], Q3 + g * load(past, i + 48) + gb * S[3]
-        Q4, Q5 = Q4 + g * load(past, i + 64) + gb * S[4], Q5 + g * load(past, i + 80) + gb * S[5]
-    W = plus(-1.0, W, 0.0, W)
-    F_bar, R, bulk_bar, (solid_bar, void_bar), factor_bar, fraction_bar = piola_adjoint(
-        F, cof, ratio, (Q0, Q1, Q2, Q3, Q4, Q5), bulk, (solid, shear), factor, void_fraction, W
-    )
-    work = bulk * bulk_bar + solid * solid_bar + shear * void_bar
-    F_bar = plus(volume, F_bar, 0.0, F_bar)
-    factor_bar = there * volume * factor_bar
-    # S_bar gathers from all elements.
-    Z0, Z1, Z2, Z3, Z4, Z5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
-    for e in range(elements):
-        g, b, a = load(maxwell, m + 64 * e), load(maxwell, m + 64 * e + 16), load(maxwell, m + 64 * e + 32)
-        fade = load(maxwell, m + 64 * e + 48)
-        q0, q1, q2 = volume * R[0], volume * R[1], volume * R[2]
-        q3, q4, q5 = volume * R[3], volume * R[4], volume * R[5]
-        o, i = after + 96 * e, before + 96 * e
-        h0, h1, h2 = load(bars, o), load(bars, o + 16), load(bars, o + 32)
-        h3, h4, h5 = load(bars, o + 48), load(bars, o + 64), load(bars, o + 80)
-        lost = 1 - a
-        Z0, Z1, Z2 = (
-            Z0 + b * g * q0 - fade * h0, Z1 + b * g * q1 - fade * h1, Z2 + b * g * q2 - fade * h2
-        )  # fmt: skip
-        Z3, Z4, Z5 = (
-            Z3 + b * g * q3 - fade * h3, Z4 + b * g * q4 - fade * h4, Z5 + b * g * q5 - fade * h5
-        )  # fmt: skip
-        if flags[3]:
-            z0, z1, z2 = load(past, i), load(past, i + 16), load(past, i + 32)
-            z3, z4, z5 = load(past, i + 48), load(past, i + 64), load(past, i + 80)
-            by_stress = q0 * S[0] + q1 * S[1] + q2 * S[2] + q3 * S[3] + q4 * S[4] + q5 * S[5]
-            by_history = h0 * S[0] + h1 * S[1] + h2 * S[2] + h3 * S[3] + h4 * S[4] + h5 * S[5]
-            direct = q0 * z0 + q1 * z1 + q2 * z2 + q3 * z3 + q4 * z4 + q5 * z5
-            fading = h0 * z0 + h1 * z1 + h2 * z2 + h3 * z3 + h4 * z4 + h5 * z5
-            add(sums.maxwell, e_sums + 48 * e, direct + b * by_stress)
-            add(sums.maxwell, e_sums + 48 * e + 16, g * by_stress - lost * by_history)
-            add(sums.maxwell, e_sums + 48 * e + 32, fading + b * by_history)
-        store(bars, o, a * h0 + g * q0)
-        store(bars, o + 16, a * h1 + g * q1)
-        store(bars, o + 32, a * h2 + g * q2)
-        store(bars, o + 48, a * h3 + g * q3)
-        store(bars, o + 64, a * h4 + g * q4)
-        store(bars, o + 80, a * h5 + g * q5)
-    if elements > 0:
-        B6 = (factor * Z0, factor * Z1, factor * Z2, factor * Z3, factor * Z4, factor * Z5)
-        F_bar = plus(1.0, F_bar, 1.0, pull_back_adjoint(F, cof, ratio, least, B6))
-        factor_bar = factor_bar + there * (Z0 * T[0] + Z1 * T[1] + Z2 * T[2] + Z3 * T[3] + Z4 * T[4] + Z5 * T[5])
-    shear_bar = left * solid_bar + void_bar
-    if flags[0] or flags[1]:
-        x_bar = factor_bar * (linear + 2 * square * x)
-        if flags[0]:
-            add(sums.numbers, number_sums + 16 * STIFFENING, factor_bar * x)
-            add(sums.numbers, number_sums + 16 * STIFFENING + 16, factor_bar * x * x)
-        if flags[1]:
-            left_bar = volume * shear * solid_bar
-            sum_ = 1 / (below + reach)
-            later = load(bars, after + end)
-            add(sums.softening, s_sums, -left_bar * below * sum_)
-            add(sums.softening, s_sums + 16, left_bar * depth * below * sum_ * sum_)
-            below_bar = select(below > 0, later - left_bar * depth * reach * sum_ * sum_, 0 * x)
-            store(bars, after + end, below_bar)
-            x_bar = x_bar + later - below_bar
-        x_bar = select(x > 0, x_bar, 0 * x)
-        J = larger(ratio, least)
-        J_bar = select(ratio < least, 0 * x, -2 * (x + 3) * x_bar / (3 * J))
-        F_bar = plus(1.0, F_bar, 2 * shrink * x_bar, F)
-        F_bar = plus(1.0, F_bar, J_bar, cof)
-    if flags[2]:
-        eta, zeta = load(numbers, n + 16 * VISCOSITY), load(numbers, n + 16 * VOLUME_VISCOSITY)
-        V_bar = plus(there, W, 0.0, W)
-        by_F, by_rate, eta_bar, zeta_bar = viscous_piola_adjoint(F, plain(rates, at), eta, zeta, V_bar)
-        solid_lane = there > 0
-        zero = 0 * volume
-        eta_bar, zeta_bar = select(solid_lane, eta_bar, zero), select(solid_lane, zeta_bar, zero)
-        scale = select(solid_lane, volume, zero)
-        by_F = (
-            select(solid_lane, by_F[0], zero), select(solid_lane, by_F[1], zero), select(solid_lane, by_F[2], zero),
-            select(solid_lane, by_F[3], zero), select(solid_lane, by_F[4], zero), select(solid_lane, by_F[5], zero),
-            select(solid_lane, by_F[6], zero), select(solid_lane, by_F[7], zero), select(solid_lane, by_F[8], zero),
-        )  # fmt: skip
-        by_rate = (
-            select(solid_lane, by_rate[0], zero), select(solid_lane, by_rate[1], zero),
-            select(solid_lane, by_rate[2], zero), select(solid_lane, by_rate[3], zero),
-            select(solid_lane, by_rate[4], zero), select(solid_lane, by_rate[5], zero),
-            select(solid_lane, by_rate[6], zero), select(solid_lane, by_rate[7], zero),
-            select(solid_lane, by_rate[8], zero),
-        )  # fmt: skip
-        F_bar = plus(1.0, F_bar, scale, by_F)
-        keep(rates, at, by_rate, scale)
-        work = work + eta * eta_bar + zeta * zeta_bar
-        add(sums.numbers, number_sums + 16 * VISCOSITY, scale * eta_bar)
-        add(sums.numbers, number_sums + 16 * VOLUME_VISCOSITY, scale * zeta_bar)
-    add(sums.numbers, number_sums + 16 * VOLUME, work)
-    add(sums.numbers, number_sums + 16 * BULK, volume * bulk_bar)
-    add(sums.numbers, number_sums + 16 * SHEAR, volume * shear_bar)
-    add(sums.numbers, number_sums + 16 * VOID_FRACTION, volume * fraction_bar)
-    keep(G, at, F_bar, 0 * volume + 1)
-
-
-@fast
-def gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates):
-    """Through the area vectors of a block's gas, at a pressure that is known."""
-    x, items, size, pairs = mesh.item_x[item], len(mesh.item_plane), 9 * mesh.patch, len(mesh.gas_chamber)
-    for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
-        chamber = mesh.gas_chamber[pair]
-        one = (g * items + item) * mesh.chambers + chamber
-        base = (g * pairs + pair) * 128
-        swept = load(work.swept, 16 * one)
-        step = 16 * ((t * case.groups + g) * mesh.chambers + chamber)
-        mine = 16 * (g * mesh.chambers + chamber)
-        stiffness, reference = load(case.air, 2 * mine), load(case.air, 2 * mine + 16)
-        pressure = chamber_pressure(load(case.pressure, step), stiffness, load(work.volumes, step), reference)
-        by_volume = load(sums.volume_bar, mine)
-        for k in range(8):
-            F, W, V = deformed(G, 144 * k), plain(B, 144 * k), load(case.gas, base + 16 * k)
-            cof = cofactor(F)
-            keep(rates, 1152 + 144 * k, cof, V)
-            pressed = contract(W, cof)
-            swept = swept + V * pressed
-            V_bar = pressure * pressed
-            if not last:
-                V_bar = V_bar + by_volume * load(sums.ratios, base + 16 * k)
-            add(sums.gas, base + 16 * k, V_bar)
-            store(sums.ratios, base + 16 * k, contract(cof, F) * (1 / 3))
-            keep(rates, 2304 + 144 * k, cross(F, W), pressure * V)
-        store(work.swept, 16 * one, swept)
-        scatter(mesh, b, x, work.areas, one * size, room, rates[1152:])
-        scatter(mesh, b, x, work.forces, (g * items + item) * size, room, rates[2304:])
-
-
-@fast
-def springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates):
-    """Through the springs of a block."""
-    x, out = mesh.item_x[item], (g * len(mesh.item_plane) + item) * 9 * mesh.patch
-    for k in range(8):
-        u = value(mesh, b, x, work.states, corner, k)
-        p0, p1, p2 = value(mesh, b, x, sums.pulls, force, k)
-        at = (g * len(mesh.block_at) + b) * 128 * ATTACHED + 16 * ATTACHED * k
-        w0, w1, w2 = stretch(u, case.attached, at)
-        spring = load(case.attached, at)
-        add(sums.attached, at, p0 * w0 + p1 * w1 + p2 * w2)
-        add(sums.attached, at + 16, spring * p0)
-        add(sums.attached, at + 32, spring * p1)
-        add(sums.attached, at + 48, spring * p2)
-        store(rates, 1152 + 48 * k, -spring * p0)
-        store(rates, 1152 + 48 * k + 16, -spring * p1)
-        store(rates, 1152 + 48 * k + 32, -spring * p2)
-    hand_on(mesh, b, x, work.forces, out, rates[1152:])
-
-
-@fast
-def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room, G, B, rates):
-    """Gradients by the nodes' places of an item, from those by the forces."""
-    items, size = len(mesh.item_plane), 9 * mesh.patch
-    out = (g * items + item) * size
-    clear(work.forces, out, out + size)
-    if case.flags[2]:
-        clear(sums.rates, out, out + size)
-    for c in range(mesh.chambers):
-        if mesh.item_gas[item, c]:
-            o = ((g * items + item) * mesh.chambers + c) * size
-            clear(work.areas, o, o + size)
-            s = 16 * ((g * items + item) * mesh.chambers + c)
-            clear(work.swept, s, s + 16)
-    place = mesh.front + mesh.item_plane[item] * mesh.plane
-    corner, force = state + place, g * 3 * mesh.component + place
-    x = mesh.item_x[item]
-    blocks, each = len(mesh.block_at), 16 * case.history
-    for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
-        gather(mesh, b, x, work.states, corner, room, G)
-        gather(mesh, b, x, sums.pulls, force, room, B)
-        if case.flags[2]:
-            gather(mesh, b, x, work.states, corner + 3 * mesh.component, room, rates)
-        if mesh.gas_begin[b] < mesh.gas_begin[b + 1]:
-            gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates)
-        n = (g * blocks + b) * 128 * NUMBERS
-        h = (g * blocks + b) * 8 * each
-        e = (g * blocks + b) * 48 * case.elements
-        m, s = g * 16 * MAXWELL * case.elements, case.softening[32 * g :]
-        for k in range(8):
-            point_adjoint(
-                G, B, rates, 144 * k, case.numbers, n + 16 * NUMBERS * k, work.histories, past + h + each * k,
-                sums.history_bar, h + each * k, case.elements, case.maxwell, m, case.flags, s,
-                sums, n + 16 * NUMBERS * k, e, (g * blocks + b) * 32,
-            )  # fmt: skip
-        scatter(mesh, b, x, work.forces, out, room, G)
-        if case.flags[4]:
-            springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates)
-        if case.flags[2]:
-            scatter(mesh, b, x, sums.rates, out, room, rates)
-
-
-@fast
-def gas_end(mesh, sums, g, item):
-    """The gradient by volumes of gas that the first substep still owes."""
-    pairs = len(mesh.gas_chamber)
-    for b in range(mesh.item_begin[item], mesh.item_begin[item + 1]):
-        for pair in range(mesh.gas_begin[b], mesh.gas_begin[b + 1]):
-            by_volume = load(sums.volume_bar, 16 * (g * mesh.chambers + mesh.gas_chamber[pair]))
-            base = (g * pairs + pair) * 128
-            for k in range(8):
-                add(sums.gas, base + 16 * k, by_volume * load(sums.ratios, base + 16 * k))
 
 
 @fast
@@ -382,6 +87,12 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                     d0 = d0 + volume_bar * sum_areas(mesh, work, g, k, p, 0, at)
                     d1 = d1 + volume_bar * sum_areas(mesh, work, g, k, p, 1, at)
                     d2 = d2 + volume_bar * sum_areas(mesh, work, g, k, p, 2, at)
+            if case.tie_stiffness.size:
+                d0, d1, d2 = (
+                    d0 + tied(mesh, case, work, g, 0, i),
+                    d1 + tied(mesh, case, work, g, 1, i),
+                    d2 + tied(mesh, case, work, g, 2, i),
+                )
             if planes > 0:
                 after = ((t + 1) * case.groups + g) * 6 * n
                 s0, s1, s2 = spread(mesh, case, work.states, after, sums.surfaces, (t + 1) % 2, g, i)
@@ -403,52 +114,53 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                 v1 + load(sums.seen_bar, o + n),
                 v2 + load(sums.seen_bar, o + 2 * n),
             )
-        store(sums.bar, a, d0)
-        store(sums.bar, a + n, d1)
-        store(sums.bar, a + 2 * n, d2)
+        store_vector(sums.bar, a, n, (d0, d1, d2))
         if t >= 0:
             moves, light = load(case.moves, node) > 0, load(case.inverse_mass, node)
             left, zero = load(case.drag_factor, node), 0 * d0
             state = (t * case.groups + g) * 6 * n
             b0, b1, b2 = v0 + dt * d0, v1 + dt * d1, v2 + dt * d2
-            s = state + 3 * n + i
-            w0, w1, w2 = load(work.states, s), load(work.states, s + n), load(work.states, s + 2 * n)
-            s = ((t + 1) * case.groups + g) * 6 * n + 3 * n + i
-            u0, u1, u2 = load(work.states, s), load(work.states, s + n), load(work.states, s + 2 * n)
+            w = vector(work.states, state + 3 * n + i, n)
+            # Velocity before drag, after the quadratic one, and before planes.
+            if work.pushed.size:
+                p0, p1, p2 = vector(work.pushed, (t * case.groups + g) * 3 * n + i, n)
+            else:
+                after, whole = vector(work.states, ((t + 1) * case.groups + g) * 6 * n + 3 * n + i, n), 1 / left
+                p0, p1, p2 = whole * after[0], whole * after[1], whole * after[2]
+            s0, s1, s2 = p0, p1, p2
+            if case.quadratic.size:
+                s0, s1, s2 = slow(mesh, case, g, i, light, p0, p1, p2)
             mass_bar = zero
             if planes > 0:
-                s = (t * case.groups + g) * 3 * n + i
-                u0, u1, u2 = load(work.pushed, s), load(work.pushed, s + n), load(work.pushed, s + 2 * n)
-                by_way = dt * d0, dt * d1, dt * d2
+                u, by_way = (left * s0, left * s1, left * s2), (dt * d0, dt * d1, dt * d2)
                 b0, b1, b2, c0, c1, c2, mass_bar = meets_adjoint(
-                    mesh, case, work.states, state, sums, g, i, light, moves, (u0, u1, u2), (b0, b1, b2), by_way
+                    mesh, case, work.states, state, sums, g, i, light, moves, u, (b0, b1, b2), by_way
                 )
                 s = (((t % 2) * case.groups + g) * 3) * n + i
-                store(sums.surfaces, s, select(moves, c0, zero))
-                store(sums.surfaces, s + n, select(moves, c1, zero))
-                store(sums.surfaces, s + 2 * n, select(moves, c2, zero))
+                store_vector(
+                    sums.surfaces, s, n, (select(moves, c0, zero), select(moves, c1, zero), select(moves, c2, zero))
+                )
             pull = gravity_row(case, g, t)
             g0, g1, g2 = load(case.gravity, pull), load(case.gravity, pull + 16), load(case.gravity, pull + 32)
-            whole = 1 / left
-            add(sums.drag_factor, node, select(moves, (u0 * b0 + u1 * b1 + u2 * b2) * whole, zero))
+            add(sums.drag_factor, node, select(moves, s0 * b0 + s1 * b1 + s2 * b2, zero))
             b0, b1, b2 = left * b0, left * b1, left * b2
-            pushed = (
-                (u0 * whole - w0 - dt * g0) * b0 + (u1 * whole - w1 - dt * g1) * b1 + (u2 * whole - w2 - dt * g2) * b2
-            )
+            if case.quadratic.size:
+                q, sink = 3 * g * n + i, select(moves, dt * light, zero)
+                q0, q1, q2 = vector(case.quadratic, q, n)
+                b0, k0 = quadratic_drag_adjoint(p0, sink * q0, b0)
+                b1, k1 = quadratic_drag_adjoint(p1, sink * q1, b1)
+                b2, k2 = quadratic_drag_adjoint(p2, sink * q2, b2)
+                add_vector(sums.quadratic, q, n, (sink * k0, sink * k1, sink * k2))
+                mass_bar = mass_bar - sink * (q0 * k0 + q1 * k1 + q2 * k2) * light
+            pushed = (p0 - w[0] - dt * g0) * b0 + (p1 - w[1] - dt * g1) * b1 + (p2 - w[2] - dt * g2) * b2
             add(sums.mass, node, select(moves, mass_bar - light * pushed, zero))
-            f = g * 3 * n + i
-            store(sums.pulls, f, dt * light * b0)
-            store(sums.pulls, f + n, dt * light * b1)
-            store(sums.pulls, f + 2 * n, dt * light * b2)
+            f, way = g * 3 * n + i, select(moves, dt * light, zero)
+            f0, f1, f2 = way * b0, way * b1, way * b2
+            store_vector(sums.pulls, f, n, (f0, f1, f2))
             v0, v1, v2 = select(moves, b0, v0), select(moves, b1, v1), select(moves, b2, v2)
             if sums.pulls.size > case.groups * 3 * n:
-                f += (t + 1) * case.groups * 3 * n
-                store(sums.pulls, f, dt * light * b0)
-                store(sums.pulls, f + n, dt * light * b1)
-                store(sums.pulls, f + 2 * n, dt * light * b2)
-        store(sums.bar, a + 3 * n, v0)
-        store(sums.bar, a + 4 * n, v1)
-        store(sums.bar, a + 5 * n, v2)
+                store_vector(sums.pulls, f + (t + 1) * case.groups * 3 * n, n, (f0, f1, f2))
+        store_vector(sums.bar, a + 3 * n, n, (v0, v1, v2))
 
 
 @fast
@@ -475,4 +187,7 @@ def march_back(mesh, case, work, rank, threads, sums, steps):
                 )
             else:
                 gas_end(mesh, sums, g, item)
+        if rank == 0 and case.tie_stiffness.size and t >= 0:
+            for g in range(case.groups):
+                ties_backward(mesh, case, work, sums, g, t * state_size + g * 6 * mesh.component)
         meet(work.sync, threads)

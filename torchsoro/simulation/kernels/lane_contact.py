@@ -23,6 +23,14 @@ def vector(a, at, stride):
 
 
 @law
+def store_vector(a, at, stride, v):
+    """Write three components."""
+    store(a, at, v[0])
+    store(a, at + stride, v[1])
+    store(a, at + 2 * stride, v[2])
+
+
+@law
 def add_vector(a, at, stride, v):
     """Add to three components."""
     store(a, at, load(a, at) + v[0])

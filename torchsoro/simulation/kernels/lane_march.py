@@ -124,7 +124,7 @@ class Work(NamedTuple):
     forces: np.ndarray
     areas: np.ndarray
     swept: np.ndarray
-    stretch: np.ndarray
+    tension: np.ndarray
     collapsed: np.ndarray
     sync: np.ndarray
     scratch: np.ndarray

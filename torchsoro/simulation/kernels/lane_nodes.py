@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from torchsoro.simulation.kernels.lane_contact import meets
-from torchsoro.simulation.kernels.lanes import fast, law, load, magnitude, select, store, total
+from torchsoro.simulation.kernels.lane_contact import meets, store_vector, vector
+from torchsoro.simulation.kernels.lanes import fast, law, load, select, store, total
+from torchsoro.simulation.kernels.laws_lanes import laws
+
+quadratic_drag = laws.quadratic_drag
 
 STIFFNESS, REFERENCE = 0, 1  # numbers of a chamber: mean air stiffness, reference volume
 
@@ -12,6 +15,13 @@ STIFFNESS, REFERENCE = 0, 1  # numbers of a chamber: mean air stiffness, referen
 def chamber_pressure(supply, stiffness, volume, reference):
     """p_act - k (V/V0 - 1)."""
     return supply - stiffness * (volume / reference - 1)
+
+
+@law
+def pressure_of(case, work, chamber, step):
+    """Pressure of a chamber in a substep whose volume is kept, by the places of its numbers and of the substep's."""
+    stiffness, reference = load(case.air, 2 * chamber), load(case.air, 2 * chamber + 16)
+    return chamber_pressure(load(case.pressure, step), stiffness, load(work.volumes, step), reference)
 
 
 @law
@@ -52,11 +62,16 @@ def force_at(mesh, case, work, g, p, c, at, t):
             row = t if start < 0 else 0
             force = load(case.force, 16 * (3 * ((row * case.groups + g) * case.share.shape[0] + k) + c))
             found = found - load(case.share[k], i) * force
+    return found + tied(mesh, case, work, g, c, i)
+
+
+@law
+def tied(mesh, case, work, g, c, i):
+    """Component c of what springs to the mean displacement of some nodes hand to these: shares of ``tension``."""
     ties = case.tie_stiffness.size // (16 * case.groups)
-    for k in range(ties):
-        tie = g * ties + k
-        pull = load(case.tie_stiffness, 16 * tie) * load(work.stretch, 16 * (3 * tie + c))
-        found = found + load(case.tie_share, tie * mesh.component + i) * pull
+    found = 0 * load(mesh.own, 0)
+    for tie in range(g * ties, (g + 1) * ties):
+        found = found + load(case.tie_share, tie * mesh.component + i) * load(work.tension, 16 * (3 * tie + c))
     return found
 
 
@@ -86,6 +101,13 @@ def sum_areas(mesh, work, g, k, p, c, at):
             o = ((g * items + item) * mesh.chambers + k) * size + (3 * mesh.plane_slot[e] + c) * mesh.patch
             found = found + load(work.areas, o + at)
     return found
+
+
+@law
+def slow(mesh, case, g, i, light, u0, u1, u2):
+    """Velocity after quadratic drag, whose numbers are by node and axis."""
+    q, sink = vector(case.quadratic, 3 * g * mesh.component + i, mesh.component), case.dt * light
+    return quadratic_drag(u0, sink * q[0]), quadratic_drag(u1, sink * q[1]), quadratic_drag(u2, sink * q[2])
 
 
 @fast
@@ -128,36 +150,22 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
         u0 = v0 + dt * (load(case.gravity, pull) - light * f0)
         u1 = v1 + dt * (load(case.gravity, pull + 16) - light * f1)
         u2 = v2 + dt * (load(case.gravity, pull + 32) - light * f2)
+        if work.pushed.size:
+            store_vector(work.pushed, (slot * case.groups + g) * 3 * n + i, n, (u0, u1, u2))
         if case.quadratic.size:
-            q, sink = 3 * g * mesh.component + i, dt * light
-            u0 = u0 / (1 + sink * load(case.quadratic, q) * magnitude(u0))
-            u1 = u1 / (1 + sink * load(case.quadratic, q + n) * magnitude(u1))
-            u2 = u2 / (1 + sink * load(case.quadratic, q + 2 * n) * magnitude(u2))
+            u0, u1, u2 = slow(mesh, case, g, i, light, u0, u1, u2)
         u0, u1, u2 = select(moves, left * u0, v0), select(moves, left * u1, v1), select(moves, left * u2, v2)
         planes = len(case.plane_stick)
         o0, o1, o2 = u0 * 0, u1 * 0, u2 * 0
         if planes > 0:
-            if work.pushed.size:
-                q = (slot * case.groups + g) * 3 * n + i
-                store(work.pushed, q, u0)
-                store(work.pushed, q + n, u1)
-                store(work.pushed, q + 2 * n, u2)
             w0, w1, w2, o0, o1, o2 = meets(mesh, case, d, now + own, g, i, planes, light, (u0, u1, u2))
             u0, u1, u2 = select(moves, w0, u0), select(moves, w1, u1), select(moves, w2, u2)
         d0 = select(moves, d0 + dt * (o0 + u0), d0)
         d1 = select(moves, d1 + dt * (o1 + u1), d1)
         d2 = select(moves, d2 + dt * (o2 + u2), d2)
-        store(d, b, d0)
-        store(d, b + n, d1)
-        store(d, b + 2 * n, d2)
-        store(d, b + 3 * n, u0)
-        store(d, b + 4 * n, u1)
-        store(d, b + 5 * n, u2)
+        store_vector(d, b, n, (d0, d1, d2))
+        store_vector(d, b + 3 * n, n, (u0, u1, u2))
         if sample >= 0:
             o = (sample * case.groups + g) * 6 * n + i
-            store(work.seen, o, d0)
-            store(work.seen, o + n, d1)
-            store(work.seen, o + 2 * n, d2)
-            store(work.seen, o + 3 * n, u0)
-            store(work.seen, o + 4 * n, u1)
-            store(work.seen, o + 5 * n, u2)
+            store_vector(work.seen, o, n, (d0, d1, d2))
+            store_vector(work.seen, o + 3 * n, n, (u0, u1, u2))

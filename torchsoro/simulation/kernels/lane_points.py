@@ -16,6 +16,7 @@ from torchsoro.simulation.kernels.lane_laws import (
     excess,
     least_ratio,
     piola,
+    plus,
     pull_back,
     viscous_piola,
 )
@@ -249,13 +250,7 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
     P, _, J = piola(F, Q, bulk, (solid, shear), factor, void_fraction)
     if flags[2]:
         eta, zeta = load(numbers, n + 16 * VISCOSITY), load(numbers, n + 16 * VOLUME_VISCOSITY)
-        V = viscous_piola(F, plain(rates, at), eta, zeta)
-        there = void_fraction < 1
-        P = (
-            P[0] + select(there, V[0], 0 * J), P[1] + select(there, V[1], 0 * J), P[2] + select(there, V[2], 0 * J),
-            P[3] + select(there, V[3], 0 * J), P[4] + select(there, V[4], 0 * J), P[5] + select(there, V[5], 0 * J),
-            P[6] + select(there, V[6], 0 * J), P[7] + select(there, V[7], 0 * J), P[8] + select(there, V[8], 0 * J),
-        )  # fmt: skip
+        P = plus(1.0, P, 1.0, viscous_piola(F, plain(rates, at), eta, zeta))
     keep(G, at, P, volume)
     return any_lane(~(J > 0) & (void_fraction == 0) & (volume > 0))
 

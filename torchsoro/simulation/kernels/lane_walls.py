@@ -6,7 +6,9 @@ the volume is one third of the sum of x . dA. Where lanes are cells, a wall poin
 
 from __future__ import annotations
 
-from torchsoro.simulation.kernels.lanes import fast, law, load, select, store, total
+from torchsoro.simulation.kernels.lane_contact import dot
+from torchsoro.simulation.kernels.lane_nodes import pressure_of
+from torchsoro.simulation.kernels.lanes import fast, law, load, store, total
 
 
 @law
@@ -29,41 +31,115 @@ def wall_point(mesh, w, field, at):
     return x0, x1, x2, a0, a1, a2, b0, b1, b2
 
 
+@law
+def hand_to_nodes(mesh, w, out, at, n, a, b):
+    """Add to the nodes of a wall point what goes with its weights, and with the slopes along its two tangents.
+
+    ``out`` is a patch of three planes from ``at`` on.
+    """
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                v = 81 * w + 27 * i + 9 * j + 3 * k
+                share, s, r = mesh.wall_value[v], mesh.wall_value[v + 1], mesh.wall_value[v + 2]
+                o = at + 3 * i * mesh.patch + mesh.wall_at[w] + j * mesh.row + k * mesh.unit
+                store(out, o, load(out, o) + (share * n[0] + (s * a[0] + r * b[0])))
+                o += mesh.patch
+                store(out, o, load(out, o) + (share * n[1] + (s * a[1] + r * b[1])))
+                o += mesh.patch
+                store(out, o, load(out, o) + (share * n[2] + (s * a[2] + r * b[2])))
+
+
+@law
+def crossed(scale, a, b):
+    """A product of vectors times a number."""
+    return scale * (a[1] * b[2] - a[2] * b[1]), scale * (a[2] * b[0] - a[0] * b[2]), scale * (a[0] * b[1] - a[1] * b[0])
+
+
 @fast
 def walls_forward(mesh, case, work, g, item, corner):
     """Area vectors and volumes that the wall points of an item add to their chambers."""
     items, size, zero = len(mesh.item_plane), 9 * mesh.patch, 0 * load(mesh.own, 0)
-    mine = load(mesh.own, 0) > 0
+    none = zero, zero, zero
     for w in range(mesh.wall_begin[item], mesh.wall_begin[item + 1]):
         x0, x1, x2, a0, a1, a2, b0, b1, b2 = wall_point(mesh, w, work.states, corner)
-        area = mesh.wall_area[w]
-        n0, n1, n2 = area * (a1 * b2 - a2 * b1), area * (a2 * b0 - a0 * b2), area * (a0 * b1 - a1 * b0)
+        n = crossed(mesh.wall_area[w] * load(mesh.own, 0), (a0, a1, a2), (b0, b1, b2))
         one = (g * items + item) * mesh.chambers + mesh.wall_chamber[w]
-        volume = select(mine, (x0 * n0 + x1 * n1 + x2 * n2) * (1 / 3), zero)
-        store(work.swept, 16 * one, load(work.swept, 16 * one) + volume)
-        n0, n1, n2 = select(mine, n0, zero), select(mine, n1, zero), select(mine, n2, zero)
-        for i in range(3):
-            for j in range(3):
-                for k in range(3):
-                    share = mesh.wall_value[81 * w + 27 * i + 9 * j + 3 * k]
-                    o = one * size + 3 * i * mesh.patch + mesh.wall_at[w] + j * mesh.row + k * mesh.unit
-                    store(work.areas, o, load(work.areas, o) + share * n0)
-                    o += mesh.patch
-                    store(work.areas, o, load(work.areas, o) + share * n1)
-                    o += mesh.patch
-                    store(work.areas, o, load(work.areas, o) + share * n2)
+        store(work.swept, 16 * one, load(work.swept, 16 * one) + dot((x0, x1, x2), n) * (1 / 3))
+        hand_to_nodes(mesh, w, work.areas, one * size, n, none, none)
+
+
+@law
+def wall_value(mesh, w, field, at):
+    """A nodal vector field at a wall point."""
+    u0, u1, u2 = 0 * load(mesh.own, 0), 0 * load(mesh.own, 0), 0 * load(mesh.own, 0)
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                share = mesh.wall_value[81 * w + 27 * i + 9 * j + 3 * k]
+                o = at + mesh.wall_at[w] + i * mesh.plane + j * mesh.row + k * mesh.unit
+                u0, u1 = u0 + share * load(field, o), u1 + share * load(field, o + mesh.component)
+                u2 = u2 + share * load(field, o + 2 * mesh.component)
+    return u0, u1, u2
+
+
+@fast
+def walls_backward(mesh, case, work, sums, g, item, t, corner, force):
+    """Through the area vectors of an item's wall points, at a pressure that is known.
+
+    Leaves the gradient by the pressures in ``swept``, that of the volumes by the nodes in ``areas``.
+    """
+    items, size = len(mesh.item_plane), 9 * mesh.patch
+    for w in range(mesh.wall_begin[item], mesh.wall_begin[item + 1]):
+        chamber = mesh.wall_chamber[w]
+        one = (g * items + item) * mesh.chambers + chamber
+        step = 16 * ((t * case.groups + g) * mesh.chambers + chamber)
+        pressure = pressure_of(case, work, 16 * (g * mesh.chambers + chamber), step)
+        x0, x1, x2, a0, a1, a2, b0, b1, b2 = wall_point(mesh, w, work.states, corner)
+        x, a, b = (x0, x1, x2), (a0, a1, a2), (b0, b1, b2)
+        scale = mesh.wall_area[w] * load(mesh.own, 0)
+        n, pull = crossed(scale, a, b), wall_value(mesh, w, sums.pulls, force)
+        store(work.swept, 16 * one, load(work.swept, 16 * one) + dot(pull, n))
+        third = scale * (1 / 3)
+        by_place = n[0] * (1 / 3), n[1] * (1 / 3), n[2] * (1 / 3)
+        hand_to_nodes(mesh, w, work.areas, one * size, by_place, crossed(third, b, x), crossed(third, x, a))
+        scale = scale * pressure
+        none = 0 * x0, 0 * x0, 0 * x0
+        out = (g * items + item) * size
+        hand_to_nodes(mesh, w, work.forces, out, none, crossed(scale, b, pull), crossed(scale, pull, a))
+
+
+@law
+def mean_of(mesh, case, shares, field, at):
+    """Mean of a component of a nodal field over the nodes of a spring; over lanes, too, where these are cells."""
+    found = 0 * load(mesh.own, 0)
+    for i in range(mesh.front, mesh.front + mesh.planes * mesh.plane, 16):
+        found = found + load(case.tie_share, shares + i) * load(field, at + i)
+    if mesh.unit == 1:
+        found = found * 0 + total(found)
+    return found
 
 
 @fast
 def ties_forward(mesh, case, work, g, state):
-    """Mean displacement of the nodes of each spring."""
+    """Force that each spring to the mean displacement of some nodes takes."""
     ties = case.tie_stiffness.size // (16 * case.groups)
-    for tie in range(ties):
+    for tie in range(g * ties, (g + 1) * ties):
         for c in range(3):
-            found = 0 * load(mesh.own, 0)
-            shares = (g * ties + tie) * mesh.component
-            for i in range(mesh.front, mesh.front + mesh.planes * mesh.plane, 16):
-                found = found + load(case.tie_share, shares + i) * load(work.states, state + c * mesh.component + i)
-            if mesh.unit == 1:
-                found = found * 0 + total(found)
-            store(work.stretch, 16 * ((g * ties + tie) * 3 + c), found)
+            mean = mean_of(mesh, case, tie * mesh.component, work.states, state + c * mesh.component)
+            store(work.tension, 16 * (3 * tie + c), load(case.tie_stiffness, 16 * tie) * mean)
+
+
+@fast
+def ties_backward(mesh, case, work, sums, g, state):
+    """Gradient by the mean displacements, left in ``tension``, and by the stiffnesses."""
+    ties = case.tie_stiffness.size // (16 * case.groups)
+    for tie in range(g * ties, (g + 1) * ties):
+        shares = tie * mesh.component
+        stiffness, found = load(case.tie_stiffness, 16 * tie), load(sums.ties, 16 * tie)
+        for c in range(3):
+            pull = mean_of(mesh, case, shares, sums.pulls, (3 * g + c) * mesh.component)
+            mean = mean_of(mesh, case, shares, work.states, state + c * mesh.component)
+            found = found - pull * mean
+            store(work.tension, 16 * (3 * tie + c), -stiffness * pull)
+        store(sums.ties, 16 * tie, found)

@@ -16,7 +16,16 @@ from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.lane_adjoint import Sums, march_back
 from torchsoro.simulation.kernels.lane_contact import PLANE
 from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, Work, march
-from torchsoro.simulation.kernels.lane_points import ATTACHED, MAXWELL, NUMBERS
+from torchsoro.simulation.kernels.lane_points import (
+    ATTACHED,
+    BULK,
+    MAXWELL,
+    NUMBERS,
+    VISCOSITY,
+    VOID_FRACTION,
+    VOLUME,
+    VOLUME_VISCOSITY,
+)
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.chambers import chamber_adjoint, chamber_means
@@ -32,6 +41,7 @@ _NUMBERS = (
     *(layout.VOLUME, layout.BULK, layout.SHEAR, layout.VOID_FRACTION, layout.STIFFENING, layout.STIFFENING + 1),
     *(layout.VISCOSITY, layout.VOLUME_VISCOSITY),
 )
+_NOT_OF_GAS = (BULK, VISCOSITY, VOLUME_VISCOSITY)  # of which gas has none here
 _PRONY = [layout.PRONY_MODULUS, layout.PRONY_GAIN, layout.PRONY_DECAY]  # of an element, likewise
 # Numbers of a plane in the order of ``lane_contact``; normal and offset count with the plane's sign.
 _PLANE = [
@@ -112,16 +122,18 @@ class LaneIntegrator:
         return torch.where(kind[:, block] == chamber[:, None, None], V[:, block], 0.0)
 
     def _coefficients(self) -> Tensor:
-        """Numbers of the points: gas counts as void, without a bulk modulus; what is absent as void without volume."""
+        """Numbers of the points: gas counts as void that only shears; what is absent as void without volume."""
         c = self.inputs.coefficients[:, _NUMBERS].clone()
         gas = self.scene.kind >= 0
-        c[:, 1, gas] = 0
-        c[:, 3, gas] = 1
-        c[:, 0, self.scene.kind == layout.ABSENT] = 0
-        c[:, 3, self.scene.kind == layout.ABSENT] = 1
+        c[:, VOID_FRACTION, gas] = 1
+        for row in _NOT_OF_GAS:
+            c[:, row, gas] = 0
+        c[:, VOLUME, self.scene.kind == layout.ABSENT] = 0
+        c[:, VOID_FRACTION, self.scene.kind == layout.ABSENT] = 1
         found = self.lanes.from_points(c)
         if self.lanes.absent:
-            found[:, :, :, 3] = torch.where(self.lanes._there[None], found[:, :, :, 3], 1.0)
+            void_fraction = found[:, :, :, VOID_FRACTION]
+            void_fraction.masked_fill_(~self.lanes._there, 1.0)
         return found
 
     def _attached(self) -> Tensor:
@@ -243,7 +255,8 @@ class LaneIntegrator:
         at[inner] = np.arange(len(inner))
         seen = start.new_zeros(len(inner), lanes.groups, 6, mesh.component)
         slots = self.steps if keep else 1
-        touching = slots if len(self.case.plane_stick) and keep else 0
+        # Velocities before drag, which those after a substep do not tell.
+        touching = slots if keep and (len(self.case.plane_stick) or self.case.quadratic.size) else 0
         pushed = kept_memory(start, touching, groups, 3, mesh.component)
         self._clear_ends(pushed)
         volumes = start.new_zeros(slots, groups, mesh.chambers, LANES)
@@ -292,7 +305,7 @@ class LaneIntegrator:
             forces=numbers(like.new_zeros(tasks, size)),
             areas=numbers(like.new_zeros(tasks, mesh.chambers, size)),
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
-            stretch=np.zeros(3 * self.case.tie_stiffness.size, numbers(like).dtype),
+            tension=np.zeros(3 * self.case.tie_stiffness.size, numbers(like).dtype),
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),
             scratch=aligned(threads * SCRATCH, numbers(like).dtype),
@@ -377,6 +390,8 @@ class LaneIntegrator:
                 groups * blocks * 32,
                 groups * mesh.component,
                 groups * mesh.component,
+                len(self.case.quadratic),
+                len(self.case.tie_stiffness),
                 3 * groups * mesh.component,
                 groups * planes * PLANE * mesh.component,
                 len(self.case.air),
@@ -410,8 +425,8 @@ class LaneIntegrator:
         by_point = lanes.to_points(tensor(sums.numbers, groups, blocks, 8, NUMBERS, LANES), points)
         found = torch.zeros_like(c)
         gas = s.kind >= 0
-        by_point[:, 1, gas] = 0
-        by_point[:, 3, gas] = 0
+        for row in (*_NOT_OF_GAS, VOID_FRACTION):
+            by_point[:, row, gas] = 0
         found[:, _NUMBERS] = by_point
         if len(lanes.pairs):
             rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(
