@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from torchsoro import Body, Chamber, Domain, Gas, Simulator, Solid, Waveform, fill
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.lattice import Faces, Lattice, Walls
 from torchsoro.simulation.ops.rollout import rollout
 from torchsoro.simulation.ops.scene import Inputs, Scene
 from torchsoro.simulation.ops.state import updated_state
@@ -18,6 +20,7 @@ from torchsoro.simulation.ops.state import updated_state
 H = 2.5e-3  # particle spacing of the small bodies, m; a cell is twice that
 DT = 5e-5  # a stable step for the paper's resin with three Maxwell elements in such cells, s
 WAYS = {"apic": {"transfer": "apic"}, "flip": {"transfer": "flip"}, "total": {"formulation": "total"}}
+MORE = ("softening", "fluid", "ties", "air", "attached")  # tensors of the total-Lagrangian form that may be left out
 TENSORS = ("coefficients", "prony", "pressure", "gravity", "force", "planes", "origin", "state", "weight")
 
 
@@ -225,3 +228,88 @@ def problem(
         lanes=lanes,
     )
     return Problem(scene=scene, tensors={name: t.to(dtype) for name, t in tensors.items()}, samples=samples)
+
+
+def walls_around(lattice: Lattice, low: tuple[int, int, int], high: tuple[int, int, int]) -> Walls:
+    """Four points on each face of the cells around a box of cells from ``low`` to before ``high``, a hollow chamber."""
+    rows: list[tuple] = []
+    for axis in range(3):
+        across = [(axis + 1) % 3, (axis + 2) % 3]
+        one, two = (lattice.axes[a] for a in across)
+        for side, beside in ((1, low[axis] - 1), (-1, high[axis])):
+            for i, j in itertools.product(*(range(low[a], high[a]) for a in across)):
+                cell, area = [0, 0, 0], float(side * one.widths[i] * two.widths[j] / 4)
+                cell[axis], cell[across[0]], cell[across[1]] = beside, i, j
+                for a, b in itertools.product(range(2), range(2)):
+                    place = [0.0, 0.0, 0.0]
+                    place[axis] = lattice.axes[axis].planes[beside + (side > 0)]
+                    place[across[0]], place[across[1]] = one.points[i, a], two.points[j, b]
+                    rows.append((cell, place, axis, area))
+    cells, places, axes, areas = (np.array(column) for column in zip(*rows, strict=True))
+    along = [a.at(places[:, i], cells[:, i]) for i, a in enumerate(lattice.axes)]
+    firsts = [a.first[cells[:, i]] for i, a in enumerate(lattice.axes)]
+    index = [first[:, None] + np.arange(3) for first in firsts]
+    nodes = np.ravel_multi_index(
+        (index[0][:, :, None, None], index[1][:, None, :, None], index[2][:, None, None, :]), lattice.shape
+    )
+
+    def product(slope: np.ndarray) -> np.ndarray:
+        """Weights, or slopes along an axis that each point has [W]."""
+        x, y, z = (np.where((slope == a)[:, None], s, w) for a, (w, s) in enumerate(along))
+        return np.einsum("wi,wj,wk->wijk", x, y, z).reshape(len(axes), 27)
+
+    values = np.stack([product(axes * 0 - 1), product((axes + 1) % 3), product((axes + 2) % 3)], -1)
+    return Walls(
+        nodes=torch.from_numpy(nodes.reshape(len(axes), 27)),
+        values=torch.from_numpy(values),
+        places=torch.from_numpy(places),
+        axes=torch.from_numpy(axes),
+        areas=torch.from_numpy(areas),
+        chambers=torch.zeros(len(axes), dtype=torch.int64),
+    )
+
+
+def completed(p: Problem, *, starts: bool = False) -> Problem:
+    """A problem of the total-Lagrangian form with all else in it that this form has.
+
+    Softening, quadratic drag, a hollow chamber around the cell (1, 1, 1), held nodes, forces on nodes, springs to mean
+    displacements, and what is attached to nodes.
+
+    Args:
+        p: The problem; changed.
+        starts: Whether forces are constant from a substep on.
+    """
+    g = torch.Generator().manual_seed(7)
+    lattice, batch = p.scene.lattice, len(p.tensors["state"])
+    assert lattice is not None
+    nodes = lattice.nodes
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    faces = Faces(touches=rand(nodes) > 0.3, ends=rand(3, 2, nodes), front=rand(nodes, 3))
+    lattice = replace(lattice, faces=faces, walls=walls_around(lattice, (1, 1, 1), (2, 2, 2)))
+    steps = p.tensors["gravity"].shape[0]
+    p.scene = replace(
+        p.scene,
+        lattice=lattice,
+        softens=True,
+        immersed=True,
+        held=rand(nodes) > 0.9,
+        node_share=rand(1, nodes),
+        force_start=(0, 2, 3) if starts else None,
+        tie_share=rand(batch, 2, nodes) * (rand(batch, 2, nodes) > 0.8),
+    )
+    count, absent = lattice.count, p.scene.kind == layout.ABSENT
+    more = {
+        "state": torch.cat([p.tensors["state"], 0.1 * rand(batch, count).masked_fill(absent, 0)], 1),
+        "pressure": torch.cat([p.tensors["pressure"], rand(steps + 1, batch, 1)], 2),
+        "force": torch.randn(1 if starts else steps, batch, 3, 3, generator=g, dtype=torch.float64),
+        "softening": rand(batch, 2) * 0.1 + torch.tensor([0.6, 0.01]),
+        "fluid": 5 + rand(batch),
+        "ties": rand(batch, 2),
+        "air": rand(batch, 1),
+        "attached": rand(batch, 2, nodes),
+    }
+    p.tensors |= {name: t.to(p.tensors["state"]) for name, t in more.items()}
+    return p

@@ -9,8 +9,8 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from problems import problem
-from test_ops import TENSORS, check
+from problems import MORE, completed, problem
+from test_ops import TENSORS, check, combined, gradients
 
 import torchsoro
 from torchsoro.simulation.axis import Axis
@@ -27,6 +27,11 @@ def axis(*widths: float, creases: tuple[int, ...] = ()) -> Axis:
 def uneven() -> Lattice:
     """Three cells by two by four, with creases; faces on the outermost nodes."""
     return Lattice(axes=(axis(1.3, 0.7, 1.1), axis(0.9, 1.2, creases=(1,)), axis(1.3, 0.8, 1.0, 1.2, creases=(2,))))
+
+
+def hollow() -> Lattice:
+    """Three cells along each axis, one of them in the middle."""
+    return Lattice(axes=(axis(1.3, 0.7, 1.1, creases=(1,)), axis(0.9, 1.2, 1.0), axis(1.3, 0.8, 1.0, creases=(1, 2))))
 
 
 def wide() -> Lattice:
@@ -47,6 +52,28 @@ engines = pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "taichi"
 @pytest.mark.parametrize("name", TENSORS)
 def test_gradcheck_by_every_tensor_with_open_knots_and_creases(name, lanes):
     assert check(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes), name)
+
+
+@pytest.mark.parametrize("name", [*TENSORS, *MORE])
+def test_gradcheck_with_all_that_a_body_may_have(name):
+    assert check(completed(problem(formulation="total", lattice=hollow(), batch=2)), name)
+
+
+def test_slopes_with_all_that_a_body_may_have_agree_with_central_differences_to_1e6():
+    p = completed(problem(formulation="total", lattice=hollow(), batch=2))
+    found, g = gradients(p), torch.Generator().manual_seed(3)
+    for name, by in found.items():
+        at = p.tensors[name]
+        way = p.smooth(name, at + torch.randn(at.shape, generator=g, dtype=torch.float64)) - at
+        with torch.no_grad():
+            up, down = (combined(p.run({name: at + step * way})) for step in (1e-5, -1e-5))
+        assert float((by * way).sum()) == pytest.approx(float(up - down) / 2e-5, rel=1e-6), name
+
+
+@pytest.mark.parametrize("batch", [3, 14])
+def test_gradcheck_with_all_that_a_body_may_have_where_lanes_are_cells_or_bodies(batch):
+    p = completed(problem(formulation="total", lattice=hollow(), batch=batch), starts=True)
+    assert check(p, "state", "coefficients", "pressure", "force", *MORE)
 
 
 @pytest.mark.parametrize("stick", [False, True])

@@ -166,8 +166,7 @@ class LaneIntegrator:
         if faces is not None:
             far, area = torch.ones_like(far), faces.facing(numbered[..., :3]).to(like)
             touches = faces.touches.to(like).unsqueeze(0)
-        shares = [self.lattice.to_nodes(s.share.to(like)), *([] if s.node_share is None else [s.node_share.to(like)])]
-        shares = lanes.from_common_nodes(torch.cat(shares))
+        shares = lanes.from_common_nodes(self._shares())
         ties = like.new_zeros(self.batch, 0, self.lattice.nodes) if s.tie_share is None else s.tie_share.to(like)
         none = np.zeros(0, numbers(like).dtype)
         quadratic = none
@@ -215,6 +214,12 @@ class LaneIntegrator:
             touches=lanes.from_common_nodes(touches)[0].numpy(),
             spacing=float(s.cell),
         )
+
+    def _shares(self) -> Tensor:
+        """Each node's share of the forces [forces, nodes]."""
+        s, like = self.scene, self.inputs.coefficients
+        more = [] if s.node_share is None else [s.node_share.to(like)]
+        return torch.cat([self.lattice.to_nodes(s.share.to(like)), *more])
 
     def _starts(self) -> np.ndarray:
         """First substep at which each force acts, counted within the segment; -1 for one that changes in time."""
@@ -428,6 +433,7 @@ class LaneIntegrator:
         for row in (*_NOT_OF_GAS, VOID_FRACTION):
             by_point[:, row, gas] = 0
         found[:, _NUMBERS] = by_point
+        by_air = lanes.summed(tensor(sums.air, groups, mesh.chambers, layout.CHAMBER, LANES))
         if len(lanes.pairs):
             rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(
                 groups, -1, 8, LANES
@@ -435,8 +441,8 @@ class LaneIntegrator:
             wide = c.new_zeros(groups, blocks, 8, 1, LANES)
             wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
             found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
-            air_bar = lanes.summed(tensor(sums.air, groups, mesh.chambers, 2, LANES))[:, : s.gas_chambers]
-            found += chamber_adjoint(s, c, chamber_means(s, c, s.gas_chambers), air_bar)
+            means = chamber_means(s, c, s.gas_chambers)
+            found += chamber_adjoint(s, c, means, by_air[:, : s.gas_chambers])
         if s.springs:
             attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
             found[:, layout.SPRING : layout.ANCHOR + 3] += attached
@@ -464,13 +470,17 @@ class LaneIntegrator:
             planes_bar[..., _PLANE] = by_plane * self._signs(c)
         gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
         if {"gravity", "force"} & wanted:
-            mass = self.nodal[:, :1]
-            share = self.lattice.to_nodes(s.share.to(c)) if len(s.share) else None
+            mass, share, starts = self.nodal[:, :1], self._shares(), self.case.force_start
             for t in range(self.steps):
                 pull = lanes.to_nodes(pulls[t + 1])
                 gravity_bar[t] = (mass * pull).sum(-1)
-                if share is not None:
-                    force_bar[t] = torch.einsum("bcn,gn->bgc", pull, share)
+                by_force = torch.einsum("bcn,gn->bgc", pull, share)
+                force_bar[min(t, len(force_bar) - 1)] += by_force * torch.from_numpy(starts <= t).unsqueeze(1)
+        fluid_bar = torch.zeros_like(i.fluid)
+        if s.immersed:
+            by_area = lanes.to_nodes(tensor(sums.quadratic, groups, 3, mesh.component))
+            fluid_bar = torch.einsum("bcn,nc->b", by_area, self.lattice.faces.front.to(c)) / 2
+        by_block = tensor(sums.softening, groups, blocks, 2, LANES).sum(1)
         pressure_bar = torch.zeros_like(i.pressure)
         if mesh.chambers:
             by_step = tensor(sums.pressure, self.steps, groups, mesh.chambers, LANES)
@@ -486,5 +496,9 @@ class LaneIntegrator:
             "gravity": gravity_bar,
             "force": force_bar,
             "planes": planes_bar,
+            "softening": lanes.to_batch(by_block),
+            "fluid": fluid_bar,
+            "ties": lanes.summed(tensor(sums.ties, groups, i.ties.shape[1], LANES)),
+            "air": by_air[:, s.gas_chambers :, layout.CHAMBER_STIFFNESS],
             "attached": attached_bar,
         }

@@ -282,7 +282,7 @@ def rollout(
     if not in_lanes(scene, state):
         refuse_without_lanes(scene, inputs)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (state, weight, *tensors.values())):
-        refuse_gradient(scene, inputs)
+        refuse_gradient(scene)
     if list(samples) != sorted(set(samples)) or (samples and not 0 <= samples[0] <= samples[-1] <= steps):
         raise ValueError(f"samples = {samples}: wanted increasing substeps from 0 to {steps}")
     values = [t.contiguous() for t in (state, weight, *tensors.values())]
