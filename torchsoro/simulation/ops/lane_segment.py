@@ -478,6 +478,7 @@ class LaneIntegrator:
                 force_bar[min(t, len(force_bar) - 1)] += by_force * torch.from_numpy(starts <= t).unsqueeze(1)
         fluid_bar = torch.zeros_like(i.fluid)
         if s.immersed:
+            assert self.lattice.faces is not None
             by_area = lanes.to_nodes(tensor(sums.quadratic, groups, 3, mesh.component))
             fluid_bar = torch.einsum("bcn,nc->b", by_area, self.lattice.faces.front.to(c)) / 2
         by_block = tensor(sums.softening, groups, blocks, 2, LANES).sum(1)
@@ -499,6 +500,6 @@ class LaneIntegrator:
             "softening": lanes.to_batch(by_block),
             "fluid": fluid_bar,
             "ties": lanes.summed(tensor(sums.ties, groups, i.ties.shape[1], LANES)),
-            "air": by_air[:, s.gas_chambers :, layout.CHAMBER_STIFFNESS],
+            "air": by_air[:, s.gas_chambers :, layout.CHAMBER_STIFFNESS].clone(),
             "attached": attached_bar,
         }
