@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
@@ -17,37 +16,20 @@ from torchsoro.simulation.kernels.lane_adjoint import Sums, march_back
 from torchsoro.simulation.kernels.lane_contact import PLANE
 from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, Work, march
 from torchsoro.simulation.kernels.lane_points import (
-    ATTACHED,
-    BULK,
     MAXWELL,
-    NUMBERS,
-    VISCOSITY,
     VOID_FRACTION,
     VOLUME,
-    VOLUME_VISCOSITY,
 )
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
-from torchsoro.simulation.ops.chambers import chamber_adjoint, chamber_means
+from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.divergence import outside, report
+from torchsoro.simulation.ops.lane_gradients import COEFFICIENTS, NOT_OF_GAS, PLANE_NUMBERS, PRONY, gather_gradients
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
 from torchsoro.simulation.threads import thread_count
-
-# Coefficients of the points in the order of ``lane_points``.
-_NUMBERS = (
-    *(layout.VOLUME, layout.BULK, layout.SHEAR, layout.VOID_FRACTION, layout.STIFFENING, layout.STIFFENING + 1),
-    *(layout.VISCOSITY, layout.VOLUME_VISCOSITY),
-)
-_NOT_OF_GAS = (BULK, VISCOSITY, VOLUME_VISCOSITY)  # of which gas has none here
-_PRONY = [layout.PRONY_MODULUS, layout.PRONY_GAIN, layout.PRONY_DECAY]  # of an element, likewise
-# Numbers of a plane in the order of ``lane_contact``; normal and offset count with the plane's sign.
-_PLANE = [
-    *(layout.PLANE_NORMAL + c for c in range(3)),
-    *(layout.PLANE_OFFSET, layout.PLANE_FRICTION, layout.PLANE_ADHESION, layout.PLANE_REACH),
-]
 
 
 @cache
@@ -123,10 +105,10 @@ class LaneIntegrator:
 
     def _coefficients(self) -> Tensor:
         """Numbers of the points: gas counts as void that only shears; what is absent as void without volume."""
-        c = self.inputs.coefficients[:, _NUMBERS].clone()
+        c = self.inputs.coefficients[:, COEFFICIENTS].clone()
         gas = self.scene.kind >= 0
         c[:, VOID_FRACTION, gas] = 1
-        for row in _NOT_OF_GAS:
+        for row in NOT_OF_GAS:
             c[:, row, gas] = 0
         c[:, VOLUME, self.scene.kind == layout.ABSENT] = 0
         c[:, VOID_FRACTION, self.scene.kind == layout.ABSENT] = 1
@@ -146,7 +128,7 @@ class LaneIntegrator:
         there = self.scene.kind != layout.ABSENT
         return self.lanes.from_points(torch.cat([c[:, layout.SPRING : layout.SPRING + 1], ways], 1) * there)
 
-    def _signs(self, like: Tensor) -> Tensor:
+    def signs(self, like: Tensor) -> Tensor:
         """By which the numbers of planes count: normal and offset with the plane's sign [planes, PLANE]."""
         sign = self.scene.plane_kind[:, layout.PLANE_SIGN, None].to(like)
         return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
@@ -158,7 +140,7 @@ class LaneIntegrator:
         there = mass > 0
         moves = there if s.held is None else there & ~s.held
         inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
-        numbered = i.planes[..., _PLANE] * self._signs(like)
+        numbered = i.planes[..., PLANE_NUMBERS] * self.signs(like)
         elastic = s.plane_kind[:, layout.PLANE_ELASTIC].bool()
         ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
         far, area = (ways > 0).to(like), torch.full_like(ways, s.cell**2)
@@ -166,7 +148,7 @@ class LaneIntegrator:
         if faces is not None:
             far, area = torch.ones_like(far), faces.facing(numbered[..., :3]).to(like)
             touches = faces.touches.to(like).unsqueeze(0)
-        shares = lanes.from_common_nodes(self._shares())
+        shares = lanes.from_common_nodes(self.shares())
         ties = like.new_zeros(self.batch, 0, self.lattice.nodes) if s.tie_share is None else s.tie_share.to(like)
         none = np.zeros(0, numbers(like).dtype)
         quadratic = none
@@ -177,7 +159,7 @@ class LaneIntegrator:
         if walls is not None:
             hollow = torch.stack([i.air, walls.volume.to(like).expand_as(i.air)], -1)
             air = torch.cat([air, hollow], 1)
-        prony = i.prony[..., _PRONY]
+        prony = i.prony[..., PRONY]
         prony = torch.cat([prony, prony[..., 1:2] * (1 - prony[..., 2:])], -1)
         assert prony.shape[-1] == MAXWELL
         return Case(
@@ -215,7 +197,7 @@ class LaneIntegrator:
             spacing=float(s.cell),
         )
 
-    def _shares(self) -> Tensor:
+    def shares(self) -> Tensor:
         """Each node's share of the forces [forces, nodes]."""
         s, like = self.scene, self.inputs.coefficients
         more = [] if s.node_share is None else [s.node_share.to(like)]
@@ -405,7 +387,7 @@ class LaneIntegrator:
         )  # fmt: skip
         work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, thread_count())
         self._march(work, march_back, sums, steps)
-        first, found = self._gathered(moving, history, pulls, sums, wanted)
+        first, found = gather_gradients(self, moving, history, pulls, sums, wanted)
         bar.copy_(first)
         return found
 
@@ -417,89 +399,3 @@ class LaneIntegrator:
         if lanes.variations and spare:
             found[-1].view(6, -1, LANES)[..., LANES - spare :] = 0
         return found
-
-    def _gathered(self, moving, history, pulls, sums: Sums, wanted: frozenset[str]):
-        """Gradients in the layout of the inputs."""
-        i, lanes, mesh, s = self.inputs, self.lanes, self.mesh, self.scene
-        groups, blocks, points = lanes.groups, len(mesh.block_at), self.lattice.count
-        c = i.coefficients
-
-        def tensor(a: np.ndarray, *shape: int) -> Tensor:
-            return torch.from_numpy(a[: math.prod(shape)]).view(shape)
-
-        by_point = lanes.to_points(tensor(sums.numbers, groups, blocks, 8, NUMBERS, LANES), points)
-        found = torch.zeros_like(c)
-        gas = s.kind >= 0
-        for row in (*_NOT_OF_GAS, VOID_FRACTION):
-            by_point[:, row, gas] = 0
-        found[:, _NUMBERS] = by_point
-        by_air = lanes.summed(tensor(sums.air, groups, mesh.chambers, layout.CHAMBER, LANES))
-        if len(lanes.pairs):
-            rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(self.case.gas) != 0).view(
-                groups, -1, 8, LANES
-            )
-            wide = c.new_zeros(groups, blocks, 8, 1, LANES)
-            wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
-            found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
-            means = chamber_means(s, c, s.gas_chambers)
-            found += chamber_adjoint(s, c, means, by_air[:, : s.gas_chambers])
-        if s.springs:
-            attached = lanes.to_points(tensor(sums.attached, groups, blocks, 8, ATTACHED, LANES), points)
-            found[:, layout.SPRING : layout.ANCHOR + 3] += attached
-        nodal = torch.cat(
-            [
-                lanes.to_nodes(tensor(a, groups, n, mesh.component))
-                for a, n in ((sums.mass, 1), (sums.reach, 3), (sums.drag_factor, 1))
-            ],
-            1,
-        )
-        mass_bar, drag_bar, attached_bar = self.lattice.nodal_adjoint(
-            c[:, layout.MASS], c[:, layout.DRAG], s.dt, i.attached, nodal
-        )
-        found[:, layout.MASS] += mass_bar
-        found[:, layout.DRAG] += drag_bar
-        prony_bar = torch.zeros_like(i.prony)
-        if self.elements and "prony" in wanted:
-            by_element = tensor(sums.maxwell, groups, blocks, self.elements, len(_PRONY), LANES).sum(1)
-            prony_bar[..., _PRONY] = lanes.to_batch(by_element)
-        planes = s.plane_kind.shape[0]
-        planes_bar = torch.zeros_like(i.planes)
-        if planes:
-            by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
-            by_plane = by_node.sum(-1).view(self.batch, planes, PLANE)
-            planes_bar[..., _PLANE] = by_plane * self._signs(c)
-        gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
-        if {"gravity", "force"} & wanted:
-            mass, share, starts = self.nodal[:, :1], self._shares(), self.case.force_start
-            for t in range(self.steps):
-                pull = lanes.to_nodes(pulls[t + 1])
-                gravity_bar[t] = (mass * pull).sum(-1)
-                by_force = torch.einsum("bcn,gn->bgc", pull, share)
-                force_bar[min(t, len(force_bar) - 1)] += by_force * torch.from_numpy(starts <= t).unsqueeze(1)
-        fluid_bar = torch.zeros_like(i.fluid)
-        if s.immersed:
-            assert self.lattice.faces is not None
-            by_area = lanes.to_nodes(tensor(sums.quadratic, groups, 3, mesh.component))
-            fluid_bar = torch.einsum("bcn,nc->b", by_area, self.lattice.faces.front.to(c)) / 2
-        by_block = tensor(sums.softening, groups, blocks, 2, LANES).sum(1)
-        pressure_bar = torch.zeros_like(i.pressure)
-        if mesh.chambers:
-            by_step = tensor(sums.pressure, self.steps, groups, mesh.chambers, LANES)
-            pressure_bar[: self.steps, :, : mesh.chambers] = lanes.summed(by_step, 1)
-        history_bar = history.view(groups, blocks, 8, self.history, LANES) if self.history else None
-        state_bar = lanes.to_nodes(moving).reshape(self.batch, -1)
-        if history_bar is not None:
-            state_bar = torch.cat([state_bar, lanes.to_points(history_bar, points).reshape(self.batch, -1)], 1)
-        return state_bar, {
-            "coefficients": found,
-            "prony": prony_bar,
-            "pressure": pressure_bar,
-            "gravity": gravity_bar,
-            "force": force_bar,
-            "planes": planes_bar,
-            "softening": lanes.to_batch(by_block),
-            "fluid": fluid_bar,
-            "ties": lanes.summed(tensor(sums.ties, groups, i.ties.shape[1], LANES)),
-            "air": by_air[:, s.gas_chambers :, layout.CHAMBER_STIFFNESS].clone(),
-            "attached": attached_bar,
-        }
