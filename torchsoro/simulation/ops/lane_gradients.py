@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.kernels.lane_adjoint import Sums
 from torchsoro.simulation.kernels.lane_contact import PLANE
+from torchsoro.simulation.kernels.lane_march import Case
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
     BULK,
@@ -22,9 +22,9 @@ from torchsoro.simulation.kernels.lane_points import (
 )
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.chambers import chamber_adjoint, chamber_means
-
-if TYPE_CHECKING:
-    from torchsoro.simulation.ops.lane_segment import LaneIntegrator
+from torchsoro.simulation.ops.lanes import Lanes
+from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.scene import Inputs, Scene
 
 # Coefficients of the points in the order of ``lane_points``.
 COEFFICIENTS = (
@@ -40,21 +40,45 @@ PLANE_NUMBERS = [
 ]
 
 
+def signs(scene: Scene, like: Tensor) -> Tensor:
+    """By which the numbers of planes count: normal and offset with the plane's sign [planes, PLANE]."""
+    sign = scene.plane_kind[:, layout.PLANE_SIGN, None].to(like)
+    return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+
+
+def node_shares(scene: Scene, lattice: Lattice, like: Tensor) -> Tensor:
+    """Each node's share of the forces [forces, nodes]."""
+    more = [] if scene.node_share is None else [scene.node_share.to(like)]
+    return torch.cat([lattice.to_nodes(scene.share.to(like)), *more])
+
+
 def gather_gradients(
-    segment: LaneIntegrator, moving: Tensor, history: Tensor, pulls: Tensor, sums: Sums, wanted: frozenset[str]
+    scene: Scene,
+    inputs: Inputs,
+    lanes: Lanes,
+    case: Case,
+    mass: Tensor,
+    summed: tuple[Tensor, Tensor, Tensor, Sums],
+    wanted: frozenset[str],
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Gradients by the first state and by the tensors of ``Inputs``.
 
     Args:
-        segment: Of which the kernels have gone back to the first substep.
-        moving: Gradient by displacements and velocities [groups, 6, component].
-        history: By histories [groups, blocks, 8, numbers, 16].
-        pulls: By the forces on the nodes, of the substep at hand and of each [1 + steps, groups, 3, component].
-        sums: What the kernels have summed.
+        scene: Of the segment.
+        inputs: Of the segment.
+        lanes: Of its bodies.
+        case: Its numbers.
+        mass: Of the nodes [B, 1, nodes] kg.
+        summed: Gradient by displacements and velocities [groups, 6, component]; by histories [groups, blocks, 8,
+            numbers, 16]; by the forces on the nodes, of the last substep and of each [1 + steps, groups, 3, component];
+            what the kernels have summed.
         wanted: Names of the tensors whose gradients are wanted.
     """
-    i, lanes, mesh, s = segment.inputs, segment.lanes, segment.mesh, segment.scene
-    groups, blocks, points = lanes.groups, len(mesh.block_at), segment.lattice.count
+    i, s, mesh, lattice = inputs, scene, lanes.mesh, scene.lattice
+    assert lattice is not None
+    moving, history, pulls, sums = summed
+    batch, steps, elements = lanes.batch, i.gravity.shape[0], i.prony.shape[1]
+    groups, blocks, points = lanes.groups, len(mesh.block_at), lattice.count
     c = i.coefficients
 
     def tensor(a: np.ndarray, *shape: int) -> Tensor:
@@ -68,7 +92,7 @@ def gather_gradients(
     found[:, COEFFICIENTS] = by_point
     by_air = lanes.summed(tensor(sums.air, groups, mesh.chambers, layout.CHAMBER, LANES))
     if len(lanes.pairs):
-        rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(segment.case.gas) != 0).view(
+        rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(case.gas) != 0).view(
             groups, -1, 8, LANES
         )
         wide = c.new_zeros(groups, blocks, 8, 1, LANES)
@@ -86,43 +110,43 @@ def gather_gradients(
         ],
         1,
     )
-    mass_bar, drag_bar, attached_bar = segment.lattice.nodal_adjoint(
+    mass_bar, drag_bar, attached_bar = lattice.nodal_adjoint(
         c[:, layout.MASS], c[:, layout.DRAG], s.dt, i.attached, nodal
     )
     found[:, layout.MASS] += mass_bar
     found[:, layout.DRAG] += drag_bar
     prony_bar = torch.zeros_like(i.prony)
-    if segment.elements and "prony" in wanted:
-        by_element = tensor(sums.maxwell, groups, blocks, segment.elements, len(PRONY), LANES).sum(1)
+    if elements and "prony" in wanted:
+        by_element = tensor(sums.maxwell, groups, blocks, elements, len(PRONY), LANES).sum(1)
         prony_bar[..., PRONY] = lanes.to_batch(by_element)
     planes = s.plane_kind.shape[0]
     planes_bar = torch.zeros_like(i.planes)
     if planes:
         by_node = lanes.to_nodes(tensor(sums.planes, groups, planes * PLANE, mesh.component))
-        by_plane = by_node.sum(-1).view(segment.batch, planes, PLANE)
-        planes_bar[..., PLANE_NUMBERS] = by_plane * segment.signs(c)
+        by_plane = by_node.sum(-1).view(batch, planes, PLANE)
+        planes_bar[..., PLANE_NUMBERS] = by_plane * signs(s, c)
     gravity_bar, force_bar = torch.zeros_like(i.gravity), torch.zeros_like(i.force)
     if {"gravity", "force"} & wanted:
-        mass, share, starts = segment.nodal[:, :1], segment.shares(), segment.case.force_start
-        for t in range(segment.steps):
+        share, starts = node_shares(s, lattice, c), case.force_start
+        for t in range(steps):
             pull = lanes.to_nodes(pulls[t + 1])
             gravity_bar[t] = (mass * pull).sum(-1)
             by_force = torch.einsum("bcn,gn->bgc", pull, share)
             force_bar[min(t, len(force_bar) - 1)] += by_force * torch.from_numpy(starts <= t).unsqueeze(1)
     fluid_bar = torch.zeros_like(i.fluid)
     if s.immersed:
-        assert segment.lattice.faces is not None
+        assert lattice.faces is not None
         by_area = lanes.to_nodes(tensor(sums.quadratic, groups, 3, mesh.component))
-        fluid_bar = torch.einsum("bcn,nc->b", by_area, segment.lattice.faces.front.to(c)) / 2
+        fluid_bar = torch.einsum("bcn,nc->b", by_area, lattice.faces.front.to(c)) / 2
     by_block = tensor(sums.softening, groups, blocks, 2, LANES).sum(1)
     pressure_bar = torch.zeros_like(i.pressure)
     if mesh.chambers:
-        by_step = tensor(sums.pressure, segment.steps, groups, mesh.chambers, LANES)
-        pressure_bar[: segment.steps, :, : mesh.chambers] = lanes.summed(by_step, 1)
-    history_bar = history.view(groups, blocks, 8, segment.history, LANES) if segment.history else None
-    state_bar = lanes.to_nodes(moving).reshape(segment.batch, -1)
+        by_step = tensor(sums.pressure, steps, groups, mesh.chambers, LANES)
+        pressure_bar[:steps, :, : mesh.chambers] = lanes.summed(by_step, 1)
+    history_bar = history.view(groups, blocks, 8, case.history, LANES) if case.history else None
+    state_bar = lanes.to_nodes(moving).reshape(batch, -1)
     if history_bar is not None:
-        state_bar = torch.cat([state_bar, lanes.to_points(history_bar, points).reshape(segment.batch, -1)], 1)
+        state_bar = torch.cat([state_bar, lanes.to_points(history_bar, points).reshape(batch, -1)], 1)
     return state_bar, {
         "coefficients": found,
         "prony": prony_bar,

@@ -24,7 +24,15 @@ from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.divergence import outside, report
-from torchsoro.simulation.ops.lane_gradients import COEFFICIENTS, NOT_OF_GAS, PLANE_NUMBERS, PRONY, gather_gradients
+from torchsoro.simulation.ops.lane_gradients import (
+    COEFFICIENTS,
+    NOT_OF_GAS,
+    PLANE_NUMBERS,
+    PRONY,
+    gather_gradients,
+    node_shares,
+    signs,
+)
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.once import once
@@ -128,11 +136,6 @@ class LaneIntegrator:
         there = self.scene.kind != layout.ABSENT
         return self.lanes.from_points(torch.cat([c[:, layout.SPRING : layout.SPRING + 1], ways], 1) * there)
 
-    def signs(self, like: Tensor) -> Tensor:
-        """By which the numbers of planes count: normal and offset with the plane's sign [planes, PLANE]."""
-        sign = self.scene.plane_kind[:, layout.PLANE_SIGN, None].to(like)
-        return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
-
     def _case(self) -> Case:
         i, s, lanes = self.inputs, self.scene, self.lanes
         like = i.coefficients
@@ -140,7 +143,7 @@ class LaneIntegrator:
         there = mass > 0
         moves = there if s.held is None else there & ~s.held
         inverse = torch.where(there, 1 / torch.where(there, mass, 1.0), 0.0)
-        numbered = i.planes[..., PLANE_NUMBERS] * self.signs(like)
+        numbered = i.planes[..., PLANE_NUMBERS] * signs(s, like)
         elastic = s.plane_kind[:, layout.PLANE_ELASTIC].bool()
         ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
         far, area = (ways > 0).to(like), torch.full_like(ways, s.cell**2)
@@ -148,7 +151,7 @@ class LaneIntegrator:
         if faces is not None:
             far, area = torch.ones_like(far), faces.facing(numbered[..., :3]).to(like)
             touches = faces.touches.to(like).unsqueeze(0)
-        shares = lanes.from_common_nodes(self.shares())
+        shares = lanes.from_common_nodes(node_shares(s, self.lattice, like))
         ties = like.new_zeros(self.batch, 0, self.lattice.nodes) if s.tie_share is None else s.tie_share.to(like)
         none = np.zeros(0, numbers(like).dtype)
         quadratic = none
@@ -196,12 +199,6 @@ class LaneIntegrator:
             touches=lanes.from_common_nodes(touches)[0].numpy(),
             spacing=float(s.cell),
         )
-
-    def shares(self) -> Tensor:
-        """Each node's share of the forces [forces, nodes]."""
-        s, like = self.scene, self.inputs.coefficients
-        more = [] if s.node_share is None else [s.node_share.to(like)]
-        return torch.cat([self.lattice.to_nodes(s.share.to(like)), *more])
 
     def _starts(self) -> np.ndarray:
         """First substep at which each force acts, counted within the segment; -1 for one that changes in time."""
@@ -387,7 +384,9 @@ class LaneIntegrator:
         )  # fmt: skip
         work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, thread_count())
         self._march(work, march_back, sums, steps)
-        first, found = gather_gradients(self, moving, history, pulls, sums, wanted)
+        first, found = gather_gradients(
+            self.scene, self.inputs, lanes, self.case, self.nodal[:, :1], (moving, history, pulls, sums), wanted
+        )
         bar.copy_(first)
         return found
 
