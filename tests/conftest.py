@@ -83,5 +83,5 @@ def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory):
-    """A bar's twin, its ensemble, and a function that makes recordings of it."""
+    """A bar's twin, and a function that makes recordings of it."""
     return bar(tmp_path_factory.mktemp("bar"))

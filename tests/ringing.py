@@ -14,7 +14,7 @@ from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experimen
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.observation import ObservationModel
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import Twin
 
 EDGE = 0.01
@@ -49,25 +49,24 @@ def two_trials(folder: Path) -> tuple[Experiment, Trial]:
 
 
 def bar(folder: Path):
-    """The twin of a bar, its ensemble, and a function that makes what it, or another, would record in two trials."""
+    """The twin of a bar, and a function that makes what it, or another, would record in two trials."""
     found, loud = two_trials(folder)
     twin = Twin(found.setup, edge=EDGE, across=2)
-    ensemble = Ensemble(twin)
 
-    def record(name: str | None, values=(), by: Ensemble = ensemble, **change) -> Experiment:
+    def record(name: str | None, values=(), by: Twin = twin, **change) -> Experiment:
         rng, trials = np.random.default_rng(1), []
         for k, trial in enumerate((found.trials[0], loud)):
             trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
-            scenario = by.twin.scenario(trial)
+            scenario = by.scenario(trial)
             if name is not None:
-                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), by.twin)
+                scenario = effect(name)(scenario, torch.tensor([values], dtype=torch.float64), by)
             observation = ObservationModel(found.setup, [trial])
             errors = np.zeros(len(observation.deviations))
             errors[0], errors[6:] = 0.002 * (k + 1), 2e-4
-            seen = observation.observe(by([scenario])[0].alone(), 0, errors)
+            seen = observation.observe(simulate(by, [scenario])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             place[7, 0] = np.nan
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
         return dataclasses.replace(found, trials=tuple(trials))
 
-    return twin, ensemble, record
+    return twin, record

@@ -13,15 +13,14 @@ from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.search import search
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
 
 def test_a_finer_twin_corrects_where_one_is(made):
-    twin, ensemble, record = made
+    twin, record = made
     setup = record(None).setup
-    fine = Ensemble(Twin(setup, edge=0.6 * twin.edge, across=5))
-    problem = FitProblem(record(None), ensemble, fine=fine)
+    fine = Twin(setup, edge=0.6 * twin.edge, across=5)
+    problem = FitProblem(record(None), twin, fine=fine)
     at = np.array([0.8])
     there = FitProblem(record(None), fine)
     wanted = there.simulate([((), at[None])])[0]
@@ -31,9 +30,9 @@ def test_a_finer_twin_corrects_where_one_is(made):
 
 
 def test_each_effect_is_corrected_where_it_is(made):
-    twin, ensemble, record = made
-    fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
-    problem = FitProblem(record(None), ensemble, fine=fine)
+    twin, record = made
+    fine = Twin(record(None).setup, edge=0.6 * twin.edge, across=5)
+    problem = FitProblem(record(None), twin, fine=fine)
     drag, tilt = (effect(name) for name in ("drag", "gravity_tilt"))
     points = [((), np.array([[0.3]])), ((drag,), np.array([[0.5, 20.0]]))]
     told = problem.corrected_each(points)
@@ -49,10 +48,10 @@ def test_each_effect_is_corrected_where_it_is(made):
 def test_correction_at_the_effect_recovers_drag_of_a_finer_twin_within_3_percent(made):
     """Recordings by a finer twin, of a body that is so different that the twin's error is another than believed."""
     twin, _, record = made
-    fine = Ensemble(Twin(record(None).setup, edge=0.6 * twin.edge, across=5))
+    fine = Twin(record(None).setup, edge=0.6 * twin.edge, across=5)
     recorded, left = record("drag", (2000.0,), by=fine), []
     for other in (None, fine):
-        problem = FitProblem(recorded, Ensemble(twin), fine=other)
+        problem = FitProblem(recorded, twin, fine=other)
         _, null_model, best = search(problem, [effect("drag"), effect("gravity_tilt")], 600.0, lambda line: None)
         assert null_model.chi2 > 3 * null_model.samples and best[0].name == "drag"
         assert best[0].values[0][0] == pytest.approx(2000.0, rel=0.03)
@@ -61,20 +60,20 @@ def test_correction_at_the_effect_recovers_drag_of_a_finer_twin_within_3_percent
 
 
 def test_a_simulation_of_ones_own_is_what_is_believed(made):
-    twin, ensemble, record = made
+    twin, record = made
     experiment = record(None)
     still = [((), np.zeros((1, 1)))]
-    problem = FitProblem(experiment, ensemble)
+    problem = FitProblem(experiment, twin)
     time, trials = np.arange(0.0, 0.2001, 0.0025), []
     for trial, motion in zip(experiment.trials, problem.simulate(still)[0], strict=True):
         place = motion.alone().position[: len(time)] + 2e-3 * np.sin(40 * time)[:, None, None]
         trials.append(dataclasses.replace(trial, simulated=Recording(time=time, position=place)))
-    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
+    fine = Twin(experiment.setup, edge=0.6 * twin.edge, across=5)
     assert not problem.stated
     experiment = dataclasses.replace(experiment, trials=(trials[0],), heldout=(trials[1],))
-    known = measure(experiment, ensemble, fine)
+    known = measure(experiment, twin, fine)
     told = DiscretizationError(shift=known.shift, correction=known.correction)
-    problem = FitProblem(experiment, ensemble, trials=tuple(trials), fine=fine, discretization=told)
+    problem = FitProblem(experiment, twin, trials=tuple(trials), fine=fine, discretization=told)
     assert problem.stated.keys() == {t.name for t in trials}
     for motion, trial in zip(problem.simulate(still)[0], trials, strict=True):
         place = motion.alone().position

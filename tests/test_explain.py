@@ -26,7 +26,7 @@ from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, fi
 from torchsoro.sim2real.inference.search import _simpler
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 # Measurement ------------------------------------------------------------------------------------------------------
@@ -39,7 +39,9 @@ def test_derivatives_by_measurement_errors_are_those_of_differences():
     place = np.stack([np.sin(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     velocity = np.stack([7 * np.cos(7 * time + i) for i in range(3 * markers)], -1).reshape(steps, markers, 3)
     gradient = np.broadcast_to(np.eye(3) + 0.1 * rng.normal(size=(1, markers, 3, 3)), (steps, markers, 3, 3))
-    motion = MarkerTrajectory(time=time, position=place, velocity=velocity, gradient=gradient, dt=1e-3)
+    motion = MarkerTrajectory(
+        time=time, position=place, velocity=velocity, deformation=gradient, sound=np.array(True), dt=1e-3
+    )
     recording = Recording(time=np.linspace(0.05, 0.25, 9), position=np.zeros((9, markers, 2)), axes=(0, 2))
 
     class Two:
@@ -85,7 +87,7 @@ def test_noise_is_found_beside_motion(noise):
 
 
 def test_a_marker_that_slips_is_found_and_a_motion_of_all_is_not(made):
-    _, _, record = made
+    _, record = made
     trials = record(None).trials
     rng = np.random.default_rng(4)
     still = [5e-5 * rng.normal(size=t.recording.position.shape) for t in trials]
@@ -100,7 +102,7 @@ def test_a_marker_that_slips_is_found_and_a_motion_of_all_is_not(made):
 
 
 def test_confused_columns_are_put_right(made):
-    _, _, record = made
+    _, record = made
     recorded = record(None)
     swapped = dataclasses.replace(
         recorded,
@@ -124,9 +126,9 @@ def test_confused_columns_are_put_right(made):
     [("drag", (600.0,), 0.15), ("attached_mass", (0.004, 0.055, 0.01, 0.015), 0.35)],
 )
 def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
-    _, ensemble, record = made
+    twin, record = made
     recorded = record(name, values)
-    problem = FitProblem(recorded, ensemble, trials=recorded.trials[:1])
+    problem = FitProblem(recorded, twin, trials=recorded.trials[:1])
     (ranked,) = problem.probe([effect(name)], problem.base())
     fits = problem.fit([((effect(name),), start) for _, start in ranked[:3]])
     fit = min((f for f in fits if f is not None), key=lambda fit: fit.chi2)
@@ -144,9 +146,9 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
 
 
 def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
-    _, ensemble, record = made
+    twin, record = made
     recorded = record("attached_mass", (0.004, 0.055, 0.01, 0.015))
-    problem = FitProblem(recorded, ensemble, trials=recorded.trials[:1])
+    problem = FitProblem(recorded, twin, trials=recorded.trials[:1])
     mass, tether = effect("attached_mass"), effect("tether")
     start = np.array([0.0, 0.0, 0.0, 2.0, 9.0, 5.0, 7.0])
     (hung,) = problem.fit([((tether,), start)], rounds=2)
@@ -159,7 +161,7 @@ def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
 
 
 def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
-    _, ensemble, record = made
+    twin, record = made
     recorded = record(None)
     late = []
     for trial in recorded.trials:
@@ -168,7 +170,7 @@ def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
             trial.recording, time=trial.recording.time[held], position=trial.recording.position[held]
         )
         late.append(dataclasses.replace(trial, recording=recording))
-    early = FitProblem(recorded, ensemble, trials=tuple(late)).early(0.4)
+    early = FitProblem(recorded, twin, trials=tuple(late)).early(0.4)
     for whole, part in zip(late, early.trials, strict=True):
         share = len(part.recording.time) / len(whole.recording.time)
         assert share == pytest.approx(0.4, abs=0.05)
@@ -176,17 +178,17 @@ def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
 
 def test_a_clock_that_is_behind_has_seen_what_comes_after_the_end(made):
     """What it shows at the end happened later; the body has not stopped by then."""
-    twin, ensemble, record = made
+    twin, record = made
     experiment, behind, trials = record(None), 0.012, []
     for trial in experiment.trials:
-        (motion,) = ensemble([twin.scenario(trial).replace(until=0.3)])
+        (motion,) = simulate(twin, [twin.scenario(trial).replace(until=0.3)])
         observation = ObservationModel(experiment.setup, [trial])
         place = observation.observe(
             motion.alone(), 0, np.where(np.arange(len(observation.deviations)) == 0, -behind, 0.0)
         )
         recording = dataclasses.replace(trial.recording, position=place)
         trials.append(dataclasses.replace(trial, recording=recording))
-    problem = FitProblem(experiment, ensemble, trials=tuple(trials))
+    problem = FitProblem(experiment, twin, trials=tuple(trials))
     for part, end in ((problem, 0.2), (problem.early(0.5), 0.1)):
         motions = [m.alone() for m in part.simulate([((), np.zeros((1, 1)))])[0]]
         chi2, errors, _, _ = part.measure(motions, np.zeros(len(part.observation.deviations)))
@@ -207,9 +209,9 @@ def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
 
 
 def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
-    twin, ensemble, record = made
+    twin, record = made
     recorded = record("attached_mass", (0.002, 0.05, 0.01, 0.02), gravity=(9.81, 0.0, 0.0))
-    problem = FitProblem(recorded, ensemble, trials=recorded.trials)
+    problem = FitProblem(recorded, twin, trials=recorded.trials)
     (ranked,) = problem.probe([effect("attached_mass")], problem.base())
     _, start = ranked[0]
     assert start[-3:] / 10 * twin.setup.size == pytest.approx((0.05, 0.01, 0.02), abs=0.006)
@@ -223,10 +225,10 @@ def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
 
 def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
     """The trial that is left out disagrees, so that the fits differ."""
-    _, ensemble, record = made
+    twin, record = made
     told = record("drag", (600.0,))
     off = dataclasses.replace(told.trials[1], recording=record("drag", (500.0,)).trials[1].recording)
-    problem = FitProblem(dataclasses.replace(told, trials=(told.trials[0], off)), ensemble)
+    problem = FitProblem(dataclasses.replace(told, trials=(told.trials[0], off)), twin)
     tasks = [((effect("drag"),), np.array([0.0, 1.0]))]
     (both,) = problem.fit(tasks)
     there = problem.only(problem.trials[:1])
@@ -239,8 +241,8 @@ def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
 
 
 def test_prior_residual_is_small_within_the_tolerance_and_large_beyond(made):
-    _, ensemble, record = made
-    problem = FitProblem(record(None), ensemble)
+    twin, record = made
+    problem = FitProblem(record(None), twin)
     held = np.array([False])
     costs = [float((problem.prior_residual(np.array([a]), held)[0] ** 2).sum()) for a in (0.0, 1.0, 2.0)]
     assert costs[0] == 0 and costs[1] < 0.1 and costs[2] > 20
@@ -252,22 +254,22 @@ def test_prior_residual_is_small_within_the_tolerance_and_large_beyond(made):
 
 
 def test_a_verdict_names_the_effect_or_nothing(made):
-    _, ensemble, record = made
+    twin, record = made
     effects = [effect(name) for name in ("modulus", "drag", "gravity_tilt")]
     quiet = {"report": lambda line: None}
-    told = judge(FitProblem(record("drag", (600.0,)), ensemble), effects, **quiet)
+    told = judge(FitProblem(record("drag", (600.0,)), twin), effects, **quiet)
     assert told.kind == "explained" and told.chosen[0].fit.name == "drag"
     deviation = float(np.sqrt(told.chosen[0].fit.covariances[0][0, 0]))
     assert abs(told.chosen[0].fit.values[0][0] - 600.0) < 5 * deviation
-    null_model = judge(FitProblem(record(None), ensemble), effects, **quiet)
+    null_model = judge(FitProblem(record(None), twin), effects, **quiet)
     assert null_model.kind == "nothing_missing" and null_model.excess == pytest.approx(1.0, abs=0.3)
 
 
 def test_a_wrong_frequency_is_found_over_many_swings(made):
     """A modulus so wrong that simulation and recording are out of phase long before the end."""
-    _, ensemble, record = made
+    twin, record = made
     recorded = record("modulus", (0.9,))
-    told = judge(FitProblem(recorded, ensemble), [effect("modulus"), effect("drag")], report=lambda line: None)
+    told = judge(FitProblem(recorded, twin), [effect("modulus"), effect("drag")], report=lambda line: None)
     assert told.chosen and told.chosen[0].fit.name == "modulus"
     assert told.chosen[0].fit.values[0][0] == pytest.approx(0.9, abs=0.01)
 
@@ -276,7 +278,7 @@ def test_a_wrong_frequency_is_found_over_many_swings(made):
 
 
 def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
-    _, _, record = made
+    _, record = made
     setup = record(None).setup
     assert choose_twin(setup, 2, 600.0).count <= choose_twin(setup, 2, 6000.0).count
     # Where a body slides, a finer one is worth more of the time.
@@ -290,7 +292,7 @@ def test_a_twin_that_a_budget_cannot_pay_is_refused(made):
 
 
 def test_effects_that_cannot_act_and_trials_without_a_recording_are_refused(made, tmp_path, monkeypatch):
-    _, _, record = made
+    _, record = made
     recorded = record("drag", (800.0,))
     monkeypatch.setattr(inputs, "read_experiment", lambda folder: recorded)
     asked = pipeline.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE)
@@ -303,33 +305,33 @@ def test_effects_that_cannot_act_and_trials_without_a_recording_are_refused(made
 
 
 def test_a_beginning_without_samples_is_none(made):
-    _, ensemble, record = made
+    twin, record = made
     experiment = record(None)
-    early = FitProblem(experiment, ensemble).early(0.35)
+    early = FitProblem(experiment, twin).early(0.35)
     assert early is not None and all(t.setup.duration == pytest.approx(0.07) for t in early.trials)
-    assert FitProblem(experiment, ensemble).early(0.12) is None
+    assert FitProblem(experiment, twin).early(0.12) is None
     recording = experiment.trials[0].recording
     before = dataclasses.replace(recording, time=recording.time - 0.06)
     experiment = dataclasses.replace(experiment, trials=(dataclasses.replace(experiment.trials[0], recording=before),))
-    early = FitProblem(experiment, ensemble).early(0.12)
+    early = FitProblem(experiment, twin).early(0.12)
     assert early is not None and early.trials[0].setup.duration == pytest.approx(0.024)
 
 
 def test_planes_of_one_trial_alone_are_touched(made):
-    twin, ensemble, record = made
+    twin, record = made
     experiment = record(None)
     ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
     one, other = experiment.trials
     other = dataclasses.replace(other, setup=dataclasses.replace(other.setup, planes=(ground,)))
     experiment = dataclasses.replace(experiment, trials=(one, other))
-    fine = Ensemble(Twin(experiment.setup, edge=0.6 * twin.edge, across=5))
-    assert [np.isfinite(d).all() for d in measure(experiment, ensemble, fine).deviation.values()] == [True, True]
+    fine = Twin(experiment.setup, edge=0.6 * twin.edge, across=5)
+    assert [np.isfinite(d).all() for d in measure(experiment, twin, fine).deviation.values()] == [True, True]
 
 
 def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
-    _, _, record = made
+    _, record = made
     setup = record(None).setup
-    recorded = record("drag", (800.0,), by=Ensemble(finer(Twin(setup, edge=EDGE, walls=WALLS), 2, 40.0)))
+    recorded = record("drag", (800.0,), by=finer(Twin(setup, edge=EDGE, walls=WALLS), 2, 40.0))
     monkeypatch.setattr(inputs, "read_experiment", lambda folder: recorded)
     monkeypatch.setattr("torchsoro.sim2real.inference.verdict.library", lambda: (effect("drag"),))
     told = pipeline.explain(pipeline.Options(experiment=recorded.folder, out=tmp_path / "out", edge=EDGE))
@@ -378,10 +380,10 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
 
 def test_measurement_errors_stay_within_6_deviations_where_no_effect_explains(made):
     """A wind that is none of the effects at hand: what is left is priced, and measurement errors stay believable."""
-    _, ensemble, record = made
+    twin, record = made
     recorded = record("attached_mass", (0.01, 0.06, 0.01, 0.01))
     told = judge(
-        FitProblem(recorded, ensemble),
+        FitProblem(recorded, twin),
         [effect("gravity_tilt"), effect("drag")],
         report=lambda line: None,
     )
@@ -393,7 +395,7 @@ def test_measurement_errors_stay_within_6_deviations_where_no_effect_explains(ma
 
 def test_two_effects_are_found_where_one_does_not_do(made):
     """A bar that is drawn by a fluid and let go with a velocity: neither alone explains it."""
-    twin, ensemble, record = made
+    twin, record = made
     one = record("drag", (600.0,))
     thrown = effect("initial_motion")
     values = torch.tensor([[0.0, 0.0, 0.25]], dtype=torch.float64)
@@ -401,12 +403,12 @@ def test_two_effects_are_found_where_one_does_not_do(made):
     for trial in one.trials:
         s = thrown(twin.scenario(trial), values, twin)
         s = effect("drag")(s, torch.tensor([[600.0]], dtype=torch.float64), twin)
-        seen = ObservationModel(one.setup, [trial]).observe(ensemble([s])[0].alone(), 0, np.zeros(12))
+        seen = ObservationModel(one.setup, [trial]).observe(simulate(twin, [s])[0].alone(), 0, np.zeros(12))
         noise = 5e-5 * np.random.default_rng(5).normal(size=seen.shape)
         trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=seen + noise)))
     both = dataclasses.replace(one, trials=tuple(trials))
     effects = [effect(name) for name in ("drag", "initial_motion", "gravity_tilt")]
-    told = judge(FitProblem(both, ensemble), effects, report=lambda line: None)
+    told = judge(FitProblem(both, twin), effects, report=lambda line: None)
     assert told.chosen and {e.name for e in told.chosen[0].fit.effects} == {"drag", "initial_motion"}
     # Which of the numbers is which effect's does not depend on their order.
     found = dict(zip((e.name for e in told.chosen[0].fit.effects), told.chosen[0].fit.values, strict=True))

@@ -117,7 +117,7 @@ def test_a_good_experiment_is_accepted_with_byte_order_marks(folder):
         write(folder, name, b"\xef\xbb\xbf" + (folder / name).read_bytes())
     found = read_inputs(Options(experiment=folder, out=folder.parent / "out"))
     assert [t.name for t in found.trials] == ["a", "b"] and [t.name for t in found.kept] == ["c"]
-    assert found.fine.twin.count > found.ensemble.twin.count and not found.notes
+    assert found.fine.count > found.twin.count and not found.notes
 
 
 @pytest.mark.parametrize(
@@ -321,7 +321,7 @@ def test_noise_that_cannot_be_estimated_is_asked_for(folder):
     ],
 )
 def test_a_file_that_is_no_model_is_refused(folder, monkeypatch, old, new, message):
-    monkeypatch.setattr("torchsoro.sim2real.inference.model.Ensemble", None)
+    monkeypatch.setattr("torchsoro.sim2real.inference.model.simulate", None)
     text = (folder / "model.toml").read_text()
     assert old in text
     write(folder, "model.toml", text.replace(old, new))

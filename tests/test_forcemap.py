@@ -19,9 +19,9 @@ from torchsoro.sim2real.inference.force_map import force_map, patches
 from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.phases import mismatches, phases
-from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.scenario import NodalForce
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
+from torchsoro.simulation.loads import Force
 
 COUNT = 3  # patches
 
@@ -31,7 +31,6 @@ def made(tmp_path_factory):
     """A bar, and what its twin would record in two trials, with a force on a patch from 60 to 120 ms in the second."""
     found, thrown = two_trials(tmp_path_factory.mktemp("bar"))
     twin = Twin(found.setup, edge=0.01, across=2)
-    ensemble = Ensemble(twin)
 
     def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> FitProblem:
         rng, trials = np.random.default_rng(1), []
@@ -40,15 +39,15 @@ def made(tmp_path_factory):
         for trial in (found.trials[0], thrown):
             s = twin.scenario(trial)
             if trial is thrown:
-                forces = tuple(NodalForce(share=share, value=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
-                s = s.replace(forces=forces)
+                forces = tuple(Force(share=share, value=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
+                s = s.replace(loads=forces)
             observation = ObservationModel(found.setup, [trial])
             errors = np.zeros(len(observation.deviations))
             errors[0], errors[6:] = 0.002, 2e-4
-            seen = observation.observe(ensemble([s])[0].alone(), 0, errors)
+            seen = observation.observe(simulate(twin, [s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
-        return FitProblem(dataclasses.replace(found, trials=tuple(trials)), ensemble)
+        return FitProblem(dataclasses.replace(found, trials=tuple(trials)), twin)
 
     return record
 
@@ -100,9 +99,9 @@ def motion_of(z):
     """Markers that all move up and down [S], a second long."""
     at = np.array([[0.06, 0.01, 0.02], [0.04, 0.0, 0.01]])
     place = at + z[:, None, None] * np.array([0, 0, 1.0])
-    gradient = np.broadcast_to(np.eye(3), (len(z), 2, 3, 3))
+    F = np.broadcast_to(np.eye(3), (len(z), 2, 3, 3))
     return MarkerTrajectory(
-        time=np.linspace(0, 1, len(z)), position=place, velocity=0 * place, gradient=gradient, dt=1e-3
+        time=np.linspace(0, 1, len(z)), position=place, velocity=0 * place, deformation=F, sound=np.array(True), dt=1e-3
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import Twin
 
 
@@ -71,7 +71,7 @@ def test_twin_of_a_walker_stays_within_5_mm_of_its_plane(hide):
     found, _ = hide("nothing")
     twin = Twin(found.setup, edge=0.01, walls=1)
     assert twin.grid.cut
-    moved = Ensemble(twin)([twin.scenario(found.trials[0])])[0]
+    moved = simulate(twin, [twin.scenario(found.trials[0])])[0]
     assert moved.sound.all()
     # Neither falls through the ground, nor jumps off it.
     assert np.abs(moved.position[..., 2] - moved.position[..., :1, :, 2]).max() < 5e-3

@@ -86,7 +86,7 @@ def test_every_dataclass_of_sim2real_is_frozen_but_for_counters(path):
 @pytest.mark.parametrize(
     ("code", "found"),
     [
-        ("problem.ensemble = other", ["line 1: problem.ensemble"]),
+        ("problem.twin = other", ["line 1: problem.twin"]),
         ("twin.setup, x = s, 1", ["line 1: twin.setup"]),
         ("self.count[0] += 1", ["line 1: self.count[0]"]),
         ("setattr(solver, 'eager', True)", ["line 1: setattr"]),
@@ -100,18 +100,18 @@ def test_a_change_of_an_object_is_seen_by_the_walk_over_its_code(code, found):
     assert list(changes(ast.parse(code))) == found
 
 
-def test_problem_ensemble_twin_and_solver_refuse_another_value(made):
-    twin, ensemble, record = made
-    problem = FitProblem(record(None), ensemble)
+def test_problem_twin_and_solver_refuse_another_value(made):
+    twin, record = made
+    problem = FitProblem(record(None), twin)
     solver = GaussNewton(problem, ())
-    for thing, name in ((problem, "ensemble"), (ensemble, "even"), (twin, "setup"), (solver, "effects")):
+    for thing, name in ((problem, "twin"), (problem, "even"), (twin, "setup"), (solver, "effects")):
         with pytest.raises(FrozenInstanceError):
             setattr(thing, name, getattr(thing, name))
 
 
 def test_a_problem_of_one_trial_leaves_that_of_all_trials_as_it_was(made):
-    _, ensemble, record = made
-    problem = FitProblem(record(None), ensemble)
+    twin, record = made
+    problem = FitProblem(record(None), twin)
     other = problem.only(problem.trials[:1], noise=2 * problem.noise)
     assert (len(other.trials), len(problem.trials), other.noise) == (1, 2, 2 * problem.noise)
     assert other.tally is problem.tally

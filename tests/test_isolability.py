@@ -181,9 +181,9 @@ class Broken(Idle):
 @pytest.fixture(scope="module")
 def problem(made):
     """From rest, under its own weight, believed to be springy: no time but that of density and modulus."""
-    _, ensemble, record = made
+    twin, record = made
     recorded = record(None)
-    return FitProblem(recorded, ensemble, trials=recorded.trials[:1])
+    return FitProblem(recorded, twin, trials=recorded.trials[:1])
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +205,7 @@ def test_cosine_of_identical_effects_is_one(screened):
 def test_from_rest_density_is_modulus_and_a_mass_at_the_tip_is_more_like_it_than_like_drag(problem):
     """With a modulus that is known well: within a wide belief, it takes up most of what a mass does."""
     trial, names = problem.trials[0], ("modulus", "density", "attached_mass", "drag")
-    sure = FitProblem(problem.experiment, problem.ensemble, trials=(trial,), tolerances=Tolerances(modulus=1e-3))
+    sure = FitProblem(problem.experiment, problem.twin, trials=(trial,), tolerances=Tolerances(modulus=1e-3))
     modulus, density, mass, drag = range(4)
     found = isolability(sure, [effect(name) for name in names])
     assert found.cosines[density, modulus] > 0.97 and found.cosines[modulus, density] > 0.97

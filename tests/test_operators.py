@@ -43,7 +43,7 @@ def test_opcheck_of_the_adjoint(form, keep):
     p = problem(particles=(4, 4, 4), steps=3, samples=(0, 2), **form)
     given = [a.detach() if isinstance(a, Tensor) else a for a in arguments(p, keep)]
     results = torch.ops.torchsoro.rollout(*given)
-    bars, record = [torch.ones_like(r) for r in results[:7]], results[7:]
+    bars, record = [torch.ones_like(r) for r in results[:8]], results[8:]
     call = (*given[: len(NAMES)], *record, *bars, *given[len(NAMES) :], [True] * len(NAMES))
     result = torch.library.opcheck(torch.ops.torchsoro.rollout_backward.default, call)
     assert set(result.values()) == {"SUCCESS"}

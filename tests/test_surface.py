@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from setups import marker, material
 
@@ -15,7 +16,7 @@ from torchsoro.design.mesh import Surface, read_surface
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
-from torchsoro.sim2real.twin.ensemble import SAFETY, Ensemble
+from torchsoro.sim2real.twin.batch import SAFETY, simulate
 from torchsoro.sim2real.twin.twin import Twin
 
 SETUP = f"""
@@ -87,7 +88,7 @@ def test_a_box_of_triangles_moves_as_a_box(tmp_path):
     mesh = folder(tmp_path / "mesh", prism([(0, 0), (80, 0), (80, 20), (0, 20)], 0, 20))
     one, other = (Twin(e.setup, edge=0.01, across=2) for e in (box, mesh))
     assert one.setup.size == pytest.approx(other.setup.size)
-    moved, same = (Ensemble(t)([t.scenario(e.trials[0])])[0] for t, e in ((one, box), (other, mesh)))
+    moved, same = (simulate(t, [t.scenario(e.trials[0])])[0] for t, e in ((one, box), (other, mesh)))
     assert np.abs(moved.position[-1] - np.array([0.08, 0.01, 0.01])).max() > 1e-4
     np.testing.assert_allclose(moved.position, same.position, atol=1e-7)
 
@@ -98,7 +99,7 @@ def test_a_box_of_triangles_lands_as_a_box(tmp_path):
     box = folder(tmp_path / "box", None, BOX, more=plane)
     mesh = folder(tmp_path / "mesh", prism([(0, 0), (80, 0), (80, 20), (0, 20)], 0, 20), more=plane)
     moved, same = (
-        Ensemble(t)([t.scenario(dataclasses.replace(e.trials[0], setup=s))])[0]
+        simulate(t, [t.scenario(dataclasses.replace(e.trials[0], setup=s))])[0]
         for e in (box, mesh)
         for s in (dataclasses.replace(e.setup, gravity=(0.0, 0.0, -9.81)),)
         for t in (Twin(s, edge=0.01, across=2),)
@@ -109,7 +110,8 @@ def test_a_box_of_triangles_lands_as_a_box(tmp_path):
 
 def test_a_plane_faces_what_there_is_of_a_body(tmp_path):
     twin = Twin(folder(tmp_path, prism(CORNERS, 0, 20)).setup, edge=0.01, across=2)
-    below, above = (float(twin.grid.facing(np.array([0.0, 0.0, side])).sum()) for side in (1.0, -1.0))
+    normals = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    below, above = twin.grid.lattice.faces.facing(normals).sum(-1).tolist()
     assert (below, above) == (pytest.approx(0.08 * 0.02), pytest.approx(0.03 * 0.02))
 
 
@@ -121,7 +123,8 @@ def test_an_l_has_its_mass_centre_and_front(tmp_path):
     centre = (twin.volumes.unsqueeze(-1) * twin.positions).sum(0) / twin.volumes.sum()
     np.testing.assert_allclose(centre, body.center_mass * 1e-3, atol=1e-9)
     # Both sides of it, halved: along z the whole length, along x both ends.
-    assert twin.grid.front.sum(0) == pytest.approx([0.02 * 0.02, 0.08 * 0.008 + 0.03 * 0.012, 0.08 * 0.02])
+    front = twin.grid.lattice.faces.front.sum(0).tolist()
+    assert front == pytest.approx([0.02 * 0.02, 0.08 * 0.008 + 0.03 * 0.012, 0.08 * 0.02])
     # A marker over the step sits on it.
     at, _ = twin.grid.nearest(np.array([[0.06, 0.01, 0.011]]))
     np.testing.assert_allclose(at[0], [0.06, 0.01, 0.008])
@@ -147,7 +150,7 @@ def test_a_round_bar_has_the_frequency_of_its_radius(tmp_path):
     errors = []
     for edge in (0.008, 0.004):
         twin = Twin(found.setup, edge=edge, across=round(0.02 / edge))
-        motion = Ensemble(twin)([twin.scenario(found.trials[0])])[0].alone()
+        motion = simulate(twin, [twin.scenario(found.trials[0])])[0].alone()
         height = motion.position[:, 0, 2] - 0.01
         errors.append(abs(-height.mean() / sag / 1.04 - 1))
     assert errors[0] < 0.2 and errors[1] < 0.1
@@ -161,16 +164,15 @@ def test_a_round_bar_that_is_thrown_bears_it(tmp_path):
     found = folder(tmp_path, bar)
     thrown = dataclasses.replace(found.setup, velocity=(0.0, 0.0, 3.0))
     twin = Twin(thrown, edge=0.006, across=2)
-    ensemble, trial = Ensemble(twin), dataclasses.replace(found.trials[0], setup=thrown)
-    assert twin.grid.cut and ensemble([twin.scenario(trial)])[0].sound.all()
-    as_of_a_box = dataclasses.replace(ensemble, safety=SAFETY)
-    assert not as_of_a_box([twin.scenario(trial)])[0].sound.all()
+    scenario = twin.scenario(dataclasses.replace(found.trials[0], setup=thrown))
+    assert twin.grid.cut and simulate(twin, [scenario])[0].sound.all()
+    assert not simulate(twin, [scenario], safe=SAFETY)[0].sound.all()  # as of a box
 
 
 def test_a_model_takes_its_mesh_along(tmp_path):
     found = folder(tmp_path / "experiment", prism(CORNERS, 0, 20))
     twin = Twin(found.setup, edge=0.01, across=2)
-    (fit,) = FitProblem(found, Ensemble(twin)).fit([((), None)], rounds=1)
+    (fit,) = FitProblem(found, twin).fit([((), None)], rounds=1)
     assert fit is not None
     out = tmp_path / "out"
     out.mkdir()

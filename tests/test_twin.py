@@ -19,11 +19,13 @@ from torchsoro import Body, Solid
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.data.schema import ChamberTable, ForceTable, Marker, PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.grid import Axis, divide
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.markers import Markers
 from torchsoro.simulation.simulator import Simulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "recipes"))
@@ -82,12 +84,13 @@ def test_mass_centre_and_wall_areas_of_a_chambered_box_match_its_geometry(trial)
     whole, hole = math.prod(t.setup.size), 0.02 * 0.008 * 0.005
     middle = (whole * np.array(t.setup.center) - hole * np.mean(CHAMBER, axis=0)) / solid
     np.testing.assert_allclose(((mass[:, None] * twin.places).sum(0) / mass.sum()).numpy(), middle)
-    assert Ensemble(twin).chamber_volume[0] == pytest.approx(hole)
-    _, _, _, axes, areas, _ = twin.grid.walls
+    walls = twin.grid.lattice.walls
+    assert float(walls.volume[0]) == pytest.approx(hole)
     for axis, area in enumerate((0.008 * 0.005, 0.02 * 0.005, 0.02 * 0.008)):
-        assert areas[axes == axis].sum() == pytest.approx(0.0, abs=1e-12)
-        assert np.abs(areas[axes == axis]).sum() == pytest.approx(2 * area)
-    areas = [twin.grid.facing(n).sum() for n in np.eye(3)]
+        across = walls.areas[walls.axes == axis]
+        assert float(across.sum()) == pytest.approx(0.0, abs=1e-12)
+        assert float(across.abs().sum()) == pytest.approx(2 * area)
+    areas = twin.grid.lattice.faces.facing(torch.eye(3)).sum(-1).numpy()
     np.testing.assert_allclose(areas, [0.02 * 0.02, 0.04 * 0.02, 0.04 * 0.02])
 
 
@@ -97,14 +100,15 @@ def test_markers_and_their_gradients_are_exact_in_an_affine_motion(trial):
     )]  # fmt: skip
     twin = Twin(dataclasses.replace(trial.setup, markers=tuple(markers)), edge=EDGE)
     A = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.0, 0.1, 1.2]])
-    moved = twin.grid.places @ A.T
-    nodes, values = twin.marks()
-    at = np.array([m.at for m in markers])
+    moved = twin.places.numpy() @ A.T
+    lattice = twin.grid.lattice
+    kind = lattice.spread(torch.full((len(lattice.index),), -1.0), layout.ABSENT)
+    at = torch.tensor([m.at for m in markers], dtype=torch.float64)
+    found = Markers.at(lattice, kind, at)
+    near = moved[found.nodes.numpy()]
     # One of them is above the body and moves with its surface as if it were tied to it.
-    np.testing.assert_allclose(np.einsum("mkc,mk->mc", moved[nodes], values[..., 0]), at @ A.T, atol=1e-12)
-    np.testing.assert_allclose(
-        np.einsum("mkc,mkd->mcd", moved[nodes], values[..., 1:]), np.tile(A, (4, 1, 1)), atol=1e-9
-    )
+    np.testing.assert_allclose(np.einsum("mkc,mk->mc", near, found.weights), at.numpy() @ A.T, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("mkc,mak->mca", near, found.slopes), np.tile(A, (4, 1, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("place", [(0.03, 0.01, 0.01), (0.04, 0.02, 0.02), (0.0391, 0.0012, 0.0197)])
@@ -142,7 +146,7 @@ def test_clamps_chambers_and_loads_that_miss_the_body_are_refused(trial, changes
 
 def run(t, edge=EDGE, walls=2, **changes):
     twin = Twin(t.setup, edge=edge, walls=walls)
-    return Ensemble(twin)([twin.scenario(t).replace(**changes)])[0].alone()
+    return simulate(twin, [twin.scenario(t).replace(**changes)])[0].alone()
 
 
 def cantilever(trial, length, width, **changes):
@@ -272,7 +276,7 @@ def test_velocity_of_a_free_body_in_a_fluid_matches_quadratic_drag(trial):
     t = changed(trial, clamps=(), forces=(), gravity=(0.0, 0.0, 0.0), velocity=(0.5, 0.0, 0.0), duration=0.1)
     twin, drag = Twin(t.setup, edge=EDGE), next(e for e in library() if e.name == "drag")
     through = drag(twin.scenario(t), torch.tensor([[1600.0]], dtype=torch.float64), twin)
-    way = Ensemble(twin)([through])[0].position[0, -1, :, 0].mean() - np.mean([m.at[0] for m in t.setup.markers])
+    way = simulate(twin, [through])[0].position[0, -1, :, 0].mean() - np.mean([m.at[0] for m in t.setup.markers])
     # m dv/dt = - density drag A v^2 / 2, with the area of the front.
     length, *front = t.setup.size
     rate = 1600.0 * math.prod(front) / 2 / (t.setup.density * length * math.prod(front))
@@ -285,7 +289,7 @@ def test_initial_motion_effect_equals_a_spin_stated_in_the_setup(trial):
     effect = next(e for e in library() if type(e).__name__ == "InitialSpin")
     twin = Twin(t.setup, edge=EDGE)
     spun = effect(twin.scenario(t), torch.tensor([[0.0, 20.0, 5.0]], dtype=torch.float64), twin)
-    found = Ensemble(twin)([spun])[0].alone()
+    found = simulate(twin, [spun])[0].alone()
     np.testing.assert_allclose(found.position, run(changed(t, angular_velocity=(0.0, 20.0, 5.0))).position, atol=1e-6)
 
 
@@ -337,7 +341,7 @@ def test_adhesion_acts_within_its_reach_only(trial, gap, speed, expected):
     effect = next(e for e in library() if e.name == "adhesion")
     values = torch.tensor([[traction, math.log(reach)]], dtype=torch.float64)
     assert effect.reported(values[0].numpy(), twin.scenario(t))["energy_j_m2"][0] == pytest.approx(traction * reach)
-    motion = Ensemble(twin)([effect(twin.scenario(t), values, twin)])[0].alone()
+    motion = simulate(twin, [effect(twin.scenario(t), values, twin)])[0].alone()
     last = 2 if expected < 0 else -1  # before it meets the plane
     assert motion.velocity[last, :, 2].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
 
@@ -367,10 +371,9 @@ def test_variations_in_a_batch_equal_single_simulations(trial):
     rows = [[0.0, 0.0, 0.0, 0.04, 0.01, 0.02], [3.0, 0.1, 0.001, 0.04, 0.01, 0.02]]
     values = torch.tensor(rows * 10, dtype=torch.float64)  # more than one group of lanes
     varied = [tether(twin.scenario(t), values, twin) for t in (trial, loaded)]
-    ensemble = Ensemble(twin)
-    for part, scenario in zip(ensemble(varied), (trial, loaded), strict=True):
+    for part, scenario in zip(simulate(twin, varied), (trial, loaded), strict=True):
         for row in range(2):
-            alone = ensemble([tether(twin.scenario(scenario), values[row : row + 1], twin)])[0]
+            alone = simulate(twin, [tether(twin.scenario(scenario), values[row : row + 1], twin)])[0]
             np.testing.assert_allclose(part.position[row], alone.position[0], atol=2e-6)
             np.testing.assert_allclose(part.position[18 + row], part.position[row], atol=1e-6)
 
@@ -378,8 +381,8 @@ def test_variations_in_a_batch_equal_single_simulations(trial):
 def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
     twin = Twin(trial.setup, edge=EDGE)
     s = twin.scenario(trial)
-    wild = s.replace(velocity=s.velocity + torch.tensor([0.0, 1e5])[:, None, None] * torch.ones(1, twin.grid.nodes, 3))
-    assert Ensemble(twin)([wild])[0].sound.tolist() == [True, False]
+    wild = s.replace(velocity=s.velocity + torch.tensor([0.0, 1e5])[:, None, None] * torch.ones(1, twin.nodes, 3))
+    assert simulate(twin, [wild])[0].sound.tolist() == [True, False]
 
 
 # Hypotheses -------------------------------------------------------------------------------------------------------
@@ -411,7 +414,7 @@ def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwi
     if effect.name == "softening":  # a range has no zero
         zero[:, 1] = -5.0
     still, same, other = (
-        m.position for m in Ensemble(twin)([scenario, effect(scenario, zero, twin), effect(scenario, some, twin)])
+        m.position for m in simulate(twin, [scenario, effect(scenario, zero, twin), effect(scenario, some, twin)])
     )
     np.testing.assert_allclose(same, still, atol=1e-8)
     if effect.name != "adhesion":  # nothing lifts off

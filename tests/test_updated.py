@@ -13,7 +13,7 @@ from test_experiment import SETUP, experiment
 
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.data.schema import ForceTable, PlaneTable
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import Twin
 
 LOADED = SETUP + "[[load]]\nbox = [[0.03, 0.0, 0.0], [0.04, 0.02, 0.02]]\nforce = [0.0, 0.05, 0.0]\nstart = 0.02\n"
@@ -68,7 +68,7 @@ def off(folder):
     """How far the particles' motion is from the twin's, over that, along y and z."""
     (trial,) = read_experiment(folder).trials
     twin = Twin(trial.setup, edge=0.004)
-    (motion,) = Ensemble(twin, 1)([twin.scenario(trial)])
+    (motion,) = simulate(twin, [twin.scenario(trial)])
     course, own = motion.alone().position[:, 0], trial.simulated
     same = np.stack([np.interp(motion.time, own.time, own.position[:, 0, k]) for k in range(3)], 1)
     moved = np.sqrt(((course - course[:1]) ** 2).mean(0))[1:]

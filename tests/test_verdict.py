@@ -20,8 +20,8 @@ from torchsoro.sim2real.inference.verdict import Thresholds, decide
 @pytest.fixture(scope="module")
 def still(made):
     """Recordings that lack nothing, and their fit without an effect."""
-    _, ensemble, record = made
-    problem = FitProblem(record(None), ensemble)
+    twin, record = made
+    problem = FitProblem(record(None), twin)
     return problem, problem.fit([((), None)], rounds=3)[0]
 
 

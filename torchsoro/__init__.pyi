@@ -9,8 +9,9 @@ from .simulation.contact import Plane, ground
 from .simulation.loads import Drag, Force, PointMass, Spring
 from .simulation.material import Body, Gas, Prony, Solid
 from .simulation.runtime import init
-from .simulation.simulator import Simulator, Trajectory
+from .simulation.simulator import Simulator
 from .simulation.stability import stable_step
+from .simulation.trajectory import Trajectory
 
 __version__: str
 __all__ = [

@@ -367,13 +367,12 @@ def main(options: Options) -> Answer | None:
     whole = ExplainOptions(
         experiment=options.experiment, out=options.out, budget=options.budget, threads=options.threads
     )
-    torch.set_num_threads(1)  # threads belong to the ensembles
+    torch.set_num_threads(1)  # threads belong to groups of simulations
     inputs = read_inputs(whole)
     if options.method in get_args(Ablation):
         problem = correct(inputs)
     else:
-        ensemble = inputs.ensemble
-        problem = FitProblem(inputs.experiment, ensemble, trials=inputs.trials, lasting=0.0)
+        problem = FitProblem(inputs.experiment, inputs.twin, threads=inputs.threads, trials=inputs.trials, lasting=0.0)
     everything = [e.name for e in library() if not e.local]
     answer = {
         "modulus-and-damping": lambda: fit_parameters(problem, ["modulus", "viscoelastic"]),

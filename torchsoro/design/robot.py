@@ -22,7 +22,8 @@ from torchsoro.simulation.contact import Plane, ground
 from torchsoro.simulation.formulation import formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
-from torchsoro.simulation.simulator import Simulator, Trajectory
+from torchsoro.simulation.simulator import Simulator
+from torchsoro.simulation.trajectory import Trajectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

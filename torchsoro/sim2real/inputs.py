@@ -19,7 +19,7 @@ from torchsoro.sim2real.inference.noise import estimate_noise
 from torchsoro.sim2real.inference.recording_faults import reordered
 from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer
 from torchsoro.sim2real.options import Options
-from torchsoro.sim2real.twin.ensemble import SAMPLE, THREADS, Ensemble
+from torchsoro.sim2real.twin.batch import SAMPLE, THREADS
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.storage import check_folder
 
@@ -37,7 +37,7 @@ class Inputs:
         experiment: As read, columns of confused markers put right, recordings thinned where they have too many rows.
         trials: To be explained, each with a recording.
         kept: With a recording, only to be predicted.
-        ensemble: Simulates the twin that is fitted.
+        twin: The body that is fitted.
         fine: Simulates one with smaller cells, which tells the other's error.
         effects: Considered; None for the whole library.
         notes: What was changed, a line each.
@@ -46,8 +46,9 @@ class Inputs:
     experiment: Experiment
     trials: tuple[Trial, ...]
     kept: tuple[Trial, ...]
-    ensemble: Ensemble
-    fine: Ensemble
+    twin: Twin
+    fine: Twin
+    threads: int
     effects: list[Hypothesis] | None
     notes: tuple[str, ...]
 
@@ -83,15 +84,15 @@ def read_inputs(options: Options) -> Inputs:
                 scenarios[trial.name] = twin.scenario(trial)
     if effects and not any(e.applies(scenarios[t.name], twin) for e in effects for t in trials):
         raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
-    ensemble = Ensemble(twin, options.threads or THREADS)
     with named_in(experiment.folder):
-        fine = Ensemble(finer(twin, len(trials), 2 * options.budget), ensemble.threads)
+        fine = finer(twin, len(trials), 2 * options.budget)
     return Inputs(
         experiment=experiment,
         trials=trials,
         kept=tuple(t for t in experiment.heldout if t.recording is not None),
-        ensemble=ensemble,
+        twin=twin,
         fine=fine,
+        threads=options.threads or THREADS,
         effects=effects,
         notes=tuple(filter(None, [confused, *thinned])),
     )

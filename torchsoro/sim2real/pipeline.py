@@ -31,7 +31,7 @@ from torchsoro.sim2real.progress import Progress, span
 from torchsoro.sim2real.report.explanation import Explanation
 from torchsoro.sim2real.report.report import write
 from torchsoro.sim2real.report.sentences import lead
-from torchsoro.sim2real.twin.ensemble import THREADS
+from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.storage import check_folder
 
 __all__ = ["Explanation", "Options", "explain", "predict_markers", "run"]
@@ -86,10 +86,11 @@ def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> 
     """
     return FitProblem(
         inputs.experiment,
-        inputs.ensemble,
+        inputs.twin,
         trials=inputs.trials,
-        discretization=measure(inputs.experiment, inputs.ensemble, inputs.fine, report=tick),
+        discretization=measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, report=tick),
         fine=inputs.fine,
+        threads=inputs.threads,
         report=tick,
     )
 
@@ -118,14 +119,14 @@ def explain(options: Options) -> Explanation:
         ValueError: for options out of range, a folder that cannot be written, or an experiment that cannot be read or
             simulated; nothing is written then.
     """
-    torch.set_num_threads(1)  # threads belong to the ensembles
+    torch.set_num_threads(1)  # threads belong to groups of simulations
     begin = time.perf_counter()
     inputs = read_inputs(options)
     progress = Progress()
     try:
         for note in inputs.notes:
             progress.note(note)
-        size = f"{inputs.ensemble.twin.count} points in cells of {1e3 * inputs.ensemble.twin.edge:.1f} mm"
+        size = f"{inputs.twin.count} points in cells of {1e3 * inputs.twin.edge:.1f} mm"
         progress.note(f"{len(inputs.trials)} trials, each simulated with {size}")
         found, trials = _explained(inputs, options, progress, begin)
     finally:
@@ -133,13 +134,13 @@ def explain(options: Options) -> Explanation:
     settings = {
         "experiment": str(options.experiment),
         "budget_minutes": options.budget,
-        "edge_m": inputs.ensemble.twin.edge,
-        "walls": inputs.ensemble.twin.walls,
+        "edge_m": inputs.twin.edge,
+        "walls": inputs.twin.walls,
     }
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
     write(found, trials, out, settings)
-    write_model(out / "model.toml", inputs.experiment.folder / "setup.toml", found.best, inputs.fine.twin)
+    write_model(out / "model.toml", inputs.experiment.folder / "setup.toml", found.best, inputs.fine)
     print(f"{lead(found)}\nReport: {out / 'report.html'} (after {span(found.seconds)})")
     return found
 

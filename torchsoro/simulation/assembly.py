@@ -9,7 +9,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchsoro.errors import refuse_gradients
 from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.attachment import load_tensors
 from torchsoro.simulation.checkpoints import MEMORY
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.kernels import layout
@@ -32,6 +34,7 @@ def assemble(
     forces: Sequence[Tensor],
     weight: Tensor,
     low: tuple[float, float, float],
+    others: Sequence[tuple[Tensor, int]] = (),
 ) -> tuple[torch.Size, Inputs, Wide]:
     """Broadcast all arguments of a call to one batch.
 
@@ -41,9 +44,10 @@ def assemble(
         pressure: [..., chambers, T + 1] Pa.
         gravity: [..., T, 3] m/s2.
         planes: Contact planes.
-        forces: [..., T, 3] N each.
+        forces: [..., T, 3] or [..., 1, 3] N each.
         weight: [..., N].
         low: Lower corner of the analysis box [m].
+        others: Further tensors whose leading axes count, with the number of axes that are not a batch.
 
     Returns:
         The leading axes, the operator's inputs, and the function that broadcasts a tensor likewise.
@@ -55,7 +59,7 @@ def assemble(
     numbers = [[torch.as_tensor(n, dtype=x.dtype, device=x.device) for n in plane.numbers()] for plane in planes]
     ranks = [(x, 2), (prony, 2), (pressure, 2), (gravity, 2), (weight, 1), *((f, 2) for f in forces)]
     ranks += [(n, 0) for plane in numbers for n in plane]
-    ranks += body_tensors(attached)
+    ranks += [*body_tensors(attached), *load_tensors(attached), *others]
     leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
     try:
         lead = torch.broadcast_shapes(*leads)
@@ -89,10 +93,9 @@ def assemble(
 
 
 def on_lattice(
-    scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, weight: Tensor
+    scene: Scene, whole: Inputs, x: Tensor, velocity: Tensor, weight: Tensor, lattice: Lattice
 ) -> tuple[Scene, Inputs, Tensor, Tensor, Tensor]:
     """From particles to the points of their lattice, in all data by particle."""
-    lattice = Lattice.around(x[0], scene.cell)
     offset = (x - x[:1]).detach()
     if bool(((offset - offset[:, :1]).abs() > 1e-3 * scene.cell).any()):
         raise ValueError(
@@ -152,9 +155,9 @@ def coefficients(attached: Attached, wide: Wide) -> Tensor:
     return torch.stack(rows, 1)
 
 
-def supply_at(body: Body, pressure: Waveform | None, times: Tensor) -> Tensor:
-    """Supply pressure [..., chambers, T + 1]."""
-    chambers = int(body.chamber.max()) + 1
+def supply_at(body: Body, hollow: int, pressure: Waveform | None, times: Tensor) -> Tensor:
+    """Supply pressure [..., chambers, T + 1] of the chambers of particles, and of the hollow ones."""
+    chambers = int(body.chamber.max()) + 1 + hollow
     if pressure is None:
         return times.new_zeros(chambers, len(times))
     values = pressure.at(times.to(pressure.time))
@@ -224,6 +227,18 @@ def check_body(body: Body) -> None:
             wanted = "finite" if vector else f"finite and {'positive' if name in ('mass', 'volume') else 'at least 0'}"
             bad = value.detach()[~(finite if vector else finite & least)][0]
             raise ValueError(f"body.{name}: value {float(bad)}, wanted {wanted}")
+    for name, value, least in (("softening", body.softening, "depth"), ("air_stiffness", body.air_stiffness, "")):
+        if value is None:
+            continue
+        if value.dtype != x.dtype or value.device != x.device or (least and value.shape[-1:] != (2,)):
+            raise ValueError(
+                f"body.{name}: {value.dtype} {tuple(value.shape)} on {value.device}, wanted {x.dtype} "
+                f"[..., {'2' if least else 'hollow chambers'}] on {x.device}"
+            )
+        if not bool((torch.isfinite(value.detach()) & (value.detach() >= 0)).all()):
+            raise ValueError(f"body.{name} = {value.tolist()}: wanted finite and at least 0")
+    if body.softening is not None and not bool((body.softening.detach()[..., 1] > 0).all()):
+        raise ValueError("body.softening: a range of 0, wanted positive ranges")
     void = body.void_fraction
     if (
         void is not None
@@ -245,10 +260,10 @@ def check_weight(weight: Tensor, count: int) -> Tensor:
     return weight
 
 
-def check_start(start: Tensor, inputs: Inputs, wanted: tuple[int, ...], formulation: str) -> None:
+def check_start(start: object, inputs: Inputs, wanted: tuple[int, ...], formulation: str) -> Tensor:
     """Refuse a state to start from that is not one of this body and formulation, of the shape ``wanted``."""
     if not isinstance(start, Tensor):
-        raise ValueError(f"start: {type(start).__name__}, wanted a Trajectory or its final state")
+        raise ValueError(f"start: {type(start).__name__}, wanted a Trajectory or its final state, or a Start")
     like, elements = inputs.coefficients, inputs.prony.shape[1]
     if tuple(start.shape) != wanted:
         raise ValueError(
@@ -261,10 +276,16 @@ def check_start(start: Tensor, inputs: Inputs, wanted: tuple[int, ...], formulat
         )
     if not bool(torch.isfinite(start.detach()).all()):
         raise ValueError("start: a state with values that are not finite, wanted finite numbers")
+    return start
 
 
 def check_probes(probes: Tensor, count: int) -> None:
-    """Refuse probes that are not indices of particles."""
+    """Refuse probes that are not indices of particles, nor places."""
+    if probes.is_floating_point():
+        if probes.ndim != 2 or probes.shape[1] != 3 or not bool(torch.isfinite(probes).all()):
+            raise ValueError(f"probes: places of shape {tuple(probes.shape)}, wanted finite places [P, 3] m")
+        refuse_gradients(probes=probes)
+        return
     if probes.dtype != torch.int64 or probes.ndim != 1:
         raise ValueError(f"probes: {probes.dtype} of shape {tuple(probes.shape)}, wanted int64 [P]")
     if len(probes) and (int(probes.min()) < 0 or int(probes.max()) >= count):

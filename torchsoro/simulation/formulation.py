@@ -6,16 +6,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar, Literal, Protocol
 
+import torch
 from torch import Tensor
 
 from torchsoro.simulation.assembly import on_lattice
+from torchsoro.simulation.attachment import refuse_nodes
 from torchsoro.simulation.checkpoints import NODE_SHARE
 from torchsoro.simulation.contact import Plane, check_updated
-from torchsoro.simulation.courant import Courant, total_courant, updated_courant
+from torchsoro.simulation.courant import UNIFORM, Courant, total_courant, updated_courant
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached
 from torchsoro.simulation.material import Gas, Prony
 from torchsoro.simulation.ops.affine import velocity_gradient
+from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.scene import Inputs, Scene
 from torchsoro.simulation.ops.state import total_state, updated_state
 
@@ -36,6 +39,16 @@ class Formulation(Protocol):
     """Density of the air in a chamber unless another is given [kg/m3]."""
 
     @property
+    def limit(self) -> float | None:
+        """Largest Courant number of a step; ``STABLE_COURANT`` if None."""
+        ...
+
+    @property
+    def hollow(self) -> int:
+        """Number of chambers that hold no particles."""
+        ...
+
+    @property
     def blend(self) -> float:
         """0 for APIC, 1 for affine FLIP."""
         ...
@@ -46,6 +59,14 @@ class Formulation(Protocol):
 
     def check_planes(self, planes: Sequence[Plane]) -> None:
         """Refuse planes with gradients that are not computed (``ValueError``)."""
+        ...
+
+    def check_loads(self, attached: Attached) -> None:
+        """Refuse what the formulation cannot simulate (``ValueError``)."""
+        ...
+
+    def constant_forces(self, like: Tensor) -> bool:
+        """Whether forces that are constant since they begin are taken as such, where nothing has a gradient."""
         ...
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
@@ -61,6 +82,10 @@ class Formulation(Protocol):
 
     def initial(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
         """State of the undeformed body; ``moving`` is false where all velocities are zero."""
+        ...
+
+    def started(self, scene: Scene, displacement: Tensor, velocity: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """State of this shape without history, from displacements and velocities of the nodes [B, nodes, 3]."""
         ...
 
     def state_shape(self, scene: Scene, inputs: Inputs) -> tuple[int, ...]:
@@ -100,6 +125,16 @@ class Updated:
         """0 for APIC, 1 for affine FLIP."""
         return TRANSFERS[self.transfer]
 
+    @property
+    def limit(self) -> None:
+        """That of the measured bodies."""
+        return None
+
+    @property
+    def hollow(self) -> int:
+        """Every chamber holds particles."""
+        return 0
+
     def courant(self, attached: Attached, prony: Prony | None, dt: float, cell: float) -> Courant:
         """See :func:`torchsoro.simulation.stability.courant`."""
         return updated_courant(attached, prony, dt, cell)
@@ -107,6 +142,14 @@ class Updated:
     def check_planes(self, planes: Sequence[Plane]) -> None:
         """Planes are of the grid; the first one of each axis shifts it, which is the gradient by its offset."""
         check_updated(planes)
+
+    def check_loads(self, attached: Attached) -> None:
+        """There are no nodes to attach anything to."""
+        refuse_nodes(attached)
+
+    def constant_forces(self, like: Tensor) -> bool:
+        """Every step has its own."""
+        return False
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
         """Histories do not depend on the step."""
@@ -119,6 +162,10 @@ class Updated:
         """State [B, S, N]."""
         spin = velocity_gradient(x, velocity, origin=inputs.origin, cell=scene.cell) if moving else None
         return updated_state(x, velocity, inputs.prony.shape[1], affine=spin)
+
+    def started(self, scene: Scene, displacement: Tensor, velocity: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """The grid knows nothing of the body before a step."""
+        raise ValueError("start: a Start of nodes, wanted Body.velocity, or a state, in the updated formulation")
 
     def state_shape(self, scene: Scene, inputs: Inputs) -> tuple[int, ...]:
         """[B, S, N]."""
@@ -136,9 +183,15 @@ class Total:
 
     Attributes:
         lanes: Whether a CPU fills its vector registers, by kernels of its own; else it runs those of a GPU.
+        lattice: Of the body, whose ``places`` (those of ``index``) are the places of its particles: cells of any
+            width, with chambers that hold no particles, and nodes on its faces. If None, a uniform one around the
+            particles.
+        limit: Largest Courant number of a step; ``stability.STABLE_COURANT`` if None. A full lattice bears more.
     """
 
     lanes: bool = field(default=True, repr=False)
+    lattice: Lattice | None = field(default=None, repr=False)
+    limit: float | None = field(default=None, repr=False)
     name: ClassVar[FormulationName] = "total"
     air_density: ClassVar[float] = AIR
 
@@ -153,10 +206,26 @@ class Total:
 
     def courant(self, attached: Attached, prony: Prony | None, dt: float, cell: float) -> Courant:
         """See :func:`torchsoro.simulation.stability.courant`."""
-        return total_courant(attached, prony, dt, cell)
+        steep = UNIFORM / cell**2 if self.lattice is None else max(a.steep for a in self.lattice.axes)
+        return total_courant(attached, prony, dt, steep)
+
+    @property
+    def hollow(self) -> int:
+        """Those with walls."""
+        return 0 if self.lattice is None or self.lattice.walls is None else self.lattice.walls.count
 
     def check_planes(self, planes: Sequence[Plane]) -> None:
         """Every plane has all gradients."""
+
+    def check_loads(self, attached: Attached) -> None:
+        """Loads on nodes want the lattice whose nodes they are of."""
+        given = [load for load in attached.more if getattr(load, "particles", ...) is None]
+        if self.lattice is None and given:
+            raise ValueError(f"loads: a {type(given[0]).__name__} on nodes, wanted Total(lattice=...), or particles")
+
+    def constant_forces(self, like: Tensor) -> bool:
+        """In lanes."""
+        return self.lanes and not like.is_cuda
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
         """The state keeps Z = H - b S of a Maxwell element, and b depends on the step."""
@@ -168,13 +237,27 @@ class Total:
 
     def place(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, weight: Tensor) -> Placed:
         """To all points of the particles' lattice."""
-        return on_lattice(replace(scene, lanes=self.lanes), inputs, x, velocity, weight)
+        lattice = self.lattice
+        if lattice is None:
+            lattice = Lattice.around(x[0], scene.cell)
+        else:
+            lattice.check(x[0])
+        return on_lattice(replace(scene, lanes=self.lanes), inputs, x, velocity, weight, lattice)
 
     def initial(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
         """State [B, L]."""
         assert scene.lattice is not None
         present, elements = scene.kind != layout.ABSENT, inputs.prony.shape[1]
         return total_state(scene.lattice, x, velocity, present, elements, scene.softens)
+
+    def started(self, scene: Scene, displacement: Tensor, velocity: Tensor, shape: tuple[int, ...]) -> Tensor:
+        """State [B, L]."""
+        assert scene.lattice is not None
+        for name, t in (("displacement", displacement), ("velocity", velocity)):
+            if t.shape[1:] != (scene.lattice.nodes, 3):
+                raise ValueError(f"start.{name}: shape {tuple(t.shape)}, wanted [..., {scene.lattice.nodes}, 3]")
+        motion = torch.stack([displacement, velocity], 1).transpose(2, 3).flatten(1)
+        return torch.nn.functional.pad(motion, (0, shape[1] - motion.shape[1]))
 
     def state_shape(self, scene: Scene, inputs: Inputs) -> tuple[int, ...]:
         """[B, L]."""

@@ -1,10 +1,12 @@
-"""What is attached to groups of particles: forces, point masses, springs, drag; together a tube or a tip load.
+"""What is attached to groups of particles or nodes: forces, point masses, springs, drag, clamps; together a tube.
 
-A group shares its load equally, or by ``share`` [..., n], whose sum is 1.
+A group shares its load equally, or by ``share`` [..., n], whose sum is 1. Without ``particles`` a share is one of each
+node of the lattice, which ``Total(lattice=...)`` is told: so a load can be anywhere in the body.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -20,21 +22,37 @@ class Force:
     """A dead force on a group.
 
     Attributes:
-        particles: int64 indices [n].
+        particles: int64 indices [n]; None for nodes.
         value: [..., 3] N, constant; or [..., S, 3] with ``time``.
         time: [S] s, increasing; interpolated linearly.
-        share: Of each particle [n]; equal if None. No gradient flows to it.
+        share: Of each particle or node [n]; equal if None. No gradient flows to it.
+        start: Since when a constant force acts [s].
+
+    Raises:
+        ValueError: for neither particles nor a share, or a start that is not finite or stands beside ``time``.
     """
 
-    particles: Tensor
+    particles: Tensor | None = None
     value: Tensor
     time: Tensor | None = None
     share: Tensor | None = None
+    start: float = 0.0
 
-    def at(self, t: Tensor) -> Tensor:
-        """Force at times t [T]: [..., T, 3] N, in the type and on the device of ``value``."""
+    def __post_init__(self) -> None:
+        """Check the group and the start."""
+        _check_group(self)
+        if not math.isfinite(self.start) or (self.time is not None and self.start != 0):
+            raise ValueError(f"start = {self.start}: wanted a finite time of a force that is constant since then")
+
+    def first(self, dt: float) -> int:
+        """The first of the steps of ``dt`` [s] in which a constant force acts, however its start is rounded."""
+        return max(0, math.ceil(self.start / dt - 1e-3))
+
+    def at(self, t: Tensor, dt: float) -> Tensor:
+        """Force in the steps of ``dt`` [s] that begin at times t [T]: [..., T, 3] N, in the type of ``value``."""
         if self.time is None:
-            return self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
+            found = self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
+            return found * (t > (self.first(dt) - 0.5) * dt).to(found)[:, None]
         return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t.to(self.time)).transpose(-1, -2)
 
 
@@ -43,14 +61,21 @@ class PointMass:
     """A mass carried by a group, with inertia and weight.
 
     Attributes:
-        particles: int64 indices [n].
+        particles: int64 indices [n]; None for nodes.
         mass: [...] kg.
-        share: Of each particle [..., n]; equal if None.
+        share: Of each particle or node [..., n]; equal if None.
+
+    Raises:
+        ValueError: for neither particles nor a share.
     """
 
-    particles: Tensor
+    particles: Tensor | None = None
     mass: Tensor | float
     share: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        """Check the group."""
+        _check_group(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,16 +83,31 @@ class Spring:
     """A spring from each particle of a group to its place plus ``shift``; together of the given stiffness.
 
     Attributes:
-        particles: int64 indices [n].
+        particles: int64 indices [n]; None for nodes, with ``mean``.
         stiffness: [...] N/m of the whole group.
-        shift: [..., 3] m from the reference place to the rest point.
-        share: Of each particle [..., n]; equal if None.
+        shift: [..., 3] m from the reference place to the rest point; not with ``mean``.
+        share: Of each particle or node [..., n]; equal if None. Without a gradient with ``mean``.
+        mean: Whether there is one spring, from the group's mean place to where that is in the undeformed body: the
+            group is free to turn and to deform about it. Total formulation only. Its stiffness sets no limit to the
+            step that the simulator knows of: on nodes of little mass a stiff one needs a smaller step.
+
+    Raises:
+        ValueError: for neither particles nor a share, nodes without ``mean``, or a shift with it.
     """
 
-    particles: Tensor
+    particles: Tensor | None = None
     stiffness: Tensor | float
     shift: Tensor | None = None
     share: Tensor | None = None
+    mean: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the group."""
+        _check_group(self)
+        if self.particles is None and not self.mean:
+            raise ValueError("mean = False: a spring on nodes, wanted mean = True, or particles")
+        if self.mean and self.shift is not None:
+            raise ValueError("shift: beside mean = True, wanted a spring to the mean place in the undeformed body")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -75,17 +115,53 @@ class Drag:
     """Linear drag on a group.
 
     Attributes:
-        particles: int64 indices [n].
+        particles: int64 indices [n]; None for nodes.
         coefficient: [...] N s/m of the whole group.
-        share: Of each particle [..., n]; equal if None.
+        share: Of each particle or node [..., n]; equal if None.
+
+    Raises:
+        ValueError: for neither particles nor a share.
     """
 
-    particles: Tensor
+    particles: Tensor | None = None
     coefficient: Tensor | float
     share: Tensor | None = None
 
+    def __post_init__(self) -> None:
+        """Check the group."""
+        _check_group(self)
 
-Load = Force | PointMass | Spring | Drag
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class QuadraticDrag:
+    """What surrounds the body resists by c/2 A v |v| along each axis, on the area A of its undeformed faces across it.
+
+    Of a lattice with ``faces`` only. Several add up.
+
+    Attributes:
+        coefficient: c = density times drag coefficient [...] kg/m3.
+    """
+
+    coefficient: Tensor | float
+
+
+@dataclass(frozen=True)
+class Clamp:
+    """Holds the nodes of the lattice in a box of the undeformed body; total formulation only.
+
+    The outermost nodes lie on the body's faces if the lattice is one with open knots (``Axis``), and half a cell in
+    front of them if it is uniform.
+
+    Attributes:
+        low: Lower corner [m].
+        high: Upper corner [m].
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+Load = Force | PointMass | Spring | Drag | QuadraticDrag | Clamp
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,8 +173,9 @@ class Attached:
         spring: [..., N] N/m, or None without springs and drag.
         anchor: [..., N, 3] m, or None.
         drag: [..., N] N s/m, or None.
-        forces: The forces, one group each.
-        share: [groups, N].
+        forces: The forces, one group each; those on particles come first.
+        share: [groups, N] of those on particles.
+        more: What is attached to nodes or acts on means, as it was given: springs, point masses, drag, clamps.
     """
 
     body: Body
@@ -107,6 +184,7 @@ class Attached:
     drag: Tensor | None
     forces: tuple[Force, ...]
     share: Tensor
+    more: tuple[Load, ...] = ()
 
 
 def attach(body: Body, loads: Sequence[Load]) -> Attached:
@@ -126,11 +204,18 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
     mass, spring = body.mass, x.new_zeros(count)
     drag = x.new_zeros(count) if body.drag is None else body.drag
     anchor = body.position
-    forces = tuple(load for load in loads if isinstance(load, Force))
+    forces = [load for load in loads if isinstance(load, Force)]
+    forces.sort(key=lambda force: force.particles is None)
     shares = [x.new_zeros(0, count)]
     held = torch.zeros(count, dtype=torch.bool, device=x.device)
+    more = tuple(load for load in loads if _elsewhere(load))
+    loads = [load for load in loads if not _elsewhere(load)]
+    for force in forces:
+        _check_vector("force", force.value)
     for load in loads:
-        group = _shares(load.particles, load.share, count, x)
+        assert not isinstance(load, QuadraticDrag | Clamp)
+        assert load.particles is not None
+        group = group_shares(load.particles, load.share, count, x)
         if isinstance(load, Force):
             if group.ndim > 1:
                 raise ValueError(f"share of a force: shape {tuple(group.shape[:-1])} of a batch, wanted [n]")
@@ -140,17 +225,16 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
                     "of the group have gradients by their values"
                 )
             shares.append(group.unsqueeze(0))
-            _check_vector("force", load.value)
         elif isinstance(load, PointMass):
-            mass = mass + _amount("mass", load.mass, x).unsqueeze(-1) * group
+            mass = mass + load_amount("mass", load.mass, x).unsqueeze(-1) * group
         elif isinstance(load, Drag):
-            drag = drag + _amount("drag coefficient", load.coefficient, x).unsqueeze(-1) * group
+            drag = drag + load_amount("drag coefficient", load.coefficient, x).unsqueeze(-1) * group
         else:
             there = (group > 0).reshape(-1, count).any(0)
             if bool((held & there).any()):
                 raise ValueError("springs: two groups share a particle, wanted groups apart from each other")
             held |= there
-            spring = spring + _amount("stiffness", load.stiffness, x).unsqueeze(-1) * group
+            spring = spring + load_amount("stiffness", load.stiffness, x).unsqueeze(-1) * group
             if load.shift is not None:
                 _check_vector("spring shift", load.shift)
                 place = there.to(x).unsqueeze(-1)
@@ -161,12 +245,23 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
         spring=None if loose else spring,
         anchor=None if loose else anchor,
         drag=None if loose else drag,
-        forces=forces,
+        forces=tuple(forces),
         share=torch.cat(shares),
+        more=more,
     )
 
 
-def _shares(particles: Tensor, share: Tensor | None, count: int, like: Tensor) -> Tensor:
+def _elsewhere(load: Load) -> bool:
+    """Whether a load is not on particles, each by itself."""
+    return isinstance(load, QuadraticDrag | Clamp) or load.particles is None or (isinstance(load, Spring) and load.mean)
+
+
+def _check_group(load: Force | PointMass | Spring | Drag) -> None:
+    if load.particles is None and load.share is None:
+        raise ValueError("particles, share: neither, wanted particles, or a share of each node")
+
+
+def group_shares(particles: Tensor, share: Tensor | None, count: int, like: Tensor) -> Tensor:
     """Each particle's share of a group [..., N]."""
     if particles.dtype != torch.int64:
         raise ValueError(f"particles: {particles.dtype}, wanted int64 indices")
@@ -198,7 +293,8 @@ def _check_vector(name: str, value: Tensor) -> None:
         raise ValueError(f"{name} = {value.tolist()}: wanted finite numbers")
 
 
-def _amount(name: str, value: Tensor | float, like: Tensor) -> Tensor:
+def load_amount(name: str, value: Tensor | float, like: Tensor) -> Tensor:
+    """A mass, stiffness or coefficient [...] in the type of ``like``; refuses what is negative or not finite."""
     number = torch.as_tensor(value, dtype=like.dtype, device=like.device)
     if not bool((torch.isfinite(number.detach()) & (number.detach() >= 0)).all()):
         raise ValueError(f"{name} = {value}: wanted finite and at least 0")

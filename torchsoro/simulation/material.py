@@ -153,13 +153,15 @@ class Prony:
         """Number of Maxwell elements."""
         return self.moduli.shape[-1]
 
-    def discrete(self, dt: float) -> Tensor:
+    def discrete(self, dt: float | Tensor) -> Tensor:
         """Numbers of the exact-exponential update [..., M, 3]: a = exp(-dt/tau), b = (1 - a) tau / dt, g.
+
+        A step for each simulation is a tensor [..., 1].
 
         H <- a H + b (S_new - S_old) integrates Eq. 8 exactly for a strain that changes linearly in a step.
         """
         ratio = dt / self.times
-        return torch.stack([torch.exp(-ratio), -torch.expm1(-ratio) / ratio, self.moduli], dim=-1)
+        return torch.stack([torch.exp(-ratio), -torch.expm1(-ratio) / ratio, self.moduli.expand_as(ratio)], dim=-1)
 
     def storage_loss(self, omega: Tensor) -> tuple[Tensor, Tensor]:
         """Storage and loss modulus over the equilibrium modulus at angular frequencies [rad/s] (Eqs. 17a, 17b)."""
@@ -167,7 +169,7 @@ class Prony:
         part = self.moduli * wt / (1 + wt * wt)
         return 1 + (part * wt).sum(-1), part.sum(-1)
 
-    def step_moduli(self, dt: float) -> Tensor:
+    def step_moduli(self, dt: float | Tensor) -> Tensor:
         """What an oscillation that changes sign at every step of dt feels of each element [..., M]: g b 2 / (1 + a)."""
         a, b, g = self.discrete(dt).detach().unbind(-1)
         return g * b * 2 / (1 + a)
@@ -194,6 +196,12 @@ class Body:
         drag: Drag coefficient [..., N] N s/m; 0 if None.
         stiffening: a and b of a solid, by which mu grows to mu (1 + a x + b x^2) at x = I1b - 3 (see :class:`Solid`)
             [..., N, 2], of any sign; 0 if None, which is neo-Hookean. The Maxwell elements stiffen alike.
+        softening: Depth d and range r of a solid that is softer below its largest stretch so far (Mullins): of mu only
+            1 - d u / (u + r) is left, where u is by how much x is less than its largest [..., 2]; none if None.
+            Total formulation only.
+        air_stiffness: Pressure that the air in each hollow chamber of the lattice loses as its volume doubles
+            [..., hollow chambers] Pa; 0 if None. Hollow chambers hold no particles, and follow in number those that do.
+            Total formulation only.
     """
 
     position: Tensor
@@ -208,6 +216,8 @@ class Body:
     void_fraction: Tensor | None = None
     drag: Tensor | None = None
     stiffening: Tensor | None = None
+    softening: Tensor | None = None
+    air_stiffness: Tensor | None = None
 
 
 def value_of(name: str, number: Number) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Literal
 
 import torch
@@ -21,45 +21,19 @@ from torchsoro.simulation.assembly import (
     gravity_at,
     supply_at,
 )
+from torchsoro.simulation.attachment import held_still, on_nodes
 from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.formulation import Formulation, FormulationName, formulation_of
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
+from torchsoro.simulation.ops.markers import Markers
 from torchsoro.simulation.ops.rollout import refuse_transforms, rollout
 from torchsoro.simulation.ops.scene import Inputs, Scene
 from torchsoro.simulation.stability import STABLE_COURANT, courant, stable_step
 from torchsoro.simulation.tracing import uncompiled
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Trajectory:
-    """Recorded motion; with a leading batch if any argument of the simulation had one.
-
-    Attributes:
-        time: [S] s, from the start of the first of the runs that went on from each other.
-        position: Probes [..., S, P, 3] m.
-        velocity: Probes [..., S, P, 3] m/s.
-        center_of_gravity: [..., S, 3] m, weighted by ``weight`` of the call.
-        center_velocity: [..., S, 3] m/s.
-        chamber_volume: Gas volume of each chamber [..., S, chambers] m3.
-        chamber_pressure: Mean gas pressure (Eq. 10) of each chamber [..., S, chambers] Pa.
-        probes: int64 [P] particle indices.
-        final: Last state, in the layout of the formulation. A later run goes on from the trajectory (``start``).
-        dt: Substep [s].
-    """
-
-    time: Tensor
-    position: Tensor
-    velocity: Tensor
-    center_of_gravity: Tensor
-    center_velocity: Tensor
-    chamber_volume: Tensor
-    chamber_pressure: Tensor
-    probes: Tensor
-    final: Tensor
-    dt: float
+from torchsoro.simulation.trajectory import Start, Trajectory
 
 
 class Simulator(nn.Module):
@@ -141,7 +115,8 @@ class Simulator(nn.Module):
         sample_every: float | None = None,
         probes: Tensor | None = None,
         weight: Tensor | None = None,
-        start: Trajectory | Tensor | None = None,
+        start: Trajectory | Tensor | Start | None = None,
+        divergence: Literal["raise", "mark"] = "raise",
         progress: Callable[[int, int], None] | None = None,
     ) -> Trajectory:
         """Simulate.
@@ -150,16 +125,20 @@ class Simulator(nn.Module):
             body: Particles; leading axes are a batch of independent simulations, as are those of the arguments below.
             duration: [s], a whole number of substeps.
             prony: Maxwell elements of the solids.
-            pressure: Gauge pressure p_act of the chambers [..., chambers, S], or [S] for a single chamber.
+            pressure: Gauge pressure p_act of the chambers [..., chambers, S], or [S] for a single chamber; those of
+                particles first, then hollow ones.
             gravity: [..., 3] m/s2; or a pair of times [S] and values [..., S, 3], interpolated linearly.
             planes: Ground and walls.
-            loads: Forces, point masses, springs and drag.
+            loads: Forces, point masses, springs, drag and clamps.
             sample_every: Time between two samples [s], a whole number of substeps; about a hundred samples if None.
-            probes: Particles to record, int64 [P]; none if None.
+            probes: Particles to record, int64 [P]; or places of the undeformed body, floating point [P, 3] m, which
+                move with the nearest place of it (total formulation only); none if None.
             weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None.
             start: Trajectory to go on from, in state and time: pressure, gravity, forces and samples continue at its
-                last time. Or a state alone (``Trajectory.final``), with which time begins at zero. The undeformed body
-                at time zero if None.
+                last time. Or a state alone (``Trajectory.final``), or a ``Start`` of the nodes, with which time begins
+                at zero. The undeformed body at time zero if None.
+            divergence: Whether a simulation that diverges raises, or is marked (``Trajectory.sound``) while the others
+                of the batch go on as they would without it; in lanes of a CPU only, without a gradient.
             progress: Called between stretches of the simulation, up to a hundred without a gradient, with the substeps
                 that are done and their number in all.
 
@@ -175,6 +154,8 @@ class Simulator(nn.Module):
         refuse_gradients(duration=duration, sample_every=sample_every)
         if self.dt != "auto":
             steps, every = _steps(duration, sample_every, self.dt)
+        if divergence not in ("raise", "mark"):
+            raise ValueError(f"divergence = {divergence!r}: wanted 'raise' or 'mark'")
         check_body(body)
         self.formulation.check_planes(planes)
         if start is None:
@@ -182,39 +163,86 @@ class Simulator(nn.Module):
         dt = self.step(body, prony, duration=duration, sample_every=sample_every, loads=loads)
         steps, every = _steps(duration, sample_every, dt)
         attached = attach(body, loads)
+        self.formulation.check_loads(attached)
         body = attached.body
 
-        state = start.final if isinstance(start, Trajectory) else start
         began, times = self._clock(start, steps, dt, prony)
         times = times.to(x.device)
         maxwell = x.new_zeros(0, 3) if prony is None else prony.discrete(dt).to(x)
         mass = body.mass if weight is None else check_weight(weight, x.shape[-2]).to(x)
         where = x.new_zeros(0, dtype=torch.int64) if probes is None else probes.to(x.device)
         check_probes(where, x.shape[-2])
-
+        constant = attached.forces and all(force.time is None for force in attached.forces)
         lead, whole, wide = assemble(
             attached,
             prony=maxwell,
-            pressure=supply_at(body, pressure, times).to(x),
+            pressure=supply_at(body, self.formulation.hollow, pressure, times).to(x),
             gravity=gravity_at(gravity, times[:-1]).to(x),
             planes=planes,
-            forces=[force.at(times[:-1]).to(x) for force in attached.forces],
+            forces=[(f.value.unsqueeze(-2) if constant else f.at(times[:-1], dt)).to(x) for f in attached.forces],
             weight=mass,
             low=self.low,
+            others=[(start.displacement, 2), (start.velocity, 2)] if isinstance(start, Start) else [],
         )
-        scene = self._scene(attached, planes, where, dt)
+        scene = self._scene(attached, planes, where[:0].long() if where.is_floating_point() else where, dt)
+        scene = replace(scene, apart=divergence == "mark")
         velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
         x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
         scene, whole, x, velocity, weights = self.formulation.place(scene, whole, x, velocity, weights)
-        if state is None:
+        if scene.lattice is not None:
+            scene, whole = on_nodes(scene, whole, attached, wide)
+        if where.is_floating_point():
+            if scene.lattice is None:
+                raise ValueError("probes: places, wanted particles in the updated formulation")
+            scene = replace(scene, markers=Markers.at(scene.lattice, scene.kind, where))
+        shape = self.formulation.state_shape(scene, whole)
+        if start is None:
             state = self.formulation.initial(scene, whole, x, velocity, moving=body.velocity is not None)
+        elif isinstance(start, Start):
+            state = self.formulation.started(scene, wide(start.displacement, 2), wide(start.velocity, 2), shape).to(x)
         else:
-            shape = self.formulation.state_shape(scene, whole)
-            check_start(state, whole, shape, self.formulation.name)
+            found = start.final if isinstance(start, Trajectory) else start
+            state = check_start(found, whole, shape, self.formulation.name)
+        state = held_still(scene, state, continued=isinstance(start, Trajectory | Tensor))
+        if constant:
+            firsts = tuple(force.first(dt) for force in attached.forces)
+            scene, whole = self._forces(scene, whole, firsts, began, [state, weights])
         samples = sorted({*range(0, steps + 1, every), steps})
         observed, final = self._integrate(scene, whole, state, weights, samples, began, progress)
         shaped = [s.movedim(0, 1).reshape(*lead, *s.shape[:1], *s.shape[2:]) for s in observed]
-        return Trajectory(time=times[torch.tensor(samples)], **_named(shaped), probes=where, final=final, dt=dt)
+        named = _named(shaped)
+        return Trajectory(
+            time=times[torch.tensor(samples)],
+            **named,
+            probes=where,
+            sound=self._sound(named, len(lead)),
+            final=final,
+            dt=dt,
+        )
+
+    def _forces(
+        self, scene: Scene, inputs: Inputs, firsts: tuple[int, ...], began: int, others: Sequence[Tensor]
+    ) -> tuple[Scene, Inputs]:
+        """Forces that are constant from a substep of the run on, with a row for each of this one if they need it."""
+        tensors = [*others, *(getattr(inputs, f.name) for f in fields(inputs))]
+        gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+        if not gradient and self.formulation.constant_forces(inputs.coefficients):
+            return replace(scene, force_start=firsts), inputs
+        force, steps = inputs.force, began + torch.arange(len(inputs.gravity), device=inputs.force.device)
+        rows = force.expand(len(steps), *force.shape[1:])
+        if max(firsts) > began:
+            acts = steps[:, None] >= torch.tensor(firsts, device=force.device)
+            rows = rows * acts[:, None, :, None].to(force)
+        return scene, replace(inputs, force=rows)
+
+    def _sound(self, recorded: dict[str, Tensor], lead: int) -> Tensor:
+        """Which simulations [...] recorded finite numbers only, and places inside of the box."""
+        found = torch.stack([torch.isfinite(t.detach()).flatten(lead).all(lead) for t in recorded.values()]).all(0)
+        for name in ("position", "center_of_gravity"):
+            x = recorded[name].detach()
+            inside = (x > x.new_tensor(self.low)) & (x < x.new_tensor(self.high))
+            found &= inside.flatten(lead).all(lead)
+        return found
 
     def _scene(self, attached: Attached, planes: Sequence[Plane], probes: Tensor, dt: float) -> Scene:
         """Constant data of the run, by particle."""
@@ -273,7 +301,7 @@ class Simulator(nn.Module):
                 whole,
                 pressure=whole.pressure[first : last + 1],
                 gravity=whole.gravity[first:last],
-                force=whole.force[first:last],
+                force=whole.force[first:last] if scene.force_start is None else whole.force,
             )
             state, *seen = rollout(scene, cut, state, weight, first=began + first, samples=inside, keep=keep)
             parts.append(tuple(seen))
@@ -282,7 +310,7 @@ class Simulator(nn.Module):
         return [torch.cat(each) for each in zip(*parts, strict=True)], state
 
     def _clock(
-        self, start: Trajectory | Tensor | None, steps: int, dt: float, prony: Prony | None
+        self, start: Trajectory | Tensor | Start | None, steps: int, dt: float, prony: Prony | None
     ) -> tuple[int, Tensor]:
         """Substeps before the first, and the times at all substeps and after the last [steps + 1] s, float64."""
         count = torch.arange(steps + 1, dtype=torch.float64)
@@ -333,11 +361,12 @@ class Simulator(nn.Module):
             each = duration / 100 if sample_every is None else sample_every
             return each / math.ceil(each / limit)
         found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation, loads=loads)
-        if found.number > STABLE_COURANT:
-            limit = self.dt * STABLE_COURANT / found.number
+        most = self.formulation.limit or STABLE_COURANT
+        if found.number > most:
+            limit = self.dt * most / found.number
             raise ValueError(
                 f"dt = {self.dt:g} s: above the limit of about {limit:.3g} s, set by {found.term} "
-                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {STABLE_COURANT})"
+                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {most})"
             )
         return self.dt
 
@@ -346,6 +375,7 @@ def _named(seen: list[Tensor]) -> dict[str, Tensor]:
     names = (
         "position",
         "velocity",
+        "deformation",
         "center_of_gravity",
         "center_velocity",
         "chamber_volume",

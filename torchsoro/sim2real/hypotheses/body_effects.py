@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
-from torchsoro.sim2real.twin.scenario import NodalSpring, Scenario
+from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
 
@@ -172,7 +173,7 @@ class AttachedMass(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Mass at the place."""
-        return scenario.replace(point_mass=scenario.point_mass + values[:, :1] * twin.at(values[:, 1:]))
+        return scenario.plus(PointMass(share=twin.at(values[:, 1:]), mass=values[:, 0]))
 
 
 class LoadInertia(Hypothesis):
@@ -184,12 +185,16 @@ class LoadInertia(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """A share of the force becomes the weight of a mass."""
-        mass, forces = scenario.point_mass, []
         size = scenario.gravity.norm(dim=-1).amax()
-        for force in scenario.forces:
-            mass = mass + values * force.value.norm(dim=-1).amax() / size * force.share
-            forces.append(dataclasses.replace(force, value=force.value * (1 - values)))
-        return scenario.replace(point_mass=mass, forces=tuple(forces))
+        masses, loads = [], []
+        for load in scenario.loads:
+            if isinstance(load, Force):
+                mass = values[:, 0] * load.value.norm(dim=-1).amax() / size
+                masses.append(PointMass(share=load.share, mass=mass))
+            loads.append(
+                dataclasses.replace(load, value=load.value * (1 - values)) if isinstance(load, Force) else load
+            )
+        return scenario.replace(loads=(*loads, *masses))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With loads that are there from the start and point down, as weights do."""
@@ -223,7 +228,8 @@ class Tether(Hypothesis):
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The spring is at rest in the undeformed body."""
         share = twin.at(values[:, 3:])
-        spring = NodalSpring(share=share, stiffness=values[:, 0])
-        drag = scenario.drag + values[:, 1:2] * share
-        mass = scenario.point_mass + values[:, 2:3] * share
-        return scenario.replace(springs=(*scenario.springs, spring), drag=drag, point_mass=mass)
+        return scenario.plus(
+            Spring(share=share, stiffness=values[:, 0], mean=True),
+            Drag(share=share, coefficient=values[:, 1]),
+            PointMass(share=share, mass=values[:, 2]),
+        )

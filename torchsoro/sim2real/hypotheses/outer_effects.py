@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
-from torchsoro.sim2real.twin.scenario import ObliquePlane, Scenario
+from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.loads import QuadraticDrag
 
 
 class PressureGain(Hypothesis):
@@ -149,7 +151,7 @@ class FluidDrag(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Force rho c_d / 2 A v |v| along each axis."""
-        return scenario.replace(quadratic_drag=scenario.quadratic_drag + values[:, 0])
+        return scenario.plus(QuadraticDrag(coefficient=values[:, 0]))
 
 
 class Sliding(Hypothesis):
@@ -244,7 +246,7 @@ class WallOffset(Hypothesis):
         return bool(scenario.planes)
 
 
-def _planes(scenario: Scenario, change: Callable[[ObliquePlane], Mapping[str, Tensor | str]]) -> Scenario:
+def _planes(scenario: Scenario, change: Callable[[Plane], Mapping[str, Tensor | str | float]]) -> Scenario:
     """A scenario with other numbers for its planes."""
     return scenario.replace(planes=tuple(dataclasses.replace(g, **change(g)) for g in scenario.planes))
 
@@ -285,7 +287,7 @@ class InitialMotion(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Of the whole body; for a clamped one, as of its farthest points, less near the clamp."""
-        shape = torch.ones(twin.grid.nodes, dtype=torch.float64)
+        shape = torch.ones(twin.nodes, dtype=torch.float64)
         for axis, side in twin.faces:
             shape = shape * (twin.depth(twin.places, axis, side) / twin.setup.size[axis]).clamp(0, 1) ** 2
         return scenario.replace(velocity=scenario.velocity + values[:, None, :] * shape[:, None])

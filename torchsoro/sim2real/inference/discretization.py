@@ -15,8 +15,8 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.twin import MarkerTrajectory
+from torchsoro.sim2real.twin.batch import THREADS, simulate
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
 GAP = 2e-5  # distance by which planes are moved to see how much the moment of contact matters [m]
@@ -28,9 +28,10 @@ FLOOR = 0.003  # least error of a twin over the size of the motion
 
 def measure(
     experiment: Experiment,
-    ensemble: Ensemble,
-    fine: Ensemble,
+    twin: Twin,
+    fine: Twin,
     *,
+    threads: int = THREADS,
     report: Callable[[str], None] = lambda line: None,
 ) -> DiscretizationError:
     """Compare twin and finer twin at the setup as stated, with measurement errors, modulus and pressure fitted.
@@ -40,26 +41,27 @@ def measure(
 
     Args:
         experiment: What is to be explained, with trials that are only predicted.
-        ensemble: Of the twin in use.
-        fine: Of another.
+        twin: In use.
+        fine: Another, with smaller cells.
+        threads: That simulate.
         report: Called with a line after each batch of simulations.
     """
-    setup, twin = experiment.setup, ensemble.twin
+    setup = experiment.setup
     trials = tuple(t for t in experiment.trials if t.recording is not None)
     everything = (*trials, *(t for t in experiment.heldout if t.recording is not None))
-    common = {"noise": 1e-4, "report": report}
+    common = {"noise": 1e-4, "report": report, "threads": threads}
     there = FitProblem(experiment, fine, trials=everything, **common)
     other = [_as_simulated(motion, t) for motion, t in zip(_believed(there), everything, strict=True)]
-    here = FitProblem(experiment, ensemble, trials=trials, priors=EXACT, **common)
+    here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors)
     shifted = DiscretizationError(shift=shift)
-    own = _believed(FitProblem(experiment, ensemble, trials=everything, discretization=shifted, **common))
+    own = _believed(FitProblem(experiment, twin, trials=everything, discretization=shifted, **common))
     correction = added(everything, own, other)
-    here = FitProblem(experiment, ensemble, trials=trials, **common)
+    here = FitProblem(experiment, twin, trials=trials, **common)
     # The error falls with the square of the cell size, which gives that of the finer twin from the difference of the
     # two; impacts on planes do not converge at that order, so that there the whole difference counts.
-    ratio = max((fine.twin.count / twin.count) ** (1 / 3), 1.1)
+    ratio = max((fine.count / twin.count) ** (1 / 3), 1.1)
     smooth = 1 / (ratio**2 - 1)
     shares = [OWN if t.simulated else 1.0 if s.planes else smooth for t, s in zip(trials, here.scenarios, strict=True)]
     deviations = [_apart(here, other[: len(trials)], shares)]
@@ -72,12 +74,12 @@ def measure(
         shared = math.sqrt(float((left**2).mean()))
         moved = math.sqrt(float(((seen - seen[:1]) ** 2).mean()))
         found[trial.name] = np.maximum(left, max(shared / 2, FLOOR * moved))
-    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.chambers else t.walls for t in (twin, fine.twin))
+    thinnest = tuple(min(a.cells for a in t.grid.axes) if not setup.chambers else t.walls for t in (twin, fine))
     return DiscretizationError(
         deviation=found,
         shift=shift,
         correction=correction,
-        edges=(twin.edge, fine.twin.edge),
+        edges=(twin.edge, fine.edge),
         walls=thinnest,
     )
 
@@ -95,7 +97,7 @@ def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
         )
         for s in here.scenarios
     ]
-    motions = here.ensemble(moved)
+    motions = simulate(here.twin, moved, threads=here.threads)
     # A trial without planes moves in one way only.
     return [[m.alone(min(k, len(m.position) - 1)) for m in motions] for k in range(2)]
 

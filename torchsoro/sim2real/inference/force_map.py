@@ -11,14 +11,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.histories import Solution, chi2_of, simulate, solve
-from torchsoro.sim2real.twin.scenario import NodalForce, Scenario
+from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.simulation.loads import Force
 
 SMALL = 1e-3  # of the body's length, by which a force bends it for its response to be measured
 PASSES = 3  # of simulations at most: the response to forces is not quite linear
@@ -51,8 +51,7 @@ class StepForce(Hypothesis):
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """One more force."""
-        force = NodalForce(share=self.share, value=values, start=self.start * scenario.duration)
-        return scenario.replace(forces=(*scenario.forces, force))
+        return scenario.plus(Force(share=self.share, value=values, start=self.start * scenario.duration))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -168,7 +167,7 @@ def patches(twin: Twin, count: int) -> tuple[np.ndarray, list[Tensor]]:
     for begin, end in itertools.pairwise(edges):
         one, other = low.copy(), low + size
         one[longest], other[longest] = begin, end
-        shares.append(torch.from_numpy(twin.grid.within((one.tolist(), other.tolist()))))
+        shares.append(twin.grid.within((one.tolist(), other.tolist())))
     return places, shares
 
 

@@ -6,7 +6,6 @@ The recorded coordinates do not enter. Responses are simulated at the setup as s
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -85,7 +84,7 @@ def isolability(
     asked = [
         ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
     ]
-    problem = problem.only(problem.trials, ensemble=dataclasses.replace(problem.ensemble, even=True))
+    problem = problem.only(problem.trials, even=True)
     base, *found = problem.simulate([((), still), *asked])
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)

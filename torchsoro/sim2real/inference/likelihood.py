@@ -20,7 +20,7 @@ from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
 from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel, Priors
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.ensemble import Ensemble
+from torchsoro.sim2real.twin.batch import THREADS, simulate
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
@@ -64,7 +64,7 @@ class Likelihood:
 
     Attributes:
         experiment: What to explain.
-        ensemble: Of its twin.
+        twin: Its body.
         trials: To fit, with a recording each; those of the experiment if none are given.
         discretization: The twin's own error.
         tolerances: Of modulus and pressure.
@@ -72,13 +72,15 @@ class Likelihood:
         noise: [m]; that of the setup, or estimated, if 0 is given.
         lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
         slips: Markers that have slipped.
-        fine: Of a finer twin, for :meth:`corrected`.
+        fine: A finer twin, for :meth:`corrected`.
+        threads: That simulate.
+        even: Whether all simulations of a call take the same time step, so that its error cancels in differences.
         report: Called with a line after each batch of simulations.
         tally: Of all simulations of this and of what is derived from it.
     """
 
     experiment: Experiment
-    ensemble: Ensemble
+    twin: Twin
     _: KW_ONLY
     trials: tuple[Trial, ...] = ()
     discretization: DiscretizationError = field(default_factory=DiscretizationError)
@@ -87,7 +89,9 @@ class Likelihood:
     noise: float = 0.0
     lasting: float = LASTING
     slips: tuple[MarkerSlip, ...] = ()
-    fine: Ensemble | None = None
+    fine: Twin | None = None
+    threads: int = THREADS
+    even: bool = False
     report: Callable[[str], None] = _silent
     tally: Tally = field(default_factory=Tally)
 
@@ -102,11 +106,6 @@ class Likelihood:
             ("discretization", self.discretization.among(trials)),
         ):
             object.__setattr__(self, name, value)
-
-    @property
-    def twin(self) -> Twin:
-        """The body."""
-        return self.ensemble.twin
 
     @cached_property
     def observation(self) -> ObservationModel:
@@ -146,7 +145,7 @@ class Likelihood:
         return np.array(self.discretization.shift or [0.0] * len(self.common))
 
     def only(self, trials: Sequence[Trial], **changes: Any) -> Self:
-        """The same of other trials, with other slips, another ensemble, or another error of the twin."""
+        """The same of other trials, with other slips, another twin, or another error of the twin."""
         return dataclasses.replace(self, trials=tuple(trials), **changes)
 
     def corrected(self, at: np.ndarray) -> Self:
@@ -171,7 +170,7 @@ class Likelihood:
         trials = [t for t in trials if t.name not in self.stated]
         if self.fine is None or not trials:
             return [{} for _ in points]
-        there = type(self)(self.experiment, self.fine, trials=tuple(trials), noise=self.noise)
+        there = type(self)(self.experiment, self.fine, trials=tuple(trials), noise=self.noise, threads=self.threads)
         bare = self.only(trials, discretization=self.discretization.replace(correction={}, own={}))
         coarse = bare.simulate(points)
         return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]
@@ -246,7 +245,7 @@ class Likelihood:
         varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
         count = len(self.scenarios)
         found = []
-        for k, motion in enumerate(self.ensemble(varied)):
+        for k, motion in enumerate(simulate(self.twin, varied, threads=self.threads, even=self.even)):
             error, name = self.discretization, self.trials[k % count].name
             known = error.own.get(requests[k // count][0], error.correction)
             found.append(motion.plus(known[name]) if name in known else motion)

@@ -20,7 +20,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
 from torchsoro.sim2real.inference.fit import Fit
-from torchsoro.sim2real.twin.ensemble import THREADS, Ensemble
+from torchsoro.sim2real.twin.batch import THREADS, simulate
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.storage import atomic_write
@@ -152,7 +152,7 @@ def predict_trial(model: Model, trial: Path, source: Path, threads: int = THREAD
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
     twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
-    motion = Ensemble(twin, threads)([model.apply(twin.scenario(told), twin)])[0].alone()
+    motion = simulate(twin, [model.apply(twin.scenario(told), twin)], threads=threads)[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
     axes = told.setup.axes

@@ -81,7 +81,9 @@ def next_experiment(problem: FitProblem, one: Explained, other: Explained) -> li
     trials = list({id(c.trial): c.trial for c in choices}.values())
     wide = FitProblem(
         dataclasses.replace(problem.experiment, setup=marked),
-        dataclasses.replace(problem.ensemble, twin=dataclasses.replace(problem.twin, setup=marked), even=True),
+        dataclasses.replace(problem.twin, setup=marked),
+        threads=problem.threads,
+        even=True,
         trials=tuple(_timed(dataclasses.replace(t, setup=_marked(t.setup, extra)), t) for t in trials),
         discretization=DiscretizationError(shift=problem.discretization.shift),
         tolerances=problem.tolerances,
@@ -248,7 +250,7 @@ def _first(motion: MarkerTrajectory, markers: int) -> MarkerTrajectory:
         motion,
         position=motion.position[..., :markers, :],
         velocity=motion.velocity[..., :markers, :],
-        gradient=motion.gradient[..., :markers, :, :],
+        deformation=motion.deformation[..., :markers, :, :],
     )
 
 

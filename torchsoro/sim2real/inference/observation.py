@@ -171,5 +171,5 @@ def _at(motion: MarkerTrajectory, time: np.ndarray, beside: np.ndarray) -> tuple
     course = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     last = np.clip(np.searchsorted(motion.time, time, side="right") - 1, 0, len(motion.time) - 2)
     s = ((time - motion.time[last]) / (motion.time[last + 1] - motion.time[last]))[:, None, None, None]
-    gradient = (1 - s) * motion.gradient[last] + s * motion.gradient[last + 1]
+    gradient = (1 - s) * motion.deformation[last] + s * motion.deformation[last + 1]
     return course(time) + np.einsum("tmij,mj->tmi", gradient, beside), course(time, 1), gradient

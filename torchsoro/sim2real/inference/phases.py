@@ -263,7 +263,7 @@ def _contacts(trial: Trial, motion: MarkerTrajectory, time: np.ndarray) -> list[
     corners = np.array(s.origin) + np.array(list(itertools.product((0, 1), repeat=3))) * np.array(s.size)
     at = np.array([m.at for m in s.markers])
     near = np.linalg.norm(corners[:, None] - at, axis=-1).argmin(1)
-    moved = motion.position[:, near] + np.einsum("scij,cj->sci", motion.gradient[:, near], corners - at[near])
+    moved = motion.position[:, near] + np.einsum("scij,cj->sci", motion.deformation[:, near], corners - at[near])
     above = np.full(len(motion.time), np.inf)
     for plane in s.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)

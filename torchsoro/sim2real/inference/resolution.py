@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from torchsoro.sim2real.data.experiment import Setup
-from torchsoro.sim2real.twin.ensemble import safety
+from torchsoro.sim2real.twin.batch import safety
 from torchsoro.sim2real.twin.twin import Twin
 
 SPEED = 6e7  # points times variations times time steps that one thread simulates in a second, about

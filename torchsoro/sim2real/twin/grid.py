@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from torchsoro.simulation.axis import Axis
+from torchsoro.simulation.ops.lattice import Faces, Lattice, Walls
+from torchsoro.simulation.ops.markers import nearest
 
 BODY, OUTSIDE = -1, -2  # kinds of cells that belong to no chamber
 PARTS = 4  # subdivisions of a cell along each axis, by which its filled share is sampled
@@ -55,7 +58,6 @@ class Grid:
         filled: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None,
     ) -> None:
         self.axes = axes
-        self.counts = tuple(a.nodes for a in axes)
         middles = np.meshgrid(*((a.planes[1:] + a.planes[:-1]) / 2 for a in axes), indexing="ij")
         self.hole = np.full(middles[0].shape, BODY)
         share = np.ones((*self.hole.shape, 8))
@@ -79,70 +81,31 @@ class Grid:
         self.cut = bool((mine < 1).any())
         """Whether a cell is filled in part only."""
 
-    @property
-    def nodes(self) -> int:
-        """Number of nodes."""
-        return math.prod(self.counts)
-
     @cached_property
-    def places(self) -> np.ndarray:
-        """Of the nodes [n, 3] m: values there of a linear field are its coefficients."""
-        return np.stack(np.meshgrid(*(a.places for a in self.axes), indexing="ij"), -1).reshape(-1, 3)
+    def lattice(self) -> Lattice:
+        """For the simulator; particles are the points with any volume, in their order."""
+        one, two, three = (2 * self.cells[:, [i]] for i in range(3))
+        x, y, z = (c + np.array(n) for c, n in ((one, [0] * 4 + [1] * 4), (two, [0, 0, 1, 1] * 2), (three, [0, 1] * 4)))
+        _, ny, nz = (2 * a.cells for a in self.axes)
+        index = torch.from_numpy(((x * ny + y) * nz + z).reshape(-1)[self.solid])
+        plain = Lattice(axes=self.axes, index=index)
+        return Lattice(axes=self.axes, index=index, walls=self._walls(plain), faces=self._faces(plain))
 
     @property
-    def strides(self) -> tuple[int, int]:
-        """Between nodes along x and y."""
-        return self.counts[1] * self.counts[2], self.counts[2]
-
-    def corner(self, cells: np.ndarray) -> np.ndarray:
-        """Lowest node of cells [..., 3]."""
-        sx, sy = self.strides
-        x, y, z = (a.first[cells[..., i]] for i, a in enumerate(self.axes))
-        return x * sx + y * sy + z
-
-    def stencil(self, x: np.ndarray, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes [N, 27] of points [N, 3] m, weights, and slopes [N, 27, 3]; in given cells, or where they are."""
-        if cells is None:
-            cells = np.stack([a.cell(x[:, i]) for i, a in enumerate(self.axes)], -1)
-        w, s = zip(*(a.at(x[:, i], cells[:, i]) for i, a in enumerate(self.axes)), strict=True)
-        three = np.arange(3)
-        sx, sy = self.strides
-        offset = (three[:, None, None] * sx + three[None, :, None] * sy + three[None, None, :]).reshape(-1)
-
-        def product(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-            return np.einsum("ni,nj,nk->nijk", a, b, c).reshape(len(x), 27)
-
-        slopes = [product(s[0], w[1], w[2]), product(w[0], s[1], w[2]), product(w[0], w[1], s[2])]
-        return self.corner(cells)[:, None] + offset, product(*w), np.stack(slopes, -1)
+    def solid(self) -> np.ndarray:
+        """Which points have a volume, bool [P]."""
+        return self.volumes > 0
 
     def nearest(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The places of the body [N, 3] m nearest to points [N, 3] m, and the cells that they lie in."""
-        low = np.stack([a.planes[self.cells[:, i]] for i, a in enumerate(self.axes)], -1)
-        high = np.stack([a.planes[self.cells[:, i] + 1] for i, a in enumerate(self.axes)], -1)
-        at = [int(((np.clip(p, low, high) - p) ** 2).sum(-1).argmin()) for p in x]
-        return np.clip(x, low[at], high[at]), self.cells[at]
+        return nearest(self.lattice, self.cells, x)
 
-    def spread(self, x: np.ndarray, amounts: np.ndarray) -> np.ndarray:
-        """Amounts [..., N] at points [N, 3] m, over the nodes [..., n]."""
-        nodes, weights, _ = self.stencil(x)
-        flat = amounts.reshape(-1, amounts.shape[-1])
-        found = np.stack([np.bincount(nodes.ravel(), (weights * row[:, None]).ravel(), self.nodes) for row in flat])
-        return found.reshape(*amounts.shape[:-1], self.nodes)
-
-    @cached_property
-    def stencil_of_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes and weights of the body's points."""
-        nodes, weights, _ = self.stencil(self.points, np.repeat(self.cells, 8, axis=0))
-        return nodes, weights
-
-    def collect(self, amounts: np.ndarray) -> np.ndarray:
+    def collect(self, amounts: Tensor) -> Tensor:
         """Amounts [..., P] at the body's points, over the nodes [..., n]."""
-        nodes, weights = self.stencil_of_points
-        flat = amounts.reshape(-1, amounts.shape[-1])
-        found = np.stack([np.bincount(nodes.ravel(), (weights * row[:, None]).ravel(), self.nodes) for row in flat])
-        return found.reshape(*amounts.shape[:-1], self.nodes)
+        flat = amounts[..., self.solid].reshape(-1, int(self.solid.sum()))
+        return self.lattice.to_nodes(self.lattice.spread(flat)).reshape(*amounts.shape[:-1], -1)
 
-    def within(self, box: tuple[Sequence[float], Sequence[float]]) -> np.ndarray:
+    def within(self, box: tuple[Sequence[float], Sequence[float]]) -> Tensor:
         """Shares [n] of what is spread evenly over a box.
 
         Raises:
@@ -160,29 +123,27 @@ class Grid:
         inside = self.hole[tuple(a.cell(x[:, i]) for i, a in enumerate(self.axes))] == BODY
         if not inside.any():
             raise ValueError(f"box = {box}: no part of the body, wanted a box that meets it")
-        return self.spread(x[inside], np.full(int(inside.sum()), 1 / int(inside.sum())))
+        nodes, weights, _ = self.lattice.splines(x[inside])
+        found = np.bincount(nodes.ravel(), weights.ravel() / int(inside.sum()), self.lattice.nodes)
+        return torch.from_numpy(found)
 
-    @cached_property
-    def walls(self) -> tuple[np.ndarray, ...]:
-        """Points of the chambers' walls, four on each face of a cell.
-
-        Returns:
-            Nodes [W, 27], weights and two slopes along the wall [W, 27, 3], places [W, 3] m, axes [W], areas [W] m2,
-            positive if the chamber is on the lower side, and chambers [W].
-        """
+    def _walls(self, lattice: Lattice) -> Walls | None:
+        """Four points on each face of a cell beside a chamber."""
         rows = [
             (cell, place, axis, -side * area, self.hole[beside])
             for cell, beside, place, axis, side, area in self._sides()
             if beside is not None and self.hole[beside] >= 0
         ]
         if not rows:
-            none = np.zeros(0, int)
-            return np.zeros((0, 27), int), np.zeros((0, 27, 3)), np.zeros((0, 3)), none, np.zeros(0), none
+            return None
         cells, places, axes, areas, chambers = (np.array(column) for column in zip(*rows, strict=True))
-        nodes, weights, slopes = self.stencil(places, cells)
+        nodes, weights, slopes = lattice.splines(places, cells)
         number = np.arange(len(rows))
-        values = np.stack([weights, slopes[number, :, (axes + 1) % 3], slopes[number, :, (axes + 2) % 3]], -1)
-        return nodes, values, places, axes, areas, chambers
+        values = np.stack([weights, slopes[number, (axes + 1) % 3], slopes[number, (axes + 2) % 3]], -1)
+        nodes, values, places, axes, areas, chambers = map(
+            torch.from_numpy, (nodes, values, places, axes, areas, chambers)
+        )
+        return Walls(nodes=nodes, values=values, places=places, axes=axes, areas=areas, chambers=chambers)
 
     def _sides(self) -> Iterator[tuple[np.ndarray, tuple[int, ...] | None, np.ndarray, int, int, float]]:
         """Four points on each face of a cell behind which there is no body.
@@ -205,16 +166,20 @@ class Grid:
                     place[one], place[two] = self.axes[one].points[cell[one], a], self.axes[two].points[cell[two], b]
                     yield cell, tuple(beside) if within else None, place, axis, side, area / 4
 
-    @cached_property
-    def front(self) -> np.ndarray:
-        """Area across each axis, as shares of nodes [n, 3] m2: the mean of both sides."""
+    def _faces(self, lattice: Lattice) -> Faces:
+        """Nodes on the faces of the box may meet planes; cut surfaces inside of it do not."""
+        index = np.stack(np.unravel_index(np.arange(lattice.nodes), lattice.shape), -1)
+        touches = ((index == 0) | (index == np.array(lattice.shape) - 1)).any(-1)
         sides = [s for s in self._sides() if s[1] is None or self.hole[s[1]] == OUTSIDE]
         cells, places = np.array([s[0] for s in sides]), np.array([s[2] for s in sides])
-        axes, areas = np.array([s[3] for s in sides]), np.array([s[5] for s in sides])
-        nodes, weights, _ = self.stencil(places, cells)
-        found = np.zeros((self.nodes, 3))
-        np.add.at(found, (nodes, axes[:, None]), weights * areas[:, None] / 2)
-        return found
+        axes, upper, areas = (np.array([s[i] for s in sides]) for i in (3, 4, 5))
+        nodes, weights, _ = lattice.splines(places, cells)
+        front, ends = np.zeros((lattice.nodes, 3)), np.zeros((3, 2, lattice.nodes))
+        np.add.at(front, (nodes, axes[:, None]), weights * areas[:, None] / 2)
+        on = np.array([s[1] is None for s in sides])
+        which = axes[on, None], (upper[on, None] > 0).astype(int), nodes[on]
+        np.add.at(ends, which, weights[on] * areas[on, None])
+        return Faces(touches=torch.from_numpy(touches), ends=torch.from_numpy(ends), front=torch.from_numpy(front))
 
     @property
     def open(self) -> bool:
@@ -224,25 +189,6 @@ class Grid:
             if (((one >= 0) & (other == OUTSIDE)) | ((one == OUTSIDE) & (other >= 0))).any():
                 return True
         return False
-
-    @cached_property
-    def rim(self) -> np.ndarray:
-        """Nodes on the faces of the box [F]."""
-        index = np.stack(np.unravel_index(np.arange(self.nodes), self.counts), -1)
-        return np.flatnonzero(((index == 0) | (index == np.array(self.counts) - 1)).any(-1))
-
-    @cached_property
-    def ends(self) -> np.ndarray:
-        """Area of the body on the lower and upper sides of its box, as shares of nodes [3, 2, n] m2."""
-        sides = [s for s in self._sides() if s[1] is None]
-        places, axes, upper, areas = (np.array([s[i] for s in sides]) for i in (2, 3, 4, 5))
-        kinds = 2 * axes + (upper > 0)
-        return self.spread(places, areas * (kinds == np.arange(6)[:, None])).reshape(3, 2, self.nodes)
-
-    def facing(self, normal: np.ndarray) -> np.ndarray:
-        """Area [n] m2 of the nodes on the face of the box that faces a plane with this normal."""
-        axis = int(np.abs(normal).argmax())
-        return self.ends[axis, int(normal[axis] < 0)]
 
 
 def _shares(axes: Sequence[Axis], filled: Callable[..., np.ndarray]) -> np.ndarray:

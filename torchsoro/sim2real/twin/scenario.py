@@ -10,59 +10,9 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.loads import Force, Load
 from torchsoro.simulation.material import Prony
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ObliquePlane:
-    """A plane that the body does not penetrate.
-
-    Attributes:
-        normal: Unit normal to the body's side [3].
-        offset: Of the plane along it [...] m.
-        friction: Coulomb coefficient [...]; "stick" for no slip under compression.
-        adhesion: Traction towards the plane, which also counts as normal traction for friction [...] Pa.
-        reach: Distance up to which adhesion acts [...] m.
-    """
-
-    normal: Tensor
-    offset: Tensor
-    friction: Tensor | str
-    adhesion: Tensor
-    reach: Tensor
-
-    @property
-    def sticks(self) -> bool:
-        """Whether the plane holds what is pressed on it."""
-        return isinstance(self.friction, str)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NodalForce:
-    """A dead force on nodes, from a time on.
-
-    Attributes:
-        share: Of each node [n], sum 1.
-        value: [..., 3] N.
-        start: When it begins [s].
-    """
-
-    share: Tensor
-    value: Tensor
-    start: float
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NodalSpring:
-    """A spring from the mean place of some nodes to where that was in the undeformed body.
-
-    Attributes:
-        share: Of each node [..., n], sum 1.
-        stiffness: [...] N/m.
-    """
-
-    share: Tensor
-    stiffness: Tensor
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,12 +31,8 @@ class Scenario:
         gravity: [..., 3] m/s2.
         displacement: Of the nodes at the start [..., n, 3] m.
         velocity: The same [..., n, 3] m/s.
-        point_mass: Attached to nodes [..., n] kg.
-        drag: Of nodes [..., n] N s/m.
-        quadratic_drag: Density of what surrounds the body times its drag coefficient [...] kg/m3.
-        planes: Planes.
-        forces: Dead forces.
-        springs: Springs to the ground.
+        planes: Planes, with a normal each.
+        loads: Forces, point masses, springs to mean places and drag on nodes, and drag of what surrounds the body.
         duration: Of the trial [s].
         until: End of the simulation [s]; after that of the trial where the clock of a recording may be late.
     """
@@ -102,12 +48,8 @@ class Scenario:
     gravity: Tensor
     displacement: Tensor
     velocity: Tensor
-    point_mass: Tensor
-    drag: Tensor
-    quadratic_drag: Tensor
-    planes: tuple[ObliquePlane, ...]
-    forces: tuple[NodalForce, ...]
-    springs: tuple[NodalSpring, ...]
+    planes: tuple[Plane, ...]
+    loads: tuple[Load, ...]
     duration: float
     until: float
 
@@ -115,16 +57,28 @@ class Scenario:
         """A scenario with other values."""
         return dataclasses.replace(self, **changes)
 
+    def plus(self, *loads: Load) -> Scenario:
+        """A scenario with more loads."""
+        return self.replace(loads=(*self.loads, *loads))
+
+    @property
+    def forces(self) -> tuple[Force, ...]:
+        """The dead forces among the loads."""
+        return tuple(load for load in self.loads if isinstance(load, Force))
+
     @cached_property
     def batch(self) -> int:
         """Number of variations."""
         ranks = [(self.youngs_modulus, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
-        ranks += [(self.air_stiffness, 1), (self.gravity, 1), (self.point_mass, 1), (self.drag, 1)]
-        ranks += [(self.softening, 1), (self.quadratic_drag, 0), (self.displacement, 2), (self.velocity, 2)]
+        ranks += [(self.air_stiffness, 1), (self.gravity, 1)]
+        ranks += [(self.softening, 1), (self.displacement, 2), (self.velocity, 2)]
         ranks += [
             (t, 0) for g in self.planes for t in (g.offset, g.adhesion, g.reach, g.friction) if isinstance(t, Tensor)
         ]
-        ranks += [(p.value, 1) for p in self.forces] + [(s.stiffness, 0) for s in self.springs]
+        for load in self.loads:
+            named = {"value": 1, "mass": 0, "stiffness": 0, "coefficient": 0, "share": 1}
+            given = [(getattr(load, name, None), rank) for name, rank in named.items()]
+            ranks += [(t, rank) for t, rank in given if isinstance(t, Tensor)]
         if self.prony is not None:
             ranks.append((self.prony.moduli, 1))
         if self.pressure is not None:

@@ -15,7 +15,9 @@ from torch import Tensor
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.data.schema import Box, ForceTable, PlaneTable
 from torchsoro.sim2real.twin.grid import Axis, Grid, divide
-from torchsoro.sim2real.twin.scenario import NodalForce, ObliquePlane, Scenario
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.loads import Force
 from torchsoro.simulation.material import Prony
 
 STEPS = 16  # of equal size, in which a force ramps up
@@ -31,23 +33,24 @@ class MarkerTrajectory:
         time: [S] s, evenly spaced.
         position: [..., S, M, 3] m.
         velocity: [..., S, M, 3] m/s.
-        gradient: Deformation gradient at the markers [..., S, M, 3, 3].
+        deformation: Deformation gradient at the markers [..., S, M, 3, 3].
+        sound: Which of a batch did not diverge, bool [...].
         dt: Largest substep [s].
     """
 
     time: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
-    gradient: np.ndarray
+    deformation: np.ndarray
+    sound: np.ndarray
     dt: float
 
     def alone(self, number: int = 0) -> MarkerTrajectory:
         """One of a batch."""
         if self.position.ndim == 3:
             return self
-        return dataclasses.replace(
-            self, position=self.position[number], velocity=self.velocity[number], gradient=self.gradient[number]
-        )
+        names = "position", "velocity", "deformation", "sound"
+        return dataclasses.replace(self, **{name: getattr(self, name)[number] for name in names})
 
     def plus(self, other: MarkerTrajectory, share: float = 1.0) -> MarkerTrajectory:
         """With a share of another motion [S', M, ...] added, which is constant after its last sample."""
@@ -56,13 +59,8 @@ class MarkerTrajectory:
             self,
             position=self.position + share * other.position[at],
             velocity=self.velocity + share * other.velocity[at],
-            gradient=self.gradient + share * other.gradient[at],
+            deformation=self.deformation + share * other.deformation[at],
         )
-
-    @property
-    def sound(self) -> np.ndarray:
-        """Which of a batch did not diverge, bool [...]."""
-        return np.asarray((np.isfinite(self.position) & (np.abs(self.position) < 1e3)).all((-3, -2, -1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +129,9 @@ class Twin:
     @cached_property
     def held(self) -> np.ndarray:
         """Which nodes the clamps hold, bool [n]."""
-        held, tiny = np.zeros(self.grid.nodes, bool), 1e-9
+        held = np.zeros(self.nodes, bool)
         for low, high in self.setup.clamps:
-            on = ((self.grid.places > np.array(low) - tiny) & (self.grid.places < np.array(high) + tiny)).all(-1)
+            on = self.grid.lattice.inside(low, high).numpy()
             held |= on
             if not on.any():
                 raise ValueError(f"clamp: box {low}, {high}, wanted one that holds a part of the body, in metres")
@@ -160,9 +158,14 @@ class Twin:
         return torch.from_numpy(self.grid.volumes)
 
     @property
+    def nodes(self) -> int:
+        """Number of nodes."""
+        return self.grid.lattice.nodes
+
+    @property
     def places(self) -> Tensor:
         """Of the nodes [n, 3] m; values there of a linear field are its coefficients."""
-        return torch.from_numpy(self.grid.places)
+        return self.grid.lattice.node_places
 
     def depth(self, places: Tensor, axis: int, side: int) -> Tensor:
         """How far places [..., 3] are in front of a face, within the body [m]."""
@@ -171,20 +174,13 @@ class Twin:
 
     def nodal(self, amounts: Tensor) -> Tensor:
         """Amounts [..., P] at the points, over the nodes [..., n]."""
-        return torch.from_numpy(self.grid.collect(amounts.numpy()))
+        return self.grid.collect(amounts)
 
     def at(self, places: Tensor) -> Tensor:
         """Shares of the nodes [B, n] of what is attached at places [B, 3] m, the nearest of the body."""
-        nodes, weights, _ = (torch.from_numpy(a) for a in self.grid.stencil(*self.grid.nearest(places.numpy())))
-        return torch.zeros(len(places), self.grid.nodes, dtype=torch.float64).scatter_add(1, nodes, weights)
-
-    def marks(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes [M, 27] of the markers, and weights and slopes [M, 27, 4]: they move with the nearest surface point."""
-        at = np.array([m.at for m in self.setup.markers], float)
-        on, cells = self.grid.nearest(at)
-        nodes, weights, slopes = self.grid.stencil(on, cells)
-        off = np.einsum("mka,ma->mk", slopes, at - on)
-        return nodes, np.concatenate([(weights + off)[..., None], slopes], -1)
+        found = self.grid.lattice.splines(*self.grid.nearest(places.numpy()))
+        nodes, weights, _ = (torch.from_numpy(a) for a in found)
+        return torch.zeros(len(places), self.nodes, dtype=torch.float64).scatter_add(1, nodes, weights)
 
     def scenario(self, trial: Trial) -> Scenario:
         """What is believed about a trial."""
@@ -194,8 +190,8 @@ class Twin:
             pairs = torch.tensor(s.prony, dtype=torch.float64)
             prony = Prony(moduli=pairs[:, 0].clone(), times=pairs[:, 1].clone())
         center = torch.tensor(s.center, dtype=torch.float64)
-        spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.grid.nodes, 3)
-        nodes = self.grid.nodes
+        spin = torch.tensor(s.angular_velocity, dtype=torch.float64).expand(self.nodes, 3)
+        nodes = self.nodes
         return Scenario(
             youngs_modulus=torch.full((self.count,), s.youngs_modulus, dtype=torch.float64),
             poisson_ratio=torch.tensor(s.poisson_ratio, dtype=torch.float64),
@@ -208,25 +204,19 @@ class Twin:
             gravity=torch.tensor(s.gravity, dtype=torch.float64),
             displacement=torch.zeros(nodes, 3, dtype=torch.float64),
             velocity=torch.tensor(s.velocity, dtype=torch.float64) + torch.cross(spin, self.places - center, dim=-1),
-            point_mass=torch.zeros(nodes, dtype=torch.float64),
-            drag=torch.zeros(nodes, dtype=torch.float64),
-            quadratic_drag=torch.zeros((), dtype=torch.float64),
             planes=tuple(_plane(p) for p in s.planes),
-            forces=tuple(
-                step for force in s.forces for step in _steps(force, torch.from_numpy(self.grid.within(force.box)))
-            ),
-            springs=(),
+            loads=tuple(step for force in s.forces for step in _steps(force, self.grid.within(force.box))),
             duration=s.duration,
             until=s.duration,
         )
 
 
-def _steps(table: ForceTable, share: Tensor) -> list[NodalForce]:
+def _steps(table: ForceTable, share: Tensor) -> list[Force]:
     """A ramp is a sum of steps; the end of a force is an opposite force that begins then."""
     value, steps = torch.tensor(table.force, dtype=torch.float64), STEPS if table.ramp > 0 else 1
     starts = [table.start + table.ramp * (k + 0.5) / steps for k in range(steps)]
-    forces = [NodalForce(share=share, value=value / steps, start=start) for start in starts]
-    return [*forces, NodalForce(share=share, value=-value, start=table.end)] if table.end < math.inf else forces
+    forces = [Force(share=share, value=value / steps, start=start) for start in starts]
+    return [*forces, Force(share=share, value=-value, start=table.end)] if table.end < math.inf else forces
 
 
 def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
@@ -245,14 +235,8 @@ def _face(box: Box, setup: Setup) -> tuple[int, int] | None:
     return None
 
 
-def _plane(plane: PlaneTable) -> ObliquePlane:
-    normal = torch.tensor(plane.normal, dtype=torch.float64)
-    unit = normal / normal.norm()
+def _plane(plane: PlaneTable) -> Plane:
+    point, normal = (torch.tensor(v, dtype=torch.float64) for v in (plane.point, plane.normal))
     zero = torch.zeros((), dtype=torch.float64)
-    return ObliquePlane(
-        normal=unit,
-        offset=unit @ torch.tensor(plane.point, dtype=torch.float64),
-        friction=plane.friction if isinstance(plane.friction, str) else zero + plane.friction,
-        adhesion=zero,
-        reach=zero,
-    )
+    friction = plane.friction if isinstance(plane.friction, str) else zero + plane.friction
+    return Plane.through(point, normal=normal, friction=friction, adhesion=zero, reach=zero, landing="elastic")

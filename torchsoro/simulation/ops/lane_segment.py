@@ -36,8 +36,10 @@ from torchsoro.simulation.ops.lane_gradients import (
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.once import once
-from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
+from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
 from torchsoro.simulation.threads import thread_count
+
+_ROOM = 2**22  # numbers of samples that are observed at a time
 
 
 @cache
@@ -219,7 +221,7 @@ class LaneIntegrator:
         mine = kernel(self.mesh, self.case, work, 0, threads, *settings)
         return [mine, *(o.result() for o in others)]
 
-    def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
+    def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
         """Advance the state [B, L] over the segment; returns the last one [1, B, L]."""
         mesh, lanes, nodes, groups = self.mesh, self.lanes, self.lattice.nodes, self.lanes.groups
         ring, past = (self.steps + 1, self.steps + 1) if keep else (2, 1)
@@ -253,10 +255,14 @@ class LaneIntegrator:
         if done < self.steps:
             last = lanes.to_nodes(states[done % ring].view(groups, 6, -1)).reshape(self.batch, -1)
             report(self.scene, self.inputs, self.first + done, last)
-        for k, state in zip(inner, seen, strict=True):
-            flat = lanes.to_nodes(state).reshape(self.batch, -1)
-            self._check(k, flat)
-            observe(k, flat)
+        each = max(1, _ROOM // (self.batch * 6 * nodes))
+        for first in range(0, len(inner), each):
+            part = inner[first : first + each]
+            wide = seen[first : first + each].movedim(0, 1).reshape(groups, -1, mesh.component)
+            flat = lanes.to_nodes(wide).reshape(self.batch, len(part), -1).transpose(0, 1)
+            for k, state in zip(part, flat, strict=True):
+                self._check(k, state)
+            observe(part, flat)
         end = self._joined(states[self.steps % ring], histories[self.steps % past])
         if self.steps not in self.samples:
             self._check(self.steps, end)

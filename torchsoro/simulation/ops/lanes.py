@@ -167,12 +167,13 @@ def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> L
     axes = ((a.knots.tobytes(), a.first.tobytes()) for a in lattice.axes)
     walls = None if lattice.walls is None else lattice.walls.key
     key = (*axes, walls, kind.cpu().numpy().tobytes(), batch, dtype)
-    if key not in _known:
-        _known[key] = _laid_out(lattice, kind, batch, dtype)
-        if len(_known) > MOST:
-            _known.popitem(last=False)
-    _known.move_to_end(key)
-    return _known[key]
+    found = _known.pop(key, None)
+    if found is None:
+        found = _laid_out(lattice, kind, batch, dtype)
+    _known[key] = found  # the last one
+    while len(_known) > MOST:
+        _known.popitem(last=False)
+    return found
 
 
 def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, lru_cache
 
@@ -18,6 +19,7 @@ from torchsoro.simulation.ops.inertia import Matching
 QUADRATURE, PARTICLES = GAUSS, MARK
 # The centre of the matter that a node outside of a face carries is 3/4 of a cell away, the face half a cell.
 _DEPTH = 0.25
+_TINY = 1e-9  # m, by which a node may be off a box that it lies in
 _OFF = 1e-3  # how far a particle may be from its place, in particle spacings
 
 _uniform = lru_cache(maxsize=256)(Axis.uniform)  # one axis, so one set of matrices, for equal arguments
@@ -84,10 +86,10 @@ class Walls:
         return self.areas.new_zeros(self.count).index_add(0, self.chambers, self.areas * along / 3)
 
     def enclosed(self, d: Tensor) -> Tensor:
-        """Volume of each chamber [B, hollow] m3, with displacements of the nodes [B, 3, nodes] m."""
+        """Volume of each chamber [..., hollow] m3, with displacements of the nodes [..., 3, nodes] m."""
         x, a, b = self._along(d)
         parts = (x * torch.linalg.cross(a, b)).sum(-1) * self.areas.to(d) / 3
-        return d.new_zeros(len(d), self.count).index_add(1, self.chambers.to(d.device), parts)
+        return d.new_zeros(*d.shape[:-2], self.count).index_add(-1, self.chambers.to(d.device), parts)
 
     def enclosed_adjoint(self, d: Tensor, bar: Tensor) -> Tensor:
         """What each wall point adds to the gradient by its nodes [B, 3, W, 27], from that by :meth:`enclosed`."""
@@ -97,8 +99,8 @@ class Walls:
         return torch.einsum("bwck,wnk,bw->bcwn", sides, self.values.to(d), by_volume)
 
     def _along(self, d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Places of the points [B, W, 3] m, and their tangents."""
-        moved = torch.einsum("bcwn,wnk->kbwc", d[:, :, self.nodes.to(d.device)], self.values.to(d))
+        """Places of the points [..., W, 3] m, and their tangents."""
+        moved = torch.einsum("...cwn,wnk->k...wc", d[..., self.nodes.to(d.device)], self.values.to(d))
         turned = torch.eye(3).to(d)[torch.stack([self.axes + 1, self.axes + 2]) % 3]
         return self.places.to(d) + moved[0], turned[0] + moved[1], turned[1] + moved[2]
 
@@ -195,6 +197,29 @@ class Lattice:
         a, b, c = low.tolist()
         return cls.uniform((nx, ny, nz), (a, b, c), cell, None if every else index)
 
+    def check(self, position: Tensor) -> None:
+        """Refuse a body whose particles [N, 3] m do not lie at the lattice's ``places``, but for a shift of the whole.
+
+        Raises:
+            ValueError: naming the first particle that is elsewhere.
+        """
+        places = self.particles
+        if len(position) != len(places):
+            raise ValueError(f"body.position: {len(position)} particles, wanted the {len(places)} of the lattice")
+        off = position.detach().to(places) - places
+        off = (off - off.mean(0)).abs().amax(1)
+        if bool((off > _OFF * self.cell).any()):
+            worst = int(off.argmax())
+            raise ValueError(
+                f"body.position: particle {worst} at {tuple(position[worst].tolist())} m, wanted its place in the "
+                f"lattice, {tuple(places[worst].tolist())} m"
+            )
+
+    @cached_property
+    def particles(self) -> Tensor:
+        """Places of the particles [N, 3] m, float64."""
+        return self.places if self.index is None else self.places[self.index.cpu()]
+
     @property
     def points(self) -> tuple[int, int, int]:
         """Points along x, y, z."""
@@ -238,6 +263,11 @@ class Lattice:
     def node_places(self) -> Tensor:
         """Reference places of the nodes [nodes, 3] m, float64."""
         return _mesh(*(a.places for a in self.axes))
+
+    def inside(self, low: Sequence[float], high: Sequence[float]) -> Tensor:
+        """Which nodes lie in a box [m], bool [nodes]."""
+        begin, end = (torch.tensor(corner, dtype=torch.float64) for corner in (low, high))
+        return ((self.node_places > begin - _TINY) & (self.node_places < end + _TINY)).all(-1)
 
     @cached_property
     def _node_spreads(self) -> Tensor:
@@ -368,23 +398,34 @@ class Lattice:
         Returns:
             int64 [P, 27]; [P, 27]; [P, 3, 27] in 1/m.
         """
-        at = torch.unravel_index(points.cpu(), self.points)
-        weights, slopes, low = [], [], []
-        for axis, p in zip(self.axes, at, strict=True):
-            weight, slope = (torch.from_numpy(t.reshape(-1, 3)) for t in axis.tabulate(place))
-            weights.append(weight[p])
-            slopes.append(slope[p])
-            low.append(torch.from_numpy(axis.first)[p // 2])
+        at = [p.numpy() for p in torch.unravel_index(points.cpu(), self.points)]
+        tables = [axis.tabulate(place) for axis in self.axes]
+        weights, slopes = zip(
+            *(tuple(t.reshape(-1, 3)[p] for t in pair) for pair, p in zip(tables, at, strict=True)), strict=True
+        )
+        found = self._products(np.stack([p // 2 for p in at], -1), weights, slopes)
+        nodes, weight, slope = (torch.from_numpy(a) for a in found)
+        return nodes, weight, slope
+
+    def splines(self, x: np.ndarray, cells: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes [P, 27] of places [P, 3] m, weights, and slopes [P, 3, 27]; in given cells, or in those around them."""
+        if cells is None:
+            cells = np.stack([a.cell(x[:, i]) for i, a in enumerate(self.axes)], -1)
+        weights, slopes = zip(*(a.at(x[:, i], cells[:, i]) for i, a in enumerate(self.axes)), strict=True)
+        return self._products(cells, weights, slopes)
+
+    def _products(self, cells: np.ndarray, weights, slopes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes of cells [P, 3], and products of the weights [P, 3] of each axis, and with one axis' slopes."""
+        x, y, z = (a.first[cells[:, i]] for i, a in enumerate(self.axes))
         _, my, mz = self.shape
-        corner = (low[0] * my + low[1]) * mz + low[2]
-        three = torch.arange(3)
+        three = np.arange(3)
         offsets = ((three[:, None, None] * my + three[None, :, None]) * mz + three[None, None, :]).reshape(-1)
 
-        def product(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-            return torch.einsum("pi,pj,pk->pijk", x, y, z).reshape(len(points), 27)
+        def product(*rows: np.ndarray) -> np.ndarray:
+            return np.einsum("pi,pj,pk->pijk", *rows).reshape(len(cells), 27)
 
         by_axis = [product(*(slopes[a] if a == axis else weights[a] for a in range(3))) for axis in range(3)]
-        return corner[:, None] + offsets, product(*weights), torch.stack(by_axis, 1)
+        return ((x * my + y) * mz + z)[:, None] + offsets, product(*weights), np.stack(by_axis, 1)
 
     def project(self, values: Tensor, present: Tensor) -> Tensor:
         """Nodal values of a vector field that is known at the particles: exact for an affine field.

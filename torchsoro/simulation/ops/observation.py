@@ -1,8 +1,10 @@
 """Observations of a state of either form, and their adjoints, written out since operators run below autograd.
 
-The observations are six tensors: positions and velocities of the probes [B, P, 3] (m, m/s), position and velocity of
-the centre of gravity [B, 3], volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An
-adjoint takes the six gradients by them and returns those by the arguments.
+The observations are seven tensors: positions and velocities of the probes [B, P, 3] (m, m/s), deformation gradients
+there [B, P, 3, 3] if the probes are markers (else of none), position and velocity of the centre of gravity [B, 3],
+volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An adjoint takes the gradients by
+them and returns those by the arguments. In the total-Lagrangian form states and pressures may be those of several
+samples, with one more leading axis, which the observations then have, too.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice
+from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Scene
 
 Arguments = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -23,13 +26,13 @@ coefficients [B, COEFFICIENTS, N]; supply pressure of each chamber now [B, chamb
 
 
 def observe(arguments: Arguments, scene: Scene) -> tuple[Tensor, ...]:
-    """The six observations."""
+    """The observations."""
     form = _observe if scene.lattice is None else _total_observe
     return form(*arguments, scene)
 
 
 def observe_adjoint(arguments: Arguments, bars: Sequence[Tensor], scene: Scene) -> Arguments:
-    """Gradients by the arguments of :func:`observe`, from those by the six observations."""
+    """Gradients by the arguments of :func:`observe`, from those by the observations."""
     form = _observe_adjoint if scene.lattice is None else _total_observe_adjoint
     return form(*arguments, bars, scene)
 
@@ -48,6 +51,7 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
     return (
         x[:, :, scene.probes].transpose(1, 2),
         v[:, :, scene.probes].transpose(1, 2),
+        x.new_zeros(len(x), 0, 3, 3),
         (share * x).sum(-1),
         (share * v).sum(-1),
         torch.cat(volumes, -1),
@@ -56,7 +60,7 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
 
 
 def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene) -> Arguments:
-    x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
+    x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = bars
     found = torch.zeros_like(state), *_zeros(coefficients, pressure)
     state_bar, coefficients_bar, pressure_bar = found
     share = weight / weight.sum(-1, keepdim=True)
@@ -86,48 +90,67 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     lattice = scene.lattice
     assert lattice is not None
     d, v = _motion(state, lattice.nodes)
-    places = lattice.on("places", state)
-    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+    at, how, slopes, where = _probed(scene, state)
     share = weight / weight.sum(-1, keepdim=True)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
-    nodal = lattice.nodal_mass(share).unsqueeze(1)
-    volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
+    nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
+    near = d[..., at]
+    gradient = torch.einsum("...cpn,pan->...pca", near[..., : len(slopes), :], slopes) + torch.eye(3).to(state)
+    volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
         gas, _, _, F = _chamber(d, c, scene)
         J, V = torch.linalg.det(F), coefficients[:, layout.VOLUME, gas]
         k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
         volumes.append((V * J).sum(-1, keepdim=True))
-        means.append((pressure[:, c] - k * (volumes[-1][:, 0] / V.sum(-1) - 1)).unsqueeze(-1))
+        means.append((pressure[..., c] - k * (volumes[-1][..., 0] / V.sum(-1) - 1)).unsqueeze(-1))
     if lattice.walls is not None:
         volumes.append(lattice.walls.enclosed(d))
         growth = volumes[-1] / lattice.walls.volume.to(d) - 1
-        means.append(pressure[:, scene.gas_chambers :] - air * growth)
+        means.append(pressure[..., scene.gas_chambers :] - air * growth)
     return (
-        places[scene.probes] + (d[:, :, at] * how).sum(-1).transpose(1, 2),
-        (v[:, :, at] * how).sum(-1).transpose(1, 2),
-        share @ places + (nodal * d).sum(-1),
+        where + (near * how).sum(-1).transpose(-1, -2),
+        (v[..., at] * how).sum(-1).transpose(-1, -2),
+        gradient,
+        center + (nodal * d).sum(-1),
         (nodal * v).sum(-1),
         torch.cat(volumes, -1),
         torch.cat(means, -1),
     )
 
 
+def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:
+    """What nodes add to the centre of gravity [B, 1, nodes], and where that is in the undeformed body [B, 3]."""
+    return lattice.nodal_mass(share).unsqueeze(1), share @ lattice.on("places", share)
+
+
+def _probed(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Nodes of the probes [P, 27], weights, slopes of markers [P or 0, 3, 27], and places [P, 3]."""
+    lattice, m = scene.lattice, scene.markers
+    assert lattice is not None
+    if m is not None:
+        return m.nodes, m.weights.to(like), m.slopes.to(like), m.places
+    at, how, slopes = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, like)
+    return at, how, slopes[:0], lattice.on("places", like)[scene.probes]
+
+
 def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
     lattice = scene.lattice
     assert lattice is not None
-    x_bar, v_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
+    x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
     state_bar, coefficients_bar, pressure_bar = torch.zeros_like(state), *_zeros(coefficients, pressure)
     motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
-    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+    at, how, slopes, _ = _probed(scene, state)
     share = weight / weight.sum(-1, keepdim=True)
-    nodal = lattice.nodal_mass(share).unsqueeze(1)
+    nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
     nodal_bar = torch.zeros_like(nodal[:, 0])
     for field, field_bar, at_probes, at_center in zip(
         motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
     ):
         field_bar += nodal * at_center.unsqueeze(-1)
         nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
-        _add_at(field_bar, at, at_probes.transpose(1, 2).unsqueeze(-1) * how)
+        _add_at(field_bar, at, at_probes.to(how).transpose(1, 2).unsqueeze(-1) * how)
+    if scene.markers is not None:
+        _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, slopes))
     share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.on("places", state).T
     for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
@@ -173,7 +196,7 @@ def _add_at(target: Tensor, at: Tensor, values: Tensor) -> None:
 
 def _motion(state: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
     """Displacements and velocities of the nodes [B, 3, nodes] m, m/s, as parts of a state."""
-    d, v = state[:, : 6 * nodes].view(-1, 2, 3, nodes).unbind(1)
+    d, v = state[..., : 6 * nodes].unflatten(-1, (2, 3, nodes)).unbind(-3)
     return d, v
 
 
@@ -181,7 +204,7 @@ def _chamber(d: Tensor, c: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor, T
     """Points of a chamber, their nodes and slopes there, and their deformation gradients [B, points, 3, 3]."""
     gas = scene.gas(c)
     at, _, slopes = _stencil(scene, f"chamber {c}", lambda: gas, QUADRATURE, d)
-    F = torch.einsum("bcpn,pan->bpca", d[:, :, at], slopes) + torch.eye(3).to(d)
+    F = torch.einsum("...cpn,pan->...pca", d[..., at], slopes) + torch.eye(3).to(d)
     return gas, at, slopes, F
 
 

@@ -35,7 +35,9 @@ if TYPE_CHECKING:
 
 _INPUTS = tuple(f.name for f in fields(Inputs))
 _TENSORS = ("state", "weight", *_INPUTS)
-_OBSERVATIONS = ("position", "velocity", "center", "center_velocity", "chamber_volume", "chamber_pressure")
+_OBSERVATIONS = (
+    *("position", "velocity", "deformation", "center", "center_velocity", "chamber_volume", "chamber_pressure"),
+)
 _RECORD = ("states", "nodes", "befores", "orders", "chunks")
 
 
@@ -84,23 +86,25 @@ def _forward(*arguments) -> tuple[Tensor, ...]:
     state, weight, inputs, scene, (first, samples, keep) = _parts(arguments)
     seen: list[tuple[Tensor, ...]] = []
     integrator = _integrator(scene, inputs, first, samples)
-    states = integrator.forward(
-        state,
-        keep=keep,
-        observe=lambda k, s: seen.append(
-            observe((s, weight, inputs.coefficients, inputs.pressure[k], inputs.air), scene)
-        ),
-    )
+
+    def look(k: int | list[int], s: Tensor) -> None:
+        found = observe((s, weight, inputs.coefficients, inputs.pressure[k], inputs.air), scene)
+        seen.append(found if isinstance(k, list) else tuple(t.unsqueeze(0) for t in found))
+
+    states = integrator.forward(state, keep=keep, observe=look)
     end = states[integrator.steps % states.shape[0]].clone()
     shapes = _observed(scene, inputs, samples)
-    observed = map(torch.stack, zip(*seen, strict=True)) if seen else (state.new_empty(shape) for shape in shapes)
+    kinds = _kinds(scene, state)
+    none = (torch.empty(shape, dtype=kind, device=state.device) for shape, kind in zip(shapes, kinds, strict=True))
+    observed = map(torch.cat, zip(*seen, strict=True)) if seen else none
     return end, *observed, *(integrator.record(states) if keep else empty_record(state))
 
 
 @torch.library.register_fake(_ROLLOUT)
 def _forward_fake(*arguments) -> tuple[Tensor, ...]:
     state, _, inputs, scene, (_, samples, keep) = _parts(arguments)
-    observed = (state.new_empty(shape) for shape in _observed(scene, inputs, samples))
+    shaped = zip(_observed(scene, inputs, samples), _kinds(scene, state), strict=True)
+    observed = (state.new_empty(shape, dtype=kind) for shape, kind in shaped)
     record = list(empty_record(state))
     if keep:
         steps, batch = inputs.gravity.shape[0], state.shape[0]
@@ -119,8 +123,16 @@ def _forward_fake(*arguments) -> tuple[Tensor, ...]:
 def _observed(scene: Scene, inputs: Inputs, samples: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Shapes of the observations over all samples."""
     batch, chambers = inputs.pressure.shape[1:]
-    at_probes, center, gas = (batch, len(scene.probes), 3), (batch, 3), (batch, chambers)
-    return tuple((len(samples), *shape) for shape in (at_probes, at_probes, center, center, gas, gas))
+    marked = 0 if scene.markers is None else len(scene.markers.places)
+    at_probes, center, gas = (batch, marked or len(scene.probes), 3), (batch, 3), (batch, chambers)
+    shapes = (at_probes, at_probes, (batch, marked, 3, 3), center, center, gas, gas)
+    return tuple((len(samples), *shape) for shape in shapes)
+
+
+def _kinds(scene: Scene, state: Tensor) -> tuple[torch.dtype, ...]:
+    """Types of the observations: places of markers keep theirs, to which a state adds little."""
+    kind = state.dtype if scene.markers is None else scene.markers.places.dtype
+    return kind, *[state.dtype] * (len(_OBSERVATIONS) - 1)
 
 
 def _setup(ctx, inputs, output) -> None:

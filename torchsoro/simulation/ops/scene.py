@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.markers import Markers
 
 # Arguments of an operator of torch.library are tensors and numbers, so that a scene is passed by its handle.
 _handles = itertools.count()
@@ -20,6 +21,9 @@ _scenes: WeakValueDictionary[int, Scene] = WeakValueDictionary()
 
 Observe = Callable[[int, Tensor], None]
 """Called with a sampled substep, counted within the segment, and the state or its gradient there."""
+
+ObserveMany = Callable[[int | list[int], Tensor], None]
+"""Called with a sampled substep and the state there, or with several and their states [S, ...]."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -48,6 +52,7 @@ class Scene:
         tie_share: [B, Q, nodes], each node's share of the groups whose mean displacement a spring resists; None if
             there are none.
         probes: int64 [P], particles whose motion is recorded.
+        markers: Places whose motion is recorded instead, with its gradient; of the total-Lagrangian form.
         lattice: Of the total-Lagrangian form; None for the updated form.
         lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
         apart: Whether simulations that diverge go on with what is not finite, and the others are not disturbed.
@@ -74,6 +79,7 @@ class Scene:
     force_start: tuple[int, ...] | None = None
     tie_share: Tensor | None = None
     lattice: Lattice | None = None
+    markers: Markers | None = None
     lanes: bool = True
     apart: bool = False
     steady: bool = False

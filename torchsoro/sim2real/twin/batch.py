@@ -1,0 +1,261 @@
+"""Simulations of a twin in many variations: those of a kind, sixteen at a time, one group to a thread."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.sim2real.twin.grid import Grid
+from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
+from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.contact import Plane
+from torchsoro.simulation.formulation import Total
+from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.loads import Clamp, Drag, Force, Load, PointMass, QuadraticDrag, Spring
+from torchsoro.simulation.material import Body, Prony
+from torchsoro.simulation.simulator import Simulator
+from torchsoro.simulation.threads import threads_here
+from torchsoro.simulation.trajectory import Start, Trajectory
+
+SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
+SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars were stable up to 1.6
+CUT = 1.0  # the same where cells are filled in part, whose nodes may have little mass
+SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
+THREADS = os.cpu_count() or 1
+FAR = 1e3  # m, half the edge of the box that a motion that has not diverged stays in
+
+Lane = tuple[int, int]  # number of the scenario, and of its variation
+Amounts = Callable[[Scenario], Tensor]
+
+
+def safety(grid: Grid) -> float:
+    """Step in use over the bound of a stable step near rest."""
+    return CUT if grid.cut else SAFETY
+
+
+def room(threads: int) -> int:
+    """Number of variations that take as long as one."""
+    return LANES * threads
+
+
+def simulate(
+    twin: Twin, scenarios: Sequence[Scenario], *, threads: int = THREADS, even: bool = False, safe: float | None = None
+) -> list[MarkerTrajectory]:
+    """Simulate variations of scenarios of one body.
+
+    Args:
+        twin: The body.
+        scenarios: Each with a batch of variations [B], or none.
+        threads: Number of threads.
+        even: Whether all variations take the same time step, so that its error cancels in their differences.
+        safe: Step over the bound of a stable one near rest; chosen by the body's cells if None.
+
+    Returns:
+        For each scenario, its motions [B, ...]; diverged ones are not ``sound``.
+
+    Raises:
+        ValueError: if one is so stiff that no step is short enough.
+    """
+    share = safe or safety(twin.grid)
+    steps = [stable(twin.grid, s, share) for s in scenarios]
+    if even:
+        least = min(float(dt.min()) for dt in steps)
+        steps = [np.full_like(dt, least) for dt in steps]
+    if not (shortest := min(float(dt.min()) for dt in steps)) > SHORTEST:
+        raise ValueError(f"stiffness: a step of {shortest:g} s is needed, wanted a body with at least {SHORTEST:g} s")
+    alike: dict[object, list[Lane]] = {}
+    for i, s in enumerate(scenarios):
+        alike.setdefault(_kind(s), []).extend((i, b) for b in range(s.batch))
+    groups = []
+    for members in alike.values():
+        members.sort(key=lambda lane: steps[lane[0]][lane[1]])
+        groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
+    markers = torch.tensor([m.at for m in twin.setup.markers], dtype=torch.float64).reshape(-1, 3)
+    samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
+    shape = samples, len(markers)
+    position, velocity = ([np.zeros((s.batch, *shape, 3)) for s in scenarios] for _ in range(2))
+    deformation = [np.zeros((s.batch, *shape, 3, 3)) for s in scenarios]
+    sound = [np.zeros(s.batch, bool) for s in scenarios]
+
+    def run(group: list[Lane]) -> float:
+        every = math.ceil(SAMPLE / min(steps[i][b] for i, b in group))
+        with threads_here(1), torch.no_grad():
+            found = _Group(twin, scenarios, group).simulate(SAMPLE / every, samples - 1, markers, share)
+        seen = (position, found.position), (velocity, found.velocity), (deformation, found.deformation)
+        for kept, values in (*seen, (sound, found.sound)):
+            for (i, b), one in zip(group, values.numpy(), strict=True):
+                kept[i][b] = one
+        return found.dt
+
+    with ThreadPoolExecutor(threads) as pool:
+        largest = max(pool.map(run, groups))
+    time = np.arange(samples) * SAMPLE
+    return [
+        MarkerTrajectory(time=time, position=x, velocity=v, deformation=F, sound=ok, dt=largest)
+        for x, v, F, ok in zip(position, velocity, deformation, sound, strict=True)
+    ]
+
+
+def stable(grid: Grid, s: Scenario, share: float) -> np.ndarray:
+    """Largest step of each variation [B] s with ``share`` of the bound near rest; see ``courant.total_courant``."""
+    nu = s.poisson_ratio.unsqueeze(-1)
+    bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
+    bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch) for m in (bulk, shear))
+    steep, dt = max(a.steep for a in grid.axes), torch.ones(s.batch, dtype=torch.float64)
+    for _ in range(40):
+        factor = torch.ones_like(dt) if s.prony is None else 1 + s.prony.step_moduli(dt.unsqueeze(-1)).sum(-1)
+        speed = torch.maximum(math.sqrt(3) * bulk, torch.sqrt(2 * factor) * shear)
+        dt = torch.sqrt(dt * share * 2 / (speed * math.sqrt(steep)))
+    return dt.clamp(max=SAMPLE).numpy()
+
+
+def _kind(s: Scenario) -> object:
+    """What the variations of a group must have in common: numbers of elements and springs, and planes."""
+    elements = 0 if s.prony is None else s.prony.elements
+    planes = tuple((tuple(torch.as_tensor(g.normal).tolist()), g.sticks) for g in s.planes)
+    return elements, planes, sum(isinstance(load, Spring) for load in s.loads)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Up to sixteen variations of a kind, as one batch of the simulator.
+
+    Attributes:
+        twin: The body.
+        scenarios: All.
+        lanes: The variations.
+    """
+
+    twin: Twin
+    scenarios: Sequence[Scenario]
+    lanes: Sequence[Lane]
+
+    def simulate(self, dt: float, samples: int, markers: Tensor, share: float) -> Trajectory:
+        """Motions [K, ...] of the markers, sampled so many times after the start."""
+        lattice, first = self.twin.grid.lattice, self.scenarios[self.lanes[0][0]]
+        simulator = Simulator(
+            cell=lattice.cell,
+            dt=dt,
+            low=(-FAR,) * 3,
+            high=(FAR,) * 3,
+            formulation=Total(lattice=lattice, limit=1.001 * share),
+        )
+        return simulator(
+            self.body(),
+            duration=samples * SAMPLE,
+            prony=self.prony(first.prony),
+            pressure=self.pressure(dt, samples),
+            gravity=self.rows(lambda s: s.gravity, 1),
+            planes=[self.plane(k, plane) for k, plane in enumerate(first.planes)],
+            loads=[*(Clamp(low, high) for low, high in self.twin.setup.clamps), *self.forces(), *self.other_loads()],
+            sample_every=SAMPLE,
+            probes=markers,
+            start=Start(
+                displacement=self.rows(lambda s: s.displacement, 2), velocity=self.rows(lambda s: s.velocity, 2)
+            ),
+            divergence="mark",
+        )
+
+    def rows(self, get: Amounts, rank: int) -> Tensor:
+        """A quantity of each variation [K, ...] float32, of as many axes as it has without a batch."""
+        given = {i: get(self.scenarios[i]) for i in {i for i, _ in self.lanes}}
+        found = [t[b if len(t) > 1 else 0] if (t := given[i]).ndim > rank else t for i, b in self.lanes]
+        return torch.stack(found).float()
+
+    def body(self) -> Body:
+        """Particles with their coefficients [K, P]."""
+        grid = self.twin.grid
+        solid, volume = torch.from_numpy(grid.solid), self.twin.volumes.float()
+        young, density = (self.rows(get, 1)[:, solid] for get in (lambda s: s.youngs_modulus, lambda s: s.density))
+        nu, volume = self.rows(lambda s: s.poisson_ratio, 0).unsqueeze(-1), volume[solid]
+        stiffening, softening = (self.rows(get, 1) for get in (lambda s: s.stiffening, lambda s: s.softening))
+        air = self.rows(lambda s: s.air_stiffness, 1)  # what takes all of it away may round to less
+        return Body(
+            position=grid.lattice.particles.float(),
+            mass=density * volume,
+            volume=volume,
+            bulk=young / (3 * (1 - 2 * nu)),
+            shear=young / (2 * (1 + nu)),
+            chamber=torch.full_like(volume, -1, dtype=torch.int32),
+            stiffening=stiffening.unsqueeze(1).expand(-1, len(volume), 2) if bool(stiffening.any()) else None,
+            softening=softening if bool(softening[:, 0].any()) else None,
+            air_stiffness=air.clamp(min=0) if self.twin.setup.chambers else None,
+        )
+
+    def prony(self, like: Prony | None) -> Prony | None:
+        """Maxwell elements [K, E]."""
+        if like is None:
+            return None
+        moduli, times = (self.rows(lambda s, name=name: getattr(s.prony, name), 1) for name in ("moduli", "times"))
+        return Prony(moduli=moduli.double(), times=times.double())
+
+    def pressure(self, dt: float, samples: int) -> Waveform | None:
+        """Supply [K, chambers, steps + 1], or what is the same for all."""
+        supplies = {i: self.scenarios[i].pressure for i, _ in self.lanes}
+        first = supplies[self.lanes[0][0]]
+        if first is None or all(p is first for p in supplies.values()):
+            return first
+        time = torch.arange(round(samples * SAMPLE / dt) + 1, dtype=torch.float64) * dt
+        seen = {i: torch.atleast_2d(p.at(time.to(p.time))) for i, p in supplies.items() if p is not None}
+        rows = [seen[i][b if len(seen[i]) > 1 else 0] if seen[i].ndim > 2 else seen[i] for i, b in self.lanes]
+        return Waveform(time=time, pressure=torch.stack(rows))
+
+    def plane(self, number: int, like: Plane) -> Plane:
+        """One of the planes, with the numbers of each variation [K]."""
+
+        def numbers(name: str) -> Tensor:
+            return self.rows(lambda s: torch.as_tensor(getattr(s.planes[number], name)), 0)
+
+        return Plane(
+            normal=like.normal,
+            offset=numbers("offset"),
+            friction="stick" if like.sticks else numbers("friction"),
+            adhesion=numbers("adhesion"),
+            reach=numbers("reach"),
+            landing=like.landing,
+        )
+
+    def forces(self) -> list[Force]:
+        """Forces of all; those on the same nodes from the same time on are one, zero where a scenario has none."""
+        values: dict[tuple[int, float], Tensor] = {}
+        shares: dict[int, Tensor] = {}
+        for k, (i, b) in enumerate(self.lanes):
+            for force in self.scenarios[i].loads:
+                if isinstance(force, Force):
+                    assert force.share is not None
+                    shares[id(force.share)] = force.share
+                    value = force.value if force.value.ndim == 1 else force.value[b if len(force.value) > 1 else 0]
+                    whole = values.setdefault((id(force.share), force.start), torch.zeros(len(self.lanes), 3))
+                    whole[k] += value.float()
+        return [Force(share=shares[number], value=value, start=start) for (number, start), value in values.items()]
+
+    def other_loads(self) -> list[Load]:
+        """Point masses, springs and drag: the first ones of each scenario together, then the second ones, ..."""
+        found: list[Load] = [*self._alike(PointMass, "mass"), *self._alike(Spring, "stiffness", mean=True)]
+        return [*found, *self._alike(Drag, "coefficient"), *self._alike(QuadraticDrag, "coefficient")]
+
+    def _alike(self, kind: type, name: str, **settings) -> list[Load]:
+        known = {i: [x for x in self.scenarios[i].loads if isinstance(x, kind)] for i in {i for i, _ in self.lanes}}
+        loads = []
+        for number in range(max(map(len, known.values()))):
+            there = [own[number] for own in known.values() if number < len(own)]
+
+            def of(i: int, b: int, field: str, rank: int, number: int = number, there: list = there) -> Tensor:
+                own = known[i]
+                t = torch.as_tensor(getattr(own[number] if number < len(own) else there[0], field))
+                t = t[b if b < len(t) else 0] if t.ndim > rank else t
+                return t if number < len(own) or field == "share" else torch.zeros_like(t)
+
+            given = {name: torch.stack([of(i, b, name, 0) for i, b in self.lanes]).float()}
+            if kind is not QuadraticDrag:
+                given["share"] = torch.stack([of(i, b, "share", 1) for i, b in self.lanes]).float()
+            loads.append(kind(**given, **settings))
+        return loads
