@@ -101,25 +101,28 @@ class Lanes:
         _batch, count, _ = values.shape
         found = values.new_zeros(self.groups, count, self.mesh.component)
         if self.variations:
-            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
             rows = values[self._row.reshape(-1)].unflatten(0, (self.groups, LANES))
-            return found.index_copy_(2, at, rows.permute(0, 2, 3, 1).flatten(2))
+            self._without_ends(found).unflatten(-1, (-1, LANES)).copy_(rows.permute(0, 2, 3, 1))
+            return found
         return found.index_copy_(2, self.nodes, values)
+
+    def _without_ends(self, lanes: Tensor) -> Tensor:
+        """The part [..., nodes * 16] of a component in which the nodes lie one behind the other, of variations."""
+        return lanes[..., self.mesh.front : self.mesh.front + LANES * len(self.nodes)]
 
     def from_common_nodes(self, values: Tensor) -> Tensor:
         """Values by node that all simulations have in common [K, nodes] as [K, component]."""
         found = values.new_zeros(len(values), self.mesh.component)
         if self.variations:
-            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
-            return found.index_copy_(1, at, values.repeat_interleave(LANES, 1))
+            self._without_ends(found).unflatten(-1, (-1, LANES)).copy_(values.unsqueeze(-1))
+            return found
         return found.index_copy_(1, self.nodes, values)
 
     def to_nodes(self, lanes: Tensor) -> Tensor:
         """The opposite of :meth:`from_nodes`."""
         if self.variations:
-            at = (self.nodes[:, None] + torch.arange(LANES)).reshape(-1)
-            rows = lanes[:, :, at].unflatten(-1, (-1, LANES)).permute(0, 3, 1, 2)
-            return rows.reshape(-1, *rows.shape[2:])[: self.batch]
+            rows = self._without_ends(lanes).unflatten(-1, (-1, LANES)).permute(0, 3, 1, 2)
+            return rows.reshape(-1, *rows.shape[2:])[: self.batch].contiguous()
         return lanes[:, :, self.nodes]
 
     def from_batch(self, values: Tensor, axis: int = 0) -> Tensor:
