@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -27,6 +28,29 @@ class Markers:
     nodes: Tensor
     weights: Tensor
     slopes: Tensor
+
+    @cached_property
+    def near(self) -> Tensor:
+        """The nodes of all markers, int64 [U]."""
+        return torch.unique(self.nodes)
+
+    @cached_property
+    def matrix(self) -> Tensor:
+        """From values at these nodes to those at the markers, and to their three derivatives [U, 4 M]."""
+        parts = torch.cat([self.weights.unsqueeze(0), self.slopes.transpose(0, 1)])
+        at = torch.searchsorted(self.near, self.nodes).expand_as(parts)
+        whole = parts.new_zeros(4, len(self.nodes), len(self.near)).scatter_add(2, at, parts)
+        return whole.flatten(0, 1).T.contiguous()
+
+    def observe(self, motion: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Displacements and velocities [..., M, 3], and derivatives of the former [..., M, 3, 3].
+
+        Args:
+            motion: Displacements and velocities of the nodes [..., 6, nodes].
+        """
+        found = (motion[..., self.near] @ self.matrix.to(motion)).unflatten(-1, (4, len(self.nodes)))
+        d, v = found[..., :3, :, :], found[..., 3:, 0, :]
+        return d[..., 0, :].transpose(-1, -2), v.transpose(-1, -2), d[..., 1:, :].movedim(-1, -3)
 
     @classmethod
     def at(cls, lattice: Lattice, kind: Tensor, places: Tensor) -> Markers:

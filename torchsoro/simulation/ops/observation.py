@@ -90,12 +90,19 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     lattice = scene.lattice
     assert lattice is not None
     d, v = _motion(state, lattice.nodes)
-    at, how, slopes, where = _probed(scene, state)
+    motion = state[..., : 6 * lattice.nodes].unflatten(-1, (6, lattice.nodes))
+    if scene.markers is not None:
+        moved, drift, gradient = scene.markers.observe(motion)
+        place, gradient = scene.markers.places + moved, gradient + torch.eye(3).to(state)
+    else:
+        at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+        place = lattice.on("places", state)[scene.probes] + (d[..., at] * how).sum(-1).transpose(-1, -2)
+        drift = (v[..., at] * how).sum(-1).transpose(-1, -2)
+        gradient = state.new_zeros(*state.shape[:-1], 0, 3, 3)
     share = weight / weight.sum(-1, keepdim=True)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
     nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
-    near = d[..., at]
-    gradient = torch.einsum("...cpn,pan->...pca", near[..., : len(slopes), :], slopes) + torch.eye(3).to(state)
+    whole = torch.einsum("...bkn,bn->...bk", motion, nodal)
     volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
         gas, _, _, F = _chamber(d, c, scene)
@@ -108,29 +115,19 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
         growth = volumes[-1] / lattice.walls.volume.to(d) - 1
         means.append(pressure[..., scene.gas_chambers :] - air * growth)
     return (
-        where + (near * how).sum(-1).transpose(-1, -2),
-        (v[..., at] * how).sum(-1).transpose(-1, -2),
+        place,
+        drift,
         gradient,
-        center + (nodal * d).sum(-1),
-        (nodal * v).sum(-1),
+        center + whole[..., :3],
+        whole[..., 3:],
         torch.cat(volumes, -1),
         torch.cat(means, -1),
     )
 
 
 def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:
-    """What nodes add to the centre of gravity [B, 1, nodes], and where that is in the undeformed body [B, 3]."""
-    return lattice.nodal_mass(share).unsqueeze(1), share @ lattice.on("places", share)
-
-
-def _probed(scene: Scene, like: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Nodes of the probes [P, 27], weights, slopes of markers [P or 0, 3, 27], and places [P, 3]."""
-    lattice, m = scene.lattice, scene.markers
-    assert lattice is not None
-    if m is not None:
-        return m.nodes, m.weights.to(like), m.slopes.to(like), m.places
-    at, how, slopes = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, like)
-    return at, how, slopes[:0], lattice.on("places", like)[scene.probes]
+    """What nodes add to the centre of gravity [B, nodes], and where that is in the undeformed body [B, 3]."""
+    return lattice.nodal_mass(share), share @ lattice.on("places", share)
 
 
 def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
@@ -139,18 +136,20 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
     x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
     state_bar, coefficients_bar, pressure_bar = torch.zeros_like(state), *_zeros(coefficients, pressure)
     motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
-    at, how, slopes, _ = _probed(scene, state)
+    at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
+    if (m := scene.markers) is not None:
+        at, how = m.nodes, m.weights.to(state)
     share = weight / weight.sum(-1, keepdim=True)
     nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
-    nodal_bar = torch.zeros_like(nodal[:, 0])
+    nodal_bar = torch.zeros_like(nodal)
     for field, field_bar, at_probes, at_center in zip(
         motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
     ):
-        field_bar += nodal * at_center.unsqueeze(-1)
+        field_bar += nodal.unsqueeze(1) * at_center.unsqueeze(-1)
         nodal_bar += (field * at_center.unsqueeze(-1)).sum(1)
         _add_at(field_bar, at, at_probes.to(how).transpose(1, 2).unsqueeze(-1) * how)
-    if scene.markers is not None:
-        _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, slopes))
+    if m is not None:
+        _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
     share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.on("places", state).T
     for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
