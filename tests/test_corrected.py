@@ -47,7 +47,7 @@ def test_each_effect_is_corrected_where_it_is(made):
 
 def test_correction_at_the_effect_recovers_drag_of_a_finer_twin_within_3_percent(made):
     """Recordings by a finer twin, of a body that is so different that the twin's error is another than believed."""
-    twin, _, record = made
+    twin, record = made
     fine = Twin(record(None).setup, edge=0.6 * twin.edge, across=5)
     recorded, left = record("drag", (2000.0,), by=fine), []
     for other in (None, fine):

@@ -48,11 +48,12 @@ class Force:
         """The first of the steps of ``dt`` [s] in which a constant force acts, however its start is rounded."""
         return max(0, math.ceil(self.start / dt - 1e-3))
 
-    def at(self, t: Tensor, dt: float) -> Tensor:
-        """Force in the steps of ``dt`` [s] that begin at times t [T]: [..., T, 3] N, in the type of ``value``."""
+    def at(self, t: Tensor, dt: float | None = None) -> Tensor:
+        """Force at times t [T], where steps of ``dt`` [s] may begin: [..., T, 3] N, in the type of ``value``."""
         if self.time is None:
             found = self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
-            return found * (t > (self.first(dt) - 0.5) * dt).to(found)[:, None]
+            begin = self.start if dt is None else (self.first(dt) - 0.5) * dt
+            return found * (t >= begin).to(found)[:, None]
         return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t.to(self.time)).transpose(-1, -2)
 
 
@@ -132,7 +133,7 @@ class Drag:
         _check_group(self)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class QuadraticDrag:
     """What surrounds the body resists by c/2 A v |v| along each axis, on the area A of its undeformed faces across it.
 

@@ -184,7 +184,7 @@ class Simulator(nn.Module):
             low=self.low,
             others=[(start.displacement, 2), (start.velocity, 2)] if isinstance(start, Start) else [],
         )
-        scene = self._scene(attached, planes, where[:0].long() if where.is_floating_point() else where, dt)
+        scene = self._scene(attached, planes, where[:0, 0].long() if where.is_floating_point() else where, dt)
         scene = replace(scene, apart=divergence == "mark")
         velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
         x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)

@@ -324,10 +324,13 @@ class Lattice:
             ways = [torch.where(there, self._reach(mass, safe, axis)[0], none) for axis in range(3)]
         more, sink = (none, none) if attached is None or not attached.shape[2] else attached.unbind(1)
         heavy = safe + more
-        factor = heavy / (heavy + dt * (self.to_nodes(drag) + sink))
+        factor = heavy / (heavy + dt * self.to_nodes(drag))
         # A node without the body's matter cannot move what is attached to it.
-        matched = self._matching(lumped).matched.to(mass)
-        return torch.stack([matched + torch.where(there, more, none), *ways, factor], 1)
+        whole = self._matching(lumped).matched.to(mass) + torch.where(there, more, none)
+        if sink is not none:
+            moved = torch.where(there, whole, torch.ones_like(whole))
+            factor = factor * moved / (moved + dt * sink)
+        return torch.stack([whole, *ways, factor], 1)
 
     def _reach(self, mass: Tensor, total: Tensor, axis: int) -> tuple[Tensor, Tensor, Tensor]:
         """The reaches of :meth:`nodal` along an axis, the centre of mass from the node [m], and d reach / d centre.
@@ -370,19 +373,27 @@ class Lattice:
         there, none = lumped > 0, torch.zeros_like(lumped)
         more, sink = attached.unbind(1) if attached.shape[2] else (none, none)
         safe = torch.where(there, lumped, torch.ones_like(lumped))
-        heavy, resistance = safe + more, dt * (self.to_nodes(drag) + sink)
-        by_factor = bar[:, 4] / (heavy + resistance) ** 2
-        sink_bar, by_mass = -dt * by_factor * heavy, torch.where(there, by_factor * resistance, none)
-        more_bar = torch.where(there, bar[:, 0], none) + by_factor * resistance
-        attached_bar = torch.stack([more_bar, sink_bar], 1) if attached.shape[2] else torch.zeros_like(attached)
-        total_bar = self._matching(lumped).adjoint(bar[:, 0]).to(mass) + by_mass
+        heavy, resistance, factor_bar = safe + more, dt * self.to_nodes(drag), bar[:, 4]
+        whole_bar, attached_bar = torch.where(there, bar[:, 0], none), torch.zeros_like(attached)
+        if attached.shape[2]:
+            whole = self._matching(lumped).matched.to(mass) + more
+            moved = torch.where(there, whole, torch.ones_like(whole))
+            left = heavy / (heavy + resistance) * factor_bar / (moved + dt * sink) ** 2
+            factor_bar = factor_bar * moved / (moved + dt * sink)
+            whole_bar = whole_bar + torch.where(there, left * dt * sink, none)
+            attached_bar = torch.stack([whole_bar, -dt * left * moved], 1)
+        by_factor = factor_bar / (heavy + resistance) ** 2
+        by_heavy = by_factor * resistance
+        if attached.shape[2]:
+            attached_bar[:, 0] += by_heavy
+        total_bar = self._matching(lumped).adjoint(whole_bar).to(mass) + torch.where(there, by_heavy, none)
         mass_bar = torch.zeros_like(mass)
         for axis in range(3) if self.faces is None else ():
             _, center, slope = self._reach(mass, safe, axis)
             moment_bar = torch.where(there, bar[:, 1 + axis] * slope / safe, torch.zeros_like(lumped))
             total_bar = total_bar - moment_bar * center
             mass_bar += self.to_points(moment_bar, along=(axis, "moment"))
-        return mass_bar + self.to_points(total_bar), self.to_points(sink_bar), attached_bar
+        return mass_bar + self.to_points(total_bar), self.to_points(-dt * by_factor * heavy), attached_bar
 
     def gradient(self, field: Tensor) -> Tensor:
         """Gradient at all places of quadrature of a nodal vector field: [B, 3, nodes] to [B, 3, 3, points]."""

@@ -102,7 +102,8 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     share = weight / weight.sum(-1, keepdim=True)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
     nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
-    whole = torch.einsum("...bkn,bn->...bk", motion, nodal)
+    # A sum whose order does not depend on how many samples there are.
+    whole = (motion * nodal.unsqueeze(1)).sum(-1)
     volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
         gas, _, _, F = _chamber(d, c, scene)
