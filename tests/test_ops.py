@@ -132,7 +132,8 @@ def test_gradcheck_of_a_bare_body(form):
 def test_every_output_has_a_gradient_by_the_state(form):
     p = problem(**form)
     leaves = p.leaves()
-    for k, output in enumerate(p.run(leaves)):
+    # There are no deformation gradients of particles.
+    for k, output in enumerate(o for o in p.run(leaves) if o.numel()):
         grads = torch.autograd.grad(output.sum(), list(leaves.values()), retain_graph=True, allow_unused=True)
         by_state = grads[list(leaves).index("state")]
         assert by_state is not None and bool(by_state.any()), k
@@ -357,5 +358,5 @@ def test_samples_out_of_order_or_range_are_refused(samples, form):
 @forms("apic", "total")
 def test_a_chamber_without_pressure_is_refused(form):
     p = problem(**form)
-    with pytest.raises(ValueError, match=r"^kind: chamber 1, wanted less than the 1 of pressure"):
+    with pytest.raises(ValueError, match=r"^kind: 2 chambers, wanted at most the 1 of pressure"):
         p.run({"pressure": p.tensors["pressure"][..., :1]})
