@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchsoro.design.lagrangian import AugmentedLagrangian, Plateau, Tightening
+from torchsoro.design.lagrangian import AugmentedLagrangian, Plateau
 
 torch.set_num_threads(1)
 
@@ -334,16 +334,3 @@ def test_bad_values_are_refused_and_leave_no_trace():
     with pytest.raises(ValueError, match="violation: got inf"):
         problem.update(0.0, math.inf)
     assert problem.plateau.count.item() == 0
-
-
-def test_the_loss_under_a_limit_that_comes_down_is_minus_l_within_it_and_has_the_gradient_of_both_terms_beyond():
-    schedule = Tightening(penalty=40.0)
-    assert float(schedule(torch.tensor(2.0), torch.tensor(-0.1))) == -2.0
-    violation = torch.tensor(0.1, requires_grad=True)
-    loss = schedule(torch.tensor(2.0), violation)
-    loss.backward()
-    assert loss.item() == pytest.approx(-2.0 + 2.0 * 0.1 + 20.0 * 0.01)
-    assert violation.grad is not None and float(violation.grad) == pytest.approx(2.0 + 40.0 * 0.1)
-    assert schedule.update(1.0, 0.1) is None
-    with pytest.raises(ValueError, match="penalty: got 0"):
-        Tightening(penalty=0.0)

@@ -260,6 +260,7 @@ class Shaky(torch.nn.Module):
         self.field: Any = torch.nn.Module()
         self.field.phi = torch.nn.Parameter(torch.ones(3))
         self.field.forward = lambda: self.field.phi + 0
+        self.field.beta = 9.0
         self.falls, self.breaks = falls, breaks
         self.tried: list[float] = []
 
@@ -283,20 +284,21 @@ class Shaky(torch.nn.Module):
     ],
 )
 def test_a_design_that_falls_over_or_breaks_down_goes_back_towards_the_last_good_one(recipes, limits, tried):
-    robot, good = Shaky(**limits), torch.zeros(3)
+    robot, good = Shaky(**limits), {"phi": torch.zeros(3), "beta": 8.0}
     gamma, outcome = loop.simulate(robot, good, 0.5)
     assert robot.tried == tried
     assert outcome.tried == tried[-1]
     assert gamma.requires_grad
     assert gamma.tolist() == robot.field.phi.tolist() == [tried[-1]] * 3
-    assert not good.any()
+    assert not good["phi"].any()
+    assert robot.field.beta == (8.0 if tried[-1] == 0 else 9.0)  # the good design as it was
 
 
 @pytest.mark.parametrize("falls", [math.inf, 0.3])
 def test_a_simulation_that_breaks_down_on_the_last_try_as_well_ends_the_run(recipes, falls):
     robot = Shaky(breaks=-1.0, falls=falls)
     with pytest.raises(SimulationDiverged):
-        loop.simulate(robot, torch.zeros(3), 0.5)
+        loop.simulate(robot, {"phi": torch.zeros(3), "beta": 8.0}, 0.5)
     assert robot.tried == [1, 0.5, 0.25, 0]
 
 
@@ -314,8 +316,42 @@ def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, 
     monkeypatch.setattr(delivery, "deliver", lambda *_, **__: {})
     recipe.main(tiny(tmp_path / "run", iterations=2))
     start = walker(TINY).field.phi
-    assert torch.equal(items(tmp_path / "run")["good"], start)
+    assert torch.equal(items(tmp_path / "run")["good"]["phi"], start)
     assert not torch.equal(items(tmp_path / "run")["field"]["phi"], start)
+
+
+class Overflowing(torch.autograd.Function):
+    """The same number, whose gradient is not finite."""
+
+    @staticmethod
+    def forward(ctx: Any, value: torch.Tensor) -> torch.Tensor:
+        return value.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *grads: torch.Tensor) -> torch.Tensor:
+        return math.inf * grads[0]
+
+
+@pytest.mark.parametrize("often", [1, 99])
+def test_a_gradient_that_overflows_changes_no_design_and_ends_the_run_only_if_it_does_so_again_and_again(
+    recipes, tmp_path, monkeypatch, often
+):
+    aim, seen = loop.aim, []
+
+    def overflowing(*given):
+        seen.append(given[0].field.phi.detach().clone())
+        return Overflowing.apply(aim(*given)) if len(seen) <= often else aim(*given)
+
+    monkeypatch.setattr(loop, "aim", overflowing)
+    robot = walker(tiny(tmp_path / "run", iterations=12, c_max=0.2499))
+    if often > loop.MOST_LOST:
+        with pytest.raises(SimulationDiverged, match="gradient of norm"):
+            loop.optimize(robot)
+        assert len(seen) == loop.MOST_LOST + 1
+        return
+    assert len(loop.optimize(robot).metrics["iteration"]) == 12
+    assert torch.equal(seen[0], seen[1]) and not torch.equal(seen[1], seen[2])
+    assert all(bool(phi.isfinite().all()) for phi in seen)
 
 
 def test_no_design_counts_as_the_best_before_gravity_is_whole(recipes, tmp_path, monkeypatch):

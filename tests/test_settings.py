@@ -13,7 +13,6 @@ from tiny import TINY
 
 from torchsoro import SimulationDiverged
 from torchsoro.command_line import plain_errors
-from torchsoro.design.loop import limit_on_c
 from torchsoro.design.reading import from_command_line
 from torchsoro.design.settings import Settings
 
@@ -41,7 +40,7 @@ def changed(name: str, held: Any, kind: Any) -> tuple[str, ...]:
     """What to write after a flag so that its setting changes and stays in range."""
     special = {"friction": "0.4", "dt": "0.0000125", "air_density": "2.5", "settle": "0.5"}
     special |= {"out": "elsewhere", "resolution": "1280x720"}
-    if name == "tighten":
+    if name == "sharpen":
         return "10", "20"
     if name in special:
         return (special[name],)
@@ -161,11 +160,9 @@ def test_errors_that_a_user_can_act_on_become_one_line(capsys):
         raise TypeError("a bug")
 
 
-def test_the_limit_on_c_comes_down_by_equal_factors_between_two_iterations():
-    s = dataclasses.replace(TINY, tighten=(10, 30))
-    assert [s.tightness(k) for k in (0, 10, 20, 30, 99)] == [0, 0, 0.5, 1, 1]
-    limits = [limit_on_c(s, k) for k in (0, 20, 30)]
-    assert limits == pytest.approx([0.25, math.sqrt(0.25 * 0.9 * s.c_max), 0.9 * s.c_max])
-    assert limit_on_c(TINY, 0) == TINY.c_max
+def test_the_projection_sharpens_by_equal_factors_between_two_iterations():
+    s = dataclasses.replace(TINY, beta=2.0, final_beta=18.0, sharpen=(10, 30))
+    assert [s.sharpness(k) for k in (0, 10, 20, 30, 99)] == pytest.approx([2, 2, 6, 18, 18])
+    assert dataclasses.replace(s, sharpen=(0, 0)).sharpness(99) == 2.0
     with pytest.raises(ValueError, match="two increasing iterations"):
-        dataclasses.replace(TINY, tighten=(30, 30))
+        dataclasses.replace(TINY, sharpen=(30, 30))

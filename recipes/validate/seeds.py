@@ -2,7 +2,7 @@
 
     python recipes/validate/seeds.py                       # ten desk walkers, about a minute each on two cores
     python recipes/validate/seeds.py climber --seeds 3
-    python recipes/validate/seeds.py --out runs/seeds      # again: what is finished there is only printed
+    python recipes/validate/seeds.py --jobs 8 --out runs/seeds    # eight at a time; finished ones are printed
 
 Walking is judged over one cycle, back at the pressure that it began with: travel of the centre of gravity, and that of
 the feet, which is as long for a robot that does not just lean.
@@ -12,8 +12,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
+import platform
 import statistics
 import time
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Literal
 
@@ -25,6 +30,7 @@ from torchsoro.design.loop import optimize
 from torchsoro.design.presets import CLIMBER, WALKER
 from torchsoro.design.robot import build
 from torchsoro.design.settings import Settings
+from torchsoro.simulation.threads import set_threads, thread_count
 from torchsoro.storage import atomic_write
 
 CHANGE = 1e-6  # of the initial field, standard deviation
@@ -38,6 +44,8 @@ class Options:
     """What to design, by its desk preset."""
     seeds: Count = 10
     """Number of initial fields."""
+    jobs: Count = 1
+    """Designs at a time, among which the threads are shared."""
     out: Path = Path("runs/seeds")
     """Folder of the runs; one that is cut off goes on."""
 
@@ -48,7 +56,7 @@ def designed(settings: Settings, seed: int) -> dict[str, float]:
     change = CHANGE * torch.randn(robot.field.phi.shape, generator=torch.Generator().manual_seed(seed))
     with torch.no_grad():
         robot.field.phi.add_(change.to(robot.field.phi)).clamp_(-1, 1)
-    begin = time.perf_counter()
+    begin, used = time.perf_counter(), time.process_time()
     found = optimize(robot)
     with torch.no_grad():
         outcome = robot(found.gamma)
@@ -57,33 +65,52 @@ def designed(settings: Settings, seed: int) -> dict[str, float]:
         "feet": float(outcome.feet),
         "C": float(outcome.intermediate),
         "seconds": time.perf_counter() - begin,
+        "cpu_seconds": time.process_time() - used,
     }
+
+
+def finished(seed: int, robot: str, out: Path, threads: int) -> dict[str, float]:
+    """The result of a seed, from its folder if it is there."""
+    folder = out / f"{robot}{seed}"
+    path = folder / "result.json"
+    if not path.is_file():
+        set_threads(threads)
+        preset = (WALKER if robot == "walker" else CLIMBER)["desk"]
+        resume = (folder / "settings.json").is_file()
+        row = designed(dataclasses.replace(preset, device="cpu", out=folder, resume=resume), seed)
+        with atomic_write(path) as file:
+            file.write(json.dumps(row).encode())
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def processor() -> str:
+    """Name of the processor, and number of its cores that may be used."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor() or platform.machine()}, {os.cpu_count()} cores"
 
 
 def main(chosen: Options) -> list[dict[str, float]]:
     """Design each, and print a line for each and one for all."""
-    preset = (WALKER if chosen.robot == "walker" else CLIMBER)["desk"]
+    limit = (WALKER if chosen.robot == "walker" else CLIMBER)["desk"].c_max
+    jobs = min(chosen.jobs, chosen.seeds)
+    threads = max(1, thread_count() // jobs)
+    task = partial(finished, robot=chosen.robot, out=chosen.out, threads=threads)
     rows = []
-    for seed in range(chosen.seeds):
-        folder = chosen.out / f"{chosen.robot}{seed}"
-        path = folder / "result.json"
-        if not path.is_file():
-            resume = (folder / "settings.json").is_file()
-            row = designed(dataclasses.replace(preset, out=folder, resume=resume), seed)
-            with atomic_write(path) as file:
-                file.write(json.dumps(row).encode())
-        row = json.loads(path.read_text(encoding="utf-8"))
-        rows.append(row)
-        print(
-            f"seed {seed}: L = {1e3 * row['L']:.2f} mm, feet {1e3 * row['feet']:.2f} mm, C = {row['C']:.4f} "
-            f"(limit {preset.c_max:g}), {row['seconds']:.0f} s",
-            flush=True,
-        )
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for seed, row in enumerate(pool.map(task, range(chosen.seeds))):
+            rows.append(row)
+            print(
+                f"seed {seed}: L = {1e3 * row['L']:.2f} mm, feet {1e3 * row['feet']:.2f} mm, C = {row['C']:.4f} "
+                f"(limit {limit:g}), {row['seconds']:.0f} s, of processors {row['cpu_seconds']:.0f} s",
+                flush=True,
+            )
     travels, shares = [1e3 * row["L"] for row in rows], [row["feet"] / row["L"] for row in rows]
     print(
         f"{chosen.robot}, {len(rows)} initial fields: L median {statistics.median(travels):.2f} mm, "
         f"{min(travels):.2f} to {max(travels):.2f} mm; feet over centre at least {min(shares):.2f}; "
-        f"largest C {max(row['C'] for row in rows):.4f}"
+        f"largest C {max(row['C'] for row in rows):.4f}; {jobs} at a time with {threads} threads each on {processor()}"
     )
     return rows
 

@@ -227,37 +227,41 @@ class AugmentedLagrangian(nn.Module):
         return f"multiplier={float(self.multiplier):.6g}, penalty={float(self.penalty):.6g}, growth={self.growth}"
 
 
-class Tightening(nn.Module):
-    """The same loss with constant multiplier and penalty, for a limit that comes down step by step.
+class ExactPenalty(nn.Module):
+    """Loss of the same problem with a price on the violation, ``-L + price max(g, 0)``, that is given from outside.
 
-    The violation that it is given is of the limit of the iteration. Where the number of iterations is small, a limit
-    that comes down leaves the design free at first and holds at the end, with no plateau to wait for.
+    A price above the multiplier at the optimum holds the limit exactly (the exact penalty function, Nocedal and
+    Wright, Numerical Optimization, section 17.2), with no plateau to wait for where the number of iterations is small.
 
     Args:
-        penalty: Penalty sigma; the multiplier lambda is a twentieth of it.
+        price: At the end.
 
     Raises:
-        ValueError: The penalty is not finite and positive.
+        ValueError: The price is not finite and positive.
     """
 
     multiplier: Tensor
     penalty: Tensor
 
-    def __init__(self, *, penalty: float) -> None:
-        """Set both numbers."""
-        if not (math.isfinite(penalty) and penalty > 0.0):
-            raise ValueError(f"penalty: got {penalty!r}, want a finite number > 0")
+    def __init__(self, *, price: float) -> None:
+        """Start without a price."""
+        if not (math.isfinite(price) and price > 0.0):
+            raise ValueError(f"price: got {price!r}, want a finite number > 0")
         super().__init__()
-        self.register_buffer("penalty", torch.tensor(float(penalty), dtype=torch.float64), persistent=False)
-        self.register_buffer("multiplier", self.penalty / 20, persistent=False)
+        self.price = float(price)
+        self.register_buffer("multiplier", torch.tensor(0.0, dtype=torch.float64))
+        self.register_buffer("penalty", torch.tensor(0.0, dtype=torch.float64))
+
+    def demand(self, share: float) -> None:
+        """Set the price to a share of that at the end, from 0 to 1."""
+        self.multiplier.fill_(self.price * share)
 
     def forward(self, objective: Tensor, violation: Tensor) -> Tensor:
         """Return the loss to minimise, as :meth:`AugmentedLagrangian.forward`."""
-        excess = torch.relu(violation)
-        return -objective + self.multiplier.to(objective) * excess + 0.5 * self.penalty.to(objective) * excess.square()
+        return -objective + float(self.multiplier) * torch.relu(violation)
 
     def update(self, loss: float, violation: float) -> None:
-        """Take note of nothing: the limit follows the iterations."""
+        """Take note of nothing: the price follows the iterations."""
 
 
 def _finite(name: str, value: float) -> float:

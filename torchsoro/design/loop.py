@@ -13,24 +13,30 @@ from typing import Any
 import torch
 
 from torchsoro.design.field import DesignField
-from torchsoro.design.lagrangian import AugmentedLagrangian, Tightening
+from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
 from torchsoro.design.robot import Outcome, Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 
+Lagrangian = AugmentedLagrangian | ExactPenalty
 Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
 
 LARGEST_C = 0.25  # of any design
-MARGIN = 0.9  # of the limit on C that a limit which comes down ends at, since the loss does not hold it exactly
 WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
+MOST_LOST = 9  # iterations in a row whose gradients are not finite
 
 
-def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[torch.Tensor, Outcome]:
+def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[torch.Tensor, Outcome]:
     """Simulate the robot's design; where it breaks down or falls over, one nearer to the last that did not, ``good``.
 
     Falling counts where it is punished: a fallen robot's gradient says nothing about how to stand. If the last of three
     steps back still falls, that is what is returned.
+
+    Args:
+        robot: Its field is changed where it has to step back.
+        good: Design variable ``phi`` and sharpness ``beta`` of that design.
+        gravity_scale: Share of gravity.
 
     Raises:
         SimulationDiverged: if half and a quarter of the way, and the last good design, break down as well.
@@ -45,7 +51,9 @@ def simulate(robot: Robot, good: torch.Tensor, gravity_scale: float) -> tuple[to
             if left == 0:
                 raise
         with torch.no_grad():
-            robot.field.phi.lerp_(good.to(robot.field.phi), 0.5 if left > 1 else 1.0)
+            robot.field.phi.lerp_(good["phi"].to(robot.field.phi), 0.5 if left > 1 else 1.0)
+        if left == 1:
+            robot.field.beta = good["beta"]
     raise AssertionError
 
 
@@ -56,16 +64,17 @@ def fell(robot: Robot, outcome: Outcome) -> bool:
 
 
 def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
-    """What an iteration maximises besides C: travel less falling, in cells, as Adam wants gradients of order one.
+    """What an iteration maximises under the limit on C, in cells, as Adam wants gradients of order one.
 
-    A body that stands on one spot has next to no gradient by where it ends, whatever its legs; it has one by how far it
-    reaches while it is inflated. ``settings.inflated`` of that counts at first.
+    That is travel less falling, and less the mass as a share of the solid body's. A body that stands on one spot has
+    next to no gradient by where it ends, whatever its legs; it has one by how far it reaches while it is inflated:
+    ``settings.inflated`` of that counts at first, and nothing once the projection is sharp.
     """
     s = robot.settings
-    ahead = s.inflated * (1 - s.tightness(iteration))
-    lean = torch.relu(1.1 * WALKS * outcome.travel - outcome.feet)
-    whole = torch.lerp(outcome.travel, outcome.feet, s.feet) - s.feet * lean
-    return (torch.lerp(whole, outcome.inflated, ahead) - s.upright * outcome.fall) / robot.domain.cell
+    early = 1 - min(1.0, iteration / s.sharpen[1]) if s.sharpen[1] else 1.0
+    whole = torch.lerp(outcome.travel, outcome.feet, s.feet) - s.feet * leaning(outcome, 1.1 * WALKS)
+    way = torch.lerp(whole, outcome.inflated, s.inflated * early) - s.upright * outcome.fall
+    return way / robot.domain.cell - s.lightness * outcome.mass / robot.full_mass
 
 
 def worth_of(robot: Robot, outcome: Outcome) -> float:
@@ -73,13 +82,16 @@ def worth_of(robot: Robot, outcome: Outcome) -> float:
     s = robot.settings
     way = outcome.travel - s.upright * outcome.fall
     if s.feet > 0:
-        way = way - 4 * torch.relu(1.03 * WALKS * outcome.travel - outcome.feet)
+        way = way - 4 * leaning(outcome, 1.03 * WALKS)
     return float(way.detach()) / robot.domain.cell
 
 
-def better(
-    worth: float, violation: float, best: dict[str, Any] | None, lagrangian: AugmentedLagrangian | Tightening
-) -> bool:
+def leaning(outcome: Outcome, share: float) -> torch.Tensor:
+    """What the feet lack of a share of the travel of the centre of gravity [m]."""
+    return torch.relu(share * outcome.travel - outcome.feet)
+
+
+def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: Lagrangian) -> bool:
     """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
 
     As long as none is within the limit, what is gained and what is violated weigh as in the loss of now.
@@ -112,9 +124,9 @@ def restore(
     state: dict[str, Any],
     field: DesignField,
     adam: torch.optim.Adam,
-    lagrangian: AugmentedLagrangian | Tightening,
+    lagrangian: Lagrangian,
     path: Path,
-) -> tuple[bool, dict[str, Any] | None, torch.Tensor]:
+) -> tuple[bool, dict[str, Any] | None, dict[str, Any]]:
     """Put a checkpoint's state into field, optimizer and schedule.
 
     Args:
@@ -137,7 +149,7 @@ def restore(
     try:
         moments = [value for own in state["adam"]["state"].values() for value in own.values() if value.ndim]
         best = state["best"]
-        designs = [state["field"]["phi"], state["good"], *moments, *([] if best is None else [best["phi"]])]
+        designs = [one["phi"] for one in (state["field"], state["good"], best) if one is not None] + moments
         if wrong := [tuple(one.shape) for one in designs if one.shape != field.phi.shape]:
             raise ValueError(f"a design of shape {wrong[0]}, wanted {tuple(field.phi.shape)}")
         field.load_state_dict(state["field"])
@@ -148,17 +160,10 @@ def restore(
     return bool(state["stopped"]), best, state["good"]
 
 
-def limit_on_c(s: Settings, iteration: int) -> float:
-    """The limit on C that the loss of an iteration has: comes down by the same factor in each."""
-    if not s.tighten[1]:
-        return s.c_max
-    return LARGEST_C * (MARGIN * s.c_max / LARGEST_C) ** s.tightness(iteration)
-
-
-def _schedule(s: Settings) -> AugmentedLagrangian | Tightening:
+def _schedule(s: Settings) -> Lagrangian:
     """The loss under the limit on C."""
-    if s.tighten[1]:
-        return Tightening(penalty=s.penalty)
+    if s.sharpen[1]:
+        return ExactPenalty(price=s.penalty)
     return AugmentedLagrangian(
         previous=LARGEST_C - s.c_max,
         penalty=s.penalty,
@@ -193,44 +198,55 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     adam = new_adam()
     lagrangian = _schedule(s)
     stopped = False
-    good = field.phi.detach().clone()
+    good = {"phi": field.phi.detach().clone(), "beta": field.beta}
     best: dict[str, Any] | None = None
+    lost = 0  # iterations in a row without a gradient
     folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
     with folder as run:
         if state := run.load():
             stopped, best, good = restore(state, field, adam, lagrangian, run.path)
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
+            # Steps shrink as the projection sharpens, so that they change the density as before.
+            field.beta = s.sharpness(k)
+            if isinstance(lagrangian, ExactPenalty):
+                lagrangian.demand(s.sharpened(k))
+            for group in adam.param_groups:
+                group["lr"] = s.learning_rate * s.beta / field.beta
             gamma, outcome = simulate(robot, good, s.gravity_scale(k))
-            limit = limit_on_c(s, k)
-            violation = float(outcome.intermediate.detach()) - s.c_max
-            worth = worth_of(robot, outcome)
-            loss = lagrangian(aim(robot, outcome, k), outcome.intermediate - limit)
+            violation, goal = outcome.intermediate - s.c_max, aim(robot, outcome, k)
+            loss = lagrangian(goal.detach(), violation)
             middle = time.perf_counter()
+            # Only the gradient of the motion is clipped: beside that of a rough one the price of C would vanish.
+            (price,) = torch.autograd.grad(loss, field.phi, retain_graph=True)
             adam.zero_grad()
-            loss.backward()
-            if not fell(robot, outcome):
-                good = field.phi.detach().clone()
+            (-goal).backward()
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
-            if not bool(norm.isfinite()):
-                raise SimulationDiverged(
-                    step=0,
-                    time=0.0,
-                    particle=None,
-                    quantity=f"gradient of norm {float(norm)} in iteration {k}",
-                    remedy="a smaller step (dt), a lower pressure, or smaller weights (penalty, upright)",
-                )
-            if s.gravity_scale(k) == 1.0 and better(worth, violation, best, lagrangian):
-                best = {
-                    "iteration": k,
-                    "worth": worth,
-                    "violation": violation,
-                    "phi": field.phi.detach().clone(),
-                }
+            design = {"phi": field.phi.detach().clone(), "beta": field.beta}
+            if norm.isfinite():
+                lost = 0
+                if not fell(robot, outcome):
+                    good = design
+            else:
+                # Through so rough a motion it overflows and says nothing.
+                lost += 1
+                adam.zero_grad(set_to_none=False)
+                if lost > MOST_LOST:
+                    raise SimulationDiverged(
+                        step=0,
+                        time=0.0,
+                        particle=None,
+                        quantity=f"gradient of norm {float(norm)} in iteration {k} and the {MOST_LOST} before",
+                        remedy="a smaller step (dt), a lower pressure, or smaller weights (penalty, upright)",
+                    )
+            field.phi.grad += price
+            worth, excess = worth_of(robot, outcome), float(violation.detach())
+            if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):
+                best = {"iteration": k, "worth": worth, "violation": excess, **design}
             end = time.perf_counter()
             adam.step()
             field.clamp_()
-            event = lagrangian.update(loss.item(), violation)
+            event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
             stopped = event is not None and event.stop and s.gravity_scale(k) == 1.0
@@ -241,13 +257,13 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                     "objective/L": outcome.travel.detach(),
                     "objective/feet": outcome.feet.detach(),
                     "constraint/C": outcome.intermediate.detach(),
-                    "constraint/limit": limit,
                     "objective/fall": outcome.fall.detach(),
                     "mass": outcome.mass.detach(),
                     **{f"cog/{axis}": center[i] for i, axis in enumerate("xyz")},
                     "multiplier/C": lagrangian.multiplier,
                     "penalty/C": lagrangian.penalty,
                     "grad_norm/phi": norm,
+                    "field/beta": field.beta,
                     "field/gamma_mean": gamma.detach().mean(),
                     "simulation/dt": outcome.dt,
                     "time/forward": middle - begin,
@@ -263,5 +279,6 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
         if best is not None:
             with torch.no_grad():
                 field.phi.copy_(best["phi"])
+            field.beta = best["beta"]
         chosen = None if best is None else best["iteration"]
         return Optimized(gamma=field().detach(), iteration=chosen, metrics=run.metrics)

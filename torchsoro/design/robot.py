@@ -19,7 +19,7 @@ from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 from torchsoro.simulation.contact import Plane, ground
-from torchsoro.simulation.formulation import formulation_of
+from torchsoro.simulation.formulation import Formulation, formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
 from torchsoro.simulation.simulator import Simulator
@@ -92,9 +92,10 @@ class Robot(nn.Module):
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
+        self.formulation: Formulation = formulation_of(s.formulation, s.transfer)
         air = s.air_density
         if air == "auto":
-            air = formulation_of(s.formulation).air_density
+            air = self.formulation.air_density
         self.gas = Gas(stiffness=s.air_stiffness, viscosity=s.air_viscosity, density=air)
         self.prony = Prony.paper(s.elements)
         if s.material is not None:
@@ -109,6 +110,7 @@ class Robot(nn.Module):
         self.soles = _outermost(self.domain, planes).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
+        self.full_mass = float(everywhere.mass[~self.domain.gas].sum())
         s.check_memory(self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every))
 
     def forward(
@@ -251,8 +253,7 @@ class Robot(nn.Module):
             safety=0.9 / parts,
             low=(-half[0] - s.room, -half[1] - s.room, -s.room),
             high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
-            transfer=s.transfer,
-            formulation=s.formulation,
+            formulation=self.formulation,
             memory_budget=int(s.memory * 2**30) or None,
         )
 

@@ -143,26 +143,30 @@ class Settings:
     """Radius of the density filter [m]."""
     beta: Positive = 8.0
     """Sharpness of the projection."""
+    final_beta: Positive = 24.0
+    """The same from the second iteration of ``sharpen`` on."""
+    sharpen: tuple[CountOrZero, CountOrZero] = (0, 0)
+    """Iterations between which the projection sharpens, and steps shrink in proportion; 0 0 for the paper's, never."""
     counted: Literal["design", "body"] = "design"
     """Whose centre of gravity travels: the design domain's (the paper's) or the chamber wall's, too."""
     feet: _Density = 0.0
     """Share of the feet's travel, against that of the centre of gravity, in what is maximised; 0 in the paper."""
     inflated: _Density = 0.0
-    """Share at first of the travel at the end of the first inflation, in place of the whole; fades as C tightens."""
+    """Share at first of the travel while inflated, in place of the whole; fades until the projection is sharp."""
     upright: AtLeastZero = 0.0
     """Weight of falling over against travel; 0 in the paper, whose longer runs punish a fall by themselves."""
     sink: AtLeastZero = 0.02
     """What the centre of gravity may sink before it counts as falling, in heights of the body."""
+    lightness: AtLeastZero = 0.0
+    """Weight of the mass, as a share of the solid body's, against travel in cells; 0 in the paper."""
     learning_rate: Positive = 0.02
     """Of Adam."""
     clip: AtLeastZero = 3.0
-    """Largest norm of the gradient; 0 for any. A tumble has one of hundreds, which Adam would remember for long."""
+    """Largest norm of the motion's gradient; 0 for any. A tumble has one of hundreds, which Adam remembers."""
     c_max: Annotated[float, Field(strict=True, gt=0, lt=0.25)] = 0.0125
     """Largest allowed intermediate density C."""
-    tighten: tuple[CountOrZero, CountOrZero] = (0, 0)
-    """Iterations between which the limit on C comes down from its largest value; 0 0 for the paper's schedule."""
     penalty: Positive = 1e-3
-    """First penalty on C; that of a limit that comes down, which has a multiplier of a twentieth, stays."""
+    """First penalty on C; of a projection that sharpens, the price of C in the end."""
     growth: Annotated[float, Field(strict=True, gt=1, allow_inf_nan=False)] = 10.0
     """Factor by which the penalty grows at a plateau."""
     window: Count = 4
@@ -205,8 +209,8 @@ class Settings:
         if self.chamber_mesh is None and self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
             low = 0.05 * cavity
             raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
-        if self.tighten != (0, 0) and not self.tighten[0] < self.tighten[1]:
-            raise ValueError(f"tighten = {self.tighten}: wanted two increasing iterations, or 0 0")
+        if self.sharpen != (0, 0) and not self.sharpen[0] < self.sharpen[1]:
+            raise ValueError(f"sharpen = {self.sharpen}: wanted two increasing iterations, or 0 0")
         for flags in (("resume", "overwrite"), ("amend", "overwrite")):
             if all(getattr(self, flag) for flag in flags):
                 raise ValueError(f"{' and '.join(flags)}: wanted one of them, to go on with a run or to start again")
@@ -270,10 +274,14 @@ class Settings:
                 f"wanted at most the {have / 2**30:.3g} GiB of this {self.target.type}"
             )
 
-    def tightness(self, iteration: int) -> float:
-        """How far the limit on C has come down in an iteration: 0 at its largest, 1 at ``c_max``."""
-        first, last = self.tighten
+    def sharpened(self, iteration: int) -> float:
+        """How far the projection has sharpened in an iteration, from 0 to 1."""
+        first, last = self.sharpen
         return 1.0 if iteration >= last else max(0.0, (iteration - first) / (last - first))
+
+    def sharpness(self, iteration: int) -> float:
+        """Sharpness of the projection in an iteration: rises by the same factor in each."""
+        return self.beta * (self.final_beta / self.beta) ** self.sharpened(iteration) if self.sharpen[1] else self.beta
 
     def gravity_scale(self, iteration: int) -> float:
         """Share of gravity in an iteration (the climber's continuation): min(1, floor(k / every) / steps)."""
