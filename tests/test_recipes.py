@@ -285,7 +285,8 @@ class Shaky(torch.nn.Module):
 )
 def test_a_design_that_falls_over_or_breaks_down_goes_back_towards_the_last_good_one(recipes, limits, tried):
     robot, good = Shaky(**limits), {"phi": torch.zeros(3), "beta": 8.0}
-    gamma, outcome = loop.simulate(robot, good, 0.5)
+    gamma, outcome, back = loop.simulate(robot, good, 0.5)
+    assert back == (tried[-1] == 0)
     assert robot.tried == tried
     assert outcome.tried == tried[-1]
     assert gamma.requires_grad
@@ -311,12 +312,12 @@ def test_a_robot_has_fallen_when_it_sank_by_more_than_a_tenth_of_its_height(reci
 def test_a_fallen_design_is_not_what_later_ones_step_back_to(recipes, tmp_path, monkeypatch):
     recipe = recipes["walker"]
     monkeypatch.setattr(loop, "fell", lambda robot, outcome: True)
-    monkeypatch.setattr(loop, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field())))
+    monkeypatch.setattr(loop, "simulate", lambda robot, good, scale: (robot.field(), robot(robot.field()), False))
     monkeypatch.setattr(delivery, "report", lambda result, settings: "")
     monkeypatch.setattr(delivery, "deliver", lambda *_, **__: {})
     recipe.main(tiny(tmp_path / "run", iterations=2))
     start = walker(TINY).field.phi
-    assert torch.equal(items(tmp_path / "run")["good"]["phi"], start)
+    assert torch.equal(items(tmp_path / "run")["good"][-1]["phi"], start)
     assert not torch.equal(items(tmp_path / "run")["field"]["phi"], start)
 
 

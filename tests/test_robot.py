@@ -89,6 +89,12 @@ def test_feet_count_that_touch_the_ground_at_the_end_and_lean_nowhere_by_the_cub
     assert float(robot.feet(dataclasses.replace(seen, position=moved), gamma)) == pytest.approx(0.003 * half, rel=1e-5)
     moved[-1, ~front, 2] += 0.5 * robot.domain.spacing  # lifted
     assert float(robot.feet(dataclasses.replace(seen, position=moved), gamma)) == pytest.approx(0.003, rel=1e-5)
+    rear = math.exp(-1) * float(share[~front].sum())
+    part = float(share[front].sum()) / (float(share[front].sum()) + rear)
+    near = robot.feet(dataclasses.replace(seen, position=moved.requires_grad_()), gamma, near=True)
+    assert float(near.detach()) == pytest.approx(0.003 * part, rel=1e-5)
+    (gradient,) = torch.autograd.grad(near, moved)
+    assert (gradient[-1, ~front, 2] > 0).all()  # the rear ones, which did not move, count less farther up
 
 
 def test_the_gradient_reaches_phi_and_is_mirror_symmetric_to_the_bit(judged):

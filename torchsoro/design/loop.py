@@ -24,10 +24,11 @@ Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
 
 LARGEST_C = 0.25  # of any design
 WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
+KEPT = 8  # designs to step back to
 MOST_LOST = 9  # iterations in a row whose gradients are not finite
 
 
-def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[torch.Tensor, Outcome]:
+def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[torch.Tensor, Outcome, bool]:
     """Simulate the robot's design; where it breaks down or falls over, one nearer to the last that did not, ``good``.
 
     Falling counts where it is punished: a fallen robot's gradient says nothing about how to stand. If the last of three
@@ -38,6 +39,9 @@ def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[
         good: Design variable ``phi`` and sharpness ``beta`` of that design.
         gravity_scale: Share of gravity.
 
+    Returns:
+        Density, outcome, and whether they are those of the good design itself.
+
     Raises:
         SimulationDiverged: if half and a quarter of the way, and the last good design, break down as well.
     """
@@ -46,7 +50,7 @@ def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[
         try:
             outcome = robot(gamma, gravity_scale=gravity_scale)
             if left == 0 or not fell(robot, outcome):
-                return gamma, outcome
+                return gamma, outcome, left == 0
         except SimulationDiverged:
             if left == 0:
                 raise
@@ -72,23 +76,23 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
     """
     s = robot.settings
     early = 1 - min(1.0, iteration / s.sharpen[1]) if s.sharpen[1] else 1.0
-    whole = torch.lerp(outcome.travel, outcome.feet, s.feet) - s.feet * leaning(outcome, 1.1 * WALKS)
+    whole = torch.lerp(outcome.travel, outcome.soles, s.feet) - s.feet * leaning(outcome.travel, outcome.soles, 1.1)
     way = torch.lerp(whole, outcome.inflated, s.inflated * early) - s.upright * outcome.fall
     return way / robot.domain.cell - s.lightness * outcome.mass / robot.full_mass
 
 
 def worth_of(robot: Robot, outcome: Outcome) -> float:
-    """What a design is worth, in cells: travel less falling and, where feet count, less four times what is leaning."""
+    """What a design is worth, in cells: travel less falling and, where feet count, less ten times what is leaning."""
     s = robot.settings
     way = outcome.travel - s.upright * outcome.fall
     if s.feet > 0:
-        way = way - 4 * leaning(outcome, 1.03 * WALKS)
+        way = way - 10 * leaning(outcome.travel, outcome.feet, 1.03)
     return float(way.detach()) / robot.domain.cell
 
 
-def leaning(outcome: Outcome, share: float) -> torch.Tensor:
-    """What the feet lack of a share of the travel of the centre of gravity [m]."""
-    return torch.relu(share * outcome.travel - outcome.feet)
+def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Tensor:
+    """What the feet lack of the share of the travel that they make of a robot that walks, with a margin [m]."""
+    return torch.relu(margin * WALKS * travel - feet)
 
 
 def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: Lagrangian) -> bool:
@@ -126,7 +130,7 @@ def restore(
     adam: torch.optim.Adam,
     lagrangian: Lagrangian,
     path: Path,
-) -> tuple[bool, dict[str, Any] | None, dict[str, Any]]:
+) -> tuple[bool, dict[str, Any] | None, list[dict[str, Any]]]:
     """Put a checkpoint's state into field, optimizer and schedule.
 
     Args:
@@ -137,7 +141,7 @@ def restore(
         path: Folder of the run, for messages.
 
     Returns:
-        Whether the run has stopped; the best design so far; the last one that did not break down.
+        Whether the run has stopped; the best design so far; the last ones that did not break down.
 
     Raises:
         ValueError: if a part is missing, or of another shape than the lattice.
@@ -149,13 +153,13 @@ def restore(
     try:
         moments = [value for own in state["adam"]["state"].values() for value in own.values() if value.ndim]
         best = state["best"]
-        designs = [one["phi"] for one in (state["field"], state["good"], best) if one is not None] + moments
+        designs = [one["phi"] for one in (state["field"], *state["good"], best) if one is not None] + moments
         if wrong := [tuple(one.shape) for one in designs if one.shape != field.phi.shape]:
             raise ValueError(f"a design of shape {wrong[0]}, wanted {tuple(field.phi.shape)}")
         field.load_state_dict(state["field"])
         adam.load_state_dict(state["adam"])
         lagrangian.load_state_dict(state["lagrangian"])
-    except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+    except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"{where} does not fit the run ({error}); start another folder") from error
     return bool(state["stopped"]), best, state["good"]
 
@@ -198,7 +202,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     adam = new_adam()
     lagrangian = _schedule(s)
     stopped = False
-    good = {"phi": field.phi.detach().clone(), "beta": field.beta}
+    good: list[dict[str, Any]] = [{"phi": field.phi.detach().clone(), "beta": field.beta}]
     best: dict[str, Any] | None = None
     lost = 0  # iterations in a row without a gradient
     folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
@@ -213,7 +217,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                 lagrangian.demand(s.sharpened(k))
             for group in adam.param_groups:
                 group["lr"] = s.learning_rate * s.beta / field.beta
-            gamma, outcome = simulate(robot, good, s.gravity_scale(k))
+            gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k))
             violation, goal = outcome.intermediate - s.c_max, aim(robot, outcome, k)
             loss = lagrangian(goal.detach(), violation)
             middle = time.perf_counter()
@@ -225,8 +229,8 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             design = {"phi": field.phi.detach().clone(), "beta": field.beta}
             if norm.isfinite():
                 lost = 0
-                if not fell(robot, outcome):
-                    good = design
+                if not (back or fell(robot, outcome)):
+                    good = [*good[1 - KEPT :], design]
             else:
                 # Through so rough a motion it overflows and says nothing.
                 lost += 1
@@ -239,6 +243,8 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                         quantity=f"gradient of norm {float(norm)} in iteration {k} and the {MOST_LOST} before",
                         remedy="a smaller step (dt), a lower pressure, or smaller weights (penalty, upright)",
                     )
+            if back and len(good) > 1:
+                good.pop()  # the next failure goes farther back, or it would be the same again
             field.phi.grad += price
             worth, excess = worth_of(robot, outcome), float(violation.detach())
             if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):

@@ -47,7 +47,7 @@ _WALKER_DESK = dataclasses.replace(
     learning_rate=0.03,
     # Smaller than any norm: gradients count by their direction, as their norms grow a hundredfold within a few steps.
     clip=0.03,
-    penalty=0.4,
+    penalty=0.8,
     sharpen=(25, 67),
     frames=40,
     picture_every=20,
@@ -79,9 +79,9 @@ _CLIMBER_DESK = dataclasses.replace(
     sink=0.008,
     feet=0.0,
     inflated=0.0,
-    # Lighter bodies press too little on the walls to hold.
     lightness=0.0,
-    friction=2.0,
+    # Between walls, Coulomb friction holds only who presses on them: the first bodies slide down.
+    friction="stick",
     counted="body",
     gravity_steps=5,
     gravity_every=4,

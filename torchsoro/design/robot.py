@@ -33,6 +33,7 @@ class Outcome:
     Attributes:
         travel: L, Eq. 13 [m].
         feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
+        soles: The same with all soles, the less the farther off they are, which has a gradient by what touches [m].
         inflated: Travel of the centre of gravity when the valve closes for the first time [m].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
@@ -44,6 +45,7 @@ class Outcome:
 
     travel: Tensor
     feet: Tensor
+    soles: Tensor
     inflated: Tensor
     intermediate: Tensor
     mass: Tensor
@@ -153,7 +155,8 @@ class Robot(nn.Module):
         height = trajectory.center_of_gravity[:, 2]
         return Outcome(
             travel=until(end),
-            feet=self.feet(trajectory, gamma),
+            feet=self.feet(trajectory, gamma, near=False),
+            soles=self.feet(trajectory, gamma, near=True),
             inflated=until(s.settle + closes),
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(solid),
@@ -163,8 +166,8 @@ class Robot(nn.Module):
             dt=trajectory.dt,
         )
 
-    def feet(self, trajectory: Trajectory, gamma: Tensor) -> Tensor:
-        """Travel of the feet since the actuation starts [m]; zero if nothing touches at the end.
+    def feet(self, trajectory: Trajectory, gamma: Tensor, *, near: bool = False) -> Tensor:
+        """Travel of the feet since the actuation starts [m]; zero if there are none at the end.
 
         Feet are the particles of the outermost layers that touch a plane at the end, to a quarter of a spacing; they
         count by the cube of their density.
@@ -172,15 +175,16 @@ class Robot(nn.Module):
         Args:
             trajectory: With those layers among its probes.
             gamma: Density [N].
+            near: Count all of those layers, by exp(-2 h / spacing) at a height h above the touch, instead.
         """
         at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
         place, probes = trajectory.position[:, at], trajectory.probes[at]
         first = int((trajectory.time - self.settings.settle).abs().argmin())
-        touches = torch.zeros_like(place[-1, :, 0], dtype=torch.bool)
-        for plane in self.planes:
-            above = plane.side * (place[-1, :, plane.axis].detach() - float(plane.offset))
-            touches |= above < 0.75 * self.domain.spacing
-        share = gamma[probes].clamp(min=0) ** 3 * touches
+        spacing = self.domain.spacing
+        away = [plane.side * (place[-1, :, plane.axis] - float(plane.offset)) for plane in self.planes]
+        height = torch.relu(torch.stack(away).amin(0) - 0.5 * spacing)
+        counts = torch.exp(-2 * height / spacing) if near else (height.detach() < 0.25 * spacing).to(height)
+        share = gamma[probes].clamp(min=0) ** 3 * counts
         moved = (place[-1] - place[first]) @ place.new_tensor(self.direction)
         return (share * moved).sum() / share.sum().clamp(min=torch.finfo(share.dtype).tiny)
 
