@@ -43,11 +43,11 @@ _WALKER_DESK = dataclasses.replace(
     # Feet that slide have gradients where feet that stick know only jumps.
     friction=0.8,
     # What does not help is left out: most designs that stall are heavy ones. With more, too little is left to stand on.
-    lightness=0.3,
+    lightness=0.1,
     learning_rate=0.03,
     # Smaller than any norm: gradients count by their direction, as their norms grow a hundredfold within a few steps.
     clip=0.03,
-    penalty=0.8,
+    penalty=0.5,
     sharpen=(25, 67),
     frames=40,
     picture_every=20,
@@ -82,6 +82,8 @@ _CLIMBER_DESK = dataclasses.replace(
     lightness=0.0,
     # Between walls, Coulomb friction holds only who presses on them: the first bodies slide down.
     friction="stick",
+    penalty=0.8,
+    sharpen=(12, 46),
     counted="body",
     gravity_steps=5,
     gravity_every=4,
