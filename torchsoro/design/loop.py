@@ -245,7 +245,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                     )
             if back and len(good) > 1:
                 good.pop()  # the next failure goes farther back, or it would be the same again
-            field.phi.grad += price
+            field.phi.grad = price if field.phi.grad is None else field.phi.grad + price
             worth, excess = worth_of(robot, outcome), float(violation.detach())
             if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):
                 best = {"iteration": k, "worth": worth, "violation": excess, **design}
