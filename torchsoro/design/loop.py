@@ -82,11 +82,11 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
 
 
 def worth_of(robot: Robot, outcome: Outcome) -> float:
-    """What a design is worth, in cells: travel less falling and, where feet count, less ten times what is leaning."""
+    """What a design is worth, in cells: travel less falling and, where feet count, next to nothing if it leans."""
     s = robot.settings
     way = outcome.travel - s.upright * outcome.fall
     if s.feet > 0:
-        way = way - 10 * leaning(outcome.travel, outcome.feet, 1.03)
+        way = way - 100 * leaning(outcome.travel, outcome.feet, 1.01)
     return float(way.detach()) / robot.domain.cell
 
 
