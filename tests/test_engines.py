@@ -37,13 +37,13 @@ def on_a_gpu(
 ):
     for i in range(COUNT):
         f, q, b = matrix(F, i), matrix(Q, i), matrix(B, i)
-        put(out, i, 0, stress.piola(f, q, bulk, shear, factor, void_fraction))
-        by_F, by_Q, by_bulk, by_shear, by_factor, by_void = stress.piola_adjoint(
-            f, q, bulk, shear, factor, void_fraction, b
+        put(out, i, 0, stress.piola(f, q, bulk, shear, shear, factor, void_fraction))
+        by_F, by_Q, by_bulk, by_solid, by_shear, by_factor, by_void = stress.piola_adjoint(
+            f, q, bulk, shear, shear, factor, void_fraction, b
         )
         put(out, i, 9, by_F)
         put(out, i, 18, by_Q)
-        out[i, 27], out[i, 28], out[i, 29], out[i, 30] = by_bulk, by_shear, by_factor, by_void
+        out[i, 27], out[i, 28], out[i, 29], out[i, 30] = by_bulk, by_solid + by_shear, by_factor, by_void
         if void_fraction < 1:
             least = stress.least_ratio(void_fraction)
             put(out, i, 31, stress.pull_back(f, least))

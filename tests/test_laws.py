@@ -34,7 +34,7 @@ def arguments(name: str) -> np.ndarray:
             column = rng.integers(0, 2, STATES)
         elif argument == "push":
             column = rng.choice([0.0, 0.5], STATES)
-        elif argument in ("dt", "reach", "sink"):
+        elif argument in ("dt", "reach", "sink", "depth", "span"):
             column = rng.uniform(0.2, 1, STATES)
         elif argument == "touch":
             column = rng.uniform(0.05, 0.2, STATES)

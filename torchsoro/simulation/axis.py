@@ -123,6 +123,14 @@ class Axis:
         return ((self.knots[2:-1] - self.knots[1:-2]) / 2) ** 2
 
     @cached_property
+    def lengths(self) -> np.ndarray:
+        """Integrals of the splines over the cells [nodes] m: what of the axis is each node's own."""
+        weight, _ = self.table
+        found = np.zeros(self.nodes)
+        np.add.at(found, self.first[:, None] + np.arange(3), weight.sum(1) * self.widths[:, None] / 2)
+        return found
+
+    @cached_property
     def spans(self) -> np.ndarray:
         """Mean width of the cells that a node's spline covers [nodes] m."""
         k = self.knots

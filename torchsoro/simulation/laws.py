@@ -1,4 +1,4 @@
-"""Laws of contact and drag, as functions of numbers: one text, which Taichi, lanes of a CPU and plain Python run.
+"""Laws of contact, drag and softening as functions of numbers: one text, for Taichi, lanes of a CPU and plain Python.
 
 ``kernels.laws_taichi`` and ``kernels.laws_lanes`` compile it. So that all three read it alike, and lanes of a vector
 register go through it together, a law
@@ -289,3 +289,34 @@ def quadratic_drag_adjoint(u, sink, r_bar):
     left = 1 / (1 + sink * abs(u))
     u_bar = r_bar * left * left
     return u_bar, -u * abs(u) * u_bar
+
+
+def softening(x, largest, depth, span):
+    """How a solid softens below its largest stretch so far, after Mullins.
+
+    Args:
+        x: Stretch, I1b - 3.
+        largest: Its largest value before.
+        depth: Largest share of the shear modulus that is lost.
+        span: By how much less than its largest the stretch is where half of that is lost, above 0.
+
+    Returns:
+        The share of the shear modulus that is left, and the largest stretch with this one.
+    """
+    below = max(largest - x, x * 0)
+    return 1 - depth * below / (below + span), x + below
+
+
+def softening_adjoint(x, largest, depth, span, left_bar, largest_bar):
+    """Adjoint of :func:`softening`: gradients by stretch, largest stretch before, depth and span."""
+    below = max(largest - x, x * 0)
+    back = 1 / (below + span)
+    below_bar = x * 0
+    if below > 0:
+        below_bar = largest_bar - left_bar * depth * span * back * back
+    return (
+        largest_bar - below_bar,
+        below_bar,
+        -left_bar * below * back,
+        left_bar * depth * below * back * back,
+    )

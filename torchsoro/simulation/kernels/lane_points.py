@@ -21,6 +21,9 @@ from torchsoro.simulation.kernels.lane_laws import (
     viscous_piola,
 )
 from torchsoro.simulation.kernels.lanes import any_lane, larger, law, load, select, store
+from torchsoro.simulation.kernels.laws_lanes import laws
+
+softening = laws.softening
 
 # Numbers of a point.
 VOLUME, BULK, SHEAR, VOID_FRACTION, STIFFENING, VISCOSITY, VOLUME_VISCOSITY = 0, 1, 2, 3, 4, 6, 7
@@ -179,15 +182,6 @@ def stiffening(F, ratio, least, numbers, n):
 
 
 @law
-def softening(F, ratio, law_numbers, at, past, before, future, after):
-    """Share of the shear modulus that is left below the largest x so far, which is kept: 1 - d u / (1 + u)."""
-    x, _ = excess(F, ratio)
-    below = larger(load(past, before) - x, 0.0)
-    store(future, after, x + below)
-    return 1 - load(law_numbers, at) * below / (below + load(law_numbers, at + 16))
-
-
-@law
 def added(S, past, before, future, after, elements, maxwell, m):
     """Q = sum g (Z + b S) over the Maxwell elements, and their states: Z becomes a Z - b (1 - a) S."""
     Q0, Q1, Q2, Q3, Q4, Q5 = 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0], 0 * S[0]
@@ -240,7 +234,9 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
             factor = factor * stiffening(F, ratio, least, numbers, n)
         if flags[1]:
             end = 96 * elements
-            left = softening(F, larger(ratio, least), softens, 0, past, before + end, future, after + end)
+            x, _ = excess(F, larger(ratio, least))
+            left, largest = softening(x, load(past, before + end), load(softens, 0), load(softens, 16))
+            store(future, after + end, select(void_fraction < 1, largest, 0 * largest))
             solid = shear * left
     S = (factor, factor, factor, factor, factor, factor)
     if elements > 0:

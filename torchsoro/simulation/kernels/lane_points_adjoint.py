@@ -38,6 +38,9 @@ from torchsoro.simulation.kernels.lane_points import (
 )
 from torchsoro.simulation.kernels.lane_walls import walls_backward
 from torchsoro.simulation.kernels.lanes import fast, larger, law, load, select, store
+from torchsoro.simulation.kernels.laws_lanes import laws
+
+softening, softening_adjoint = laws.softening, laws.softening_adjoint
 
 
 @law
@@ -79,7 +82,7 @@ def point_adjoint(
     there = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
     factor, left, solid = there, 0 * volume + 1, shear
     x, shrink, linear, square = 0 * volume, 0 * volume, 0 * volume, 0 * volume
-    below, _largest, depth, reach = 0 * volume, 0 * volume, 0 * volume, 0 * volume + 1
+    depth, reach = 0 * volume, 0 * volume + 1
     end = 96 * elements
     if flags[0] or flags[1]:
         x, shrink = excess(F, larger(ratio, least))
@@ -88,8 +91,7 @@ def point_adjoint(
             factor = there * (1 + x * (linear + square * x))
         if flags[1]:
             depth, reach = load(softens, 0), load(softens, 16)
-            below = larger(load(past, before + end) - x, 0.0)
-            left = 1 - depth * below / (below + reach)
+            left, _ = softening(x, load(past, before + end), depth, reach)
             solid = shear * left
     T = (0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor)
     Q0, Q1, Q2, Q3, Q4, Q5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
@@ -153,14 +155,14 @@ def point_adjoint(
             add(sums.numbers, number_sums + 16 * STIFFENING, factor_bar * x)
             add(sums.numbers, number_sums + 16 * STIFFENING + 16, factor_bar * x * x)
         if flags[1]:
-            left_bar = volume * shear * solid_bar
-            sum_ = 1 / (below + reach)
-            later = load(bars, after + end)
-            add(sums.softening, s_sums, -left_bar * below * sum_)
-            add(sums.softening, s_sums + 16, left_bar * depth * below * sum_ * sum_)
-            below_bar = select(below > 0, later - left_bar * depth * reach * sum_ * sum_, 0 * x)
-            store(bars, after + end, below_bar)
-            x_bar = x_bar + later - below_bar
+            later = select(void_fraction < 1, load(bars, after + end), 0 * x)
+            by_x, largest_bar, depth_bar, reach_bar = softening_adjoint(
+                x, load(past, before + end), depth, reach, volume * shear * solid_bar, later
+            )
+            add(sums.softening, s_sums, depth_bar)
+            add(sums.softening, s_sums + 16, reach_bar)
+            store(bars, after + end, largest_bar)
+            x_bar = x_bar + by_x
         x_bar = select(x > 0, x_bar, 0 * x)
         J = larger(ratio, least)
         J_bar = select(ratio < least, 0 * x, -2 * (x + 3) * x_bar / (3 * J))

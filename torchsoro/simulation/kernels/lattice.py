@@ -10,6 +10,7 @@ from torchsoro.simulation.kernels.layout import (
     AXES,
     AXIS,
     FIRSTS,
+    HISTORIES,
     MX,
     MY,
     MZ,
@@ -86,3 +87,9 @@ def gather_value(head: ti.template(), ints: ti.template(), fixed: ti.template(),
                 for c in ti.static(range(3)):
                     u[c] += weight * a[line + c * nodes + k]
     return u
+
+
+@ti.func
+def state_length(head: ti.template()):
+    """Numbers in the state of a simulation of the total-Lagrangian form."""
+    return 6 * product(nodes_per_axis(head)) + head[HISTORIES] * product(points_per_axis(head))

@@ -75,10 +75,16 @@ def lattice_components(nodes: int, points: int, elements: int, softens: bool = F
 COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
-    *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks"),
+    *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "history"),
+    *("faced", "ties", "pushes", "wall_chunks"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
-VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS = range(16, 25)
+VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
+FACED, TIES, PUSHES, WALL_CHUNKS = range(26, 30)
+
+# What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
+# soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers.
+LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW = (2**n for n in range(7))
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
 # kept of every substep beside the states; what points and nodes hand each other, forward and (from FORCES) backward;
@@ -86,26 +92,41 @@ VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS = ra
 BUFFERS = {
     "integers": (
         *("kind", "plane_kind", "firsts", "tiles", "chamber_start", "slot_start", "slot_chamber", "sources"),
-        "near_nodes",
+        *("near_nodes", "wall_chunk", "wall_kind", "wall_start", "wall_entry"),
     ),
-    "fixed": ("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share"),
+    "fixed": (
+        *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
+        *("quadratic", "tie_share", "ties", "node_share", "walls"),
+    ),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed"),
-    "scratch": ("partials", "swept", "pads"),
+    "scratch": ("partials", "swept", "pads", "tension", "normals"),
     "backward": ("forces", "surfaces", "volume_bar", "jacobians"),
     "sums": tuple(
         f"{name}_bar"
-        for name in ("coefficients", "prony", "pressure", "gravity", "force", "plane_numbers", "nodal", "chamber")
+        for name in (
+            *("coefficients", "prony", "pressure", "gravity", "force", "plane_numbers", "nodal", "chamber"),
+            *("softening", "quadratic", "ties"),
+        )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(25, 34)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE = range(34, 41)
-PRESSURE, GRAVITY, FORCE = range(41, 44)
-VOLUMES, PUSHED = range(44, 46)
-PARTIALS, SWEPT, PADS = range(46, 49)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(49, 53)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(53, 61)
-HEAD = 61
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(30, 39)
+WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY = range(39, 43)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(43, 52)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS = range(52, 57)
+PRESSURE, GRAVITY, FORCE = range(57, 60)
+VOLUMES, PUSHED = range(60, 62)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(62, 67)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(67, 71)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(71, 79)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(79, 82)
+HEAD = 82
+
+# A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
+# nodes the weight and two slopes; what it hands to its nodes at most: five vectors.
+WALL_INTEGERS = 3
+WALL = 4 + 3 * 27
+WALL_VECTORS = 15
 
 # Numbers of the lattice: substep, edge of a cell for contact; then the axes one after the other: for each point the
 # weights of its three nodes and their slopes by the reference place; places of the particles; places of the nodes.

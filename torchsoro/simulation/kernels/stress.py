@@ -39,32 +39,48 @@ def fade(ratio, least):
 
 
 @ti.func
-def stiffening(F, least, a, b):
-    """Factor 1 + a x + b x^2 of the shear modulus at x = I1b - 3.
+def excess(F, least):
+    """Stretch x = I1b - 3 of a solid.
 
     J counts as at least ``least``, here and in the other laws of the solid, and x as at least 0: only a crushed point
-    has less. Kernels without stiffening leave this out and take 1, which the compiler then leaves out, too.
+    has less.
     """
     J = ti.max(F.determinant(), least)
-    x = ti.max(ti.exp(-2 * ti.log(J) / 3) * contract(F, F) - 3, 0)
+    return ti.max(ti.exp(-2 * ti.log(J) / 3) * contract(F, F) - 3, 0)
+
+
+@ti.func
+def excess_adjoint(F, least, x_bar):
+    """Adjoint of :func:`excess`: the gradient by F."""
+    cof = cofactor(F)
+    ratio = contract(cof, F) / 3
+    J = ti.max(ratio, least)
+    shrink = ti.exp(-2 * ti.log(J) / 3)
+    x = ti.max(shrink * contract(F, F) - 3, 0)
+    used = x_bar
+    if x == 0:  # cut off
+        used = 0 * J
+    J_bar = -2 * (x + 3) * used / (3 * J)
+    if ratio < least:
+        J_bar = 0 * J
+    return (2 * shrink * used) * F + J_bar * cof
+
+
+@ti.func
+def stiffening(F, least, a, b):
+    """Factor 1 + a x + b x^2 of the shear modulus at x = I1b - 3 (:func:`excess`).
+
+    Kernels without stiffening leave this out and take 1, which the compiler then leaves out, too.
+    """
+    x = excess(F, least)
     return 1 + x * (a + b * x)
 
 
 @ti.func
 def stiffening_adjoint(F, least, a, b, factor_bar):
     """Adjoint of :func:`stiffening`: gradients by F, a and b."""
-    cof = cofactor(F)
-    ratio = contract(cof, F) / 3
-    J = ti.max(ratio, least)
-    shrink = ti.exp(-2 * ti.log(J) / 3)
-    x = ti.max(shrink * contract(F, F) - 3, 0)
-    x_bar = factor_bar * (a + 2 * b * x)
-    if x == 0:  # cut off
-        x_bar = 0 * J
-    J_bar = -2 * (x + 3) * x_bar / (3 * J)
-    if ratio < least:
-        J_bar = 0 * J
-    return (2 * shrink * x_bar) * F + J_bar * cof, factor_bar * x, factor_bar * x * x
+    x = excess(F, least)
+    return excess_adjoint(F, least, factor_bar * (a + 2 * b * x)), factor_bar * x, factor_bar * x * x
 
 
 @ti.func
@@ -180,41 +196,45 @@ def void_work(F, P_bar):
 
 
 @ti.func
-def piola(F, Q, bulk, shear, factor, void_fraction):
-    """First Piola stress of a solid of which a share ``void_fraction`` (0 to 1) is void; void does not stiffen."""
+def piola(F, Q, bulk, solid, shear, factor, void_fraction):
+    """First Piola stress of a solid of which a share ``void_fraction`` (0 to 1) is void; void does not stiffen.
+
+    ``solid`` is the solid's shear modulus, ``shear`` that of void: the same, unless the solid has softened.
+    """
     P = F * 0
     if void_fraction < 1:
-        P = (1 - void_fraction) * solid_piola(F, Q, bulk, shear, factor, least_ratio(void_fraction))
+        P = (1 - void_fraction) * solid_piola(F, Q, bulk, solid, factor, least_ratio(void_fraction))
     if void_fraction > 0:
         P += void_fraction * void_piola(F, shear)
     return P
 
 
 @ti.func
-def piola_adjoint(F, Q, bulk, shear, factor, void_fraction, P_bar):
-    """Adjoint of :func:`piola`: gradients by F, Q, bulk and shear modulus, factor and void_fraction.
+def piola_adjoint(F, Q, bulk, solid, shear, factor, void_fraction, P_bar):
+    """Adjoint of :func:`piola`: gradients by F, Q, bulk modulus, both shear moduli, factor and void_fraction.
 
     At a void fraction of exactly 0 the last is the derivative from above; at exactly 1 it is 0.
     """
     F_bar = F * 0
     Q_bar = F * 0
     bulk_bar = shear * 0
+    solid_bar = shear * 0
     shear_bar = shear * 0
     factor_bar = shear * 0
     void_bar = shear * 0
     if void_fraction < 1:
-        by_F, by_Q, by_bulk, by_shear, by_factor = solid_piola_adjoint(
-            F, Q, bulk, shear, factor, least_ratio(void_fraction), P_bar
+        by_F, by_Q, by_bulk, by_solid, by_factor = solid_piola_adjoint(
+            F, Q, bulk, solid, factor, least_ratio(void_fraction), P_bar
         )
         F_bar, Q_bar = (1 - void_fraction) * by_F, (1 - void_fraction) * by_Q
-        bulk_bar, shear_bar = (1 - void_fraction) * by_bulk, (1 - void_fraction) * by_shear
+        bulk_bar, solid_bar = (1 - void_fraction) * by_bulk, (1 - void_fraction) * by_solid
         factor_bar = (1 - void_fraction) * by_factor
         # Both laws are linear in their moduli.
-        void_bar = shear * void_work(F, P_bar) - (bulk * by_bulk + shear * by_shear)
+        void_bar = shear * void_work(F, P_bar) - (bulk * by_bulk + solid * by_solid)
     if void_fraction > 0:
         F_bar += void_fraction * void_piola_adjoint(F, shear, P_bar)
-        shear_bar += void_fraction * void_work(F, P_bar)
-    return F_bar, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar
+        shear_bar = void_fraction * void_work(F, P_bar)
+    return F_bar, Q_bar, bulk_bar, solid_bar, shear_bar, factor_bar, void_bar
 
 
 @ti.func

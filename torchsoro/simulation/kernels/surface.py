@@ -15,8 +15,10 @@ from torchsoro.simulation.kernels.contact import plane_contact, plane_contact_ad
 from torchsoro.simulation.kernels.lattice import node_place, nodes_per_axis, product
 from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
+    AREA,
     BATCH,
     EDGE,
+    FACED,
     NODAL,
     NODAL_REACH,
     NODES,
@@ -140,23 +142,33 @@ def surface_place(ints: ti.template(), fixed: ti.template(), state: ti.template(
 
 
 @ti.func
-def plane_of(ints: ti.template(), fixed: ti.template(), b, k, reaches, mass):
+def plane_of(ints: ti.template(), fixed: ti.template(), b, k, reaches):
     """Of plane k: unit normal to the free side, distance from the origin along it, and what ``plane_contact`` takes.
 
-    These are: stick, friction, pull-off speed that adhesion cancels in a step, its reach, push. Adhesion reaches to the
-    nodes whose matter faces the plane.
+    These are: stick, friction, reach of adhesion, push. Adhesion reaches to the nodes whose matter faces the plane.
     """
     plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
     kind = ints[PLANE_KIND] + k * PLANE_INTEGERS
     edge, sign = fixed[EDGE], ints[kind + PLANE_SIGN]
     n, level = sign * load_vector(fixed, plane + PLANE_NORMAL, 1), sign * fixed[plane + PLANE_OFFSET]
     stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
-    hold = fixed[plane + PLANE_ADHESION] * edge * edge * fixed[STEP_SIZE] / mass
     reach = fixed[plane + PLANE_REACH]
-    if not reaches.dot(n) > 0:
+    if ints[FACED] == 0 and not reaches.dot(n) > 0:
         reach = reach * 0
     push = edge * 0 + laws.PUSH * ints[kind + PLANE_ELASTIC]
-    return n, level, stick, friction, hold, reach, push
+    return n, level, stick, friction, reach, push
+
+
+@ti.func
+def adhesion_speed(ints: ti.template(), fixed: ti.template(), b, k, i, mass):
+    """Pull-off speed of node i that adhesion to plane k cancels in a step, and that for an adhesion of one.
+
+    A node that meets no planes has a negative area.
+    """
+    one = b * ints[PLANES] + k
+    area = fixed[ints[AREA] + one * product(nodes_per_axis(ints)) + i]
+    per_adhesion = area * fixed[STEP_SIZE] / mass
+    return fixed[ints[PLANE_NUMBERS] + one * PLANE + PLANE_ADHESION] * per_adhesion, per_adhesion
 
 
 @ti.func
@@ -169,8 +181,9 @@ def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.templa
     node = current_place(ints, fixed, state, at, i, m)
     reaches = reaches_of(ints, fixed, b, i, product(m))
     for k in range(count):
-        normal, level, stick, friction, hold, reach, push = plane_of(ints, fixed, b, k, reaches, mass)
-        if node.dot(normal) - level < laws.LOOK * edge + reach:
+        normal, level, stick, friction, reach, push = plane_of(ints, fixed, b, k, reaches)
+        hold, per_adhesion = adhesion_speed(ints, fixed, b, k, i, mass)
+        if per_adhesion >= 0 and node.dot(normal) - level < laws.LOOK * edge + reach:
             gap = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps).dot(normal) - level
             after, way = plane_contact(r, normal, gap, dt, stick, friction, hold, reach, laws.TOUCH * edge, push)
             r = after
@@ -206,8 +219,9 @@ def surface_response_adjoint(
     reaches = reaches_of(ints, fixed, b, i, nodes)
     for back in range(ints[PLANES]):
         k = ints[PLANES] - 1 - back
-        normal, level, stick, friction, hold, reach, push = plane_of(ints, fixed, b, k, reaches, mass)
-        if node.dot(normal) - level < laws.LOOK * edge + reach:
+        normal, level, stick, friction, reach, push = plane_of(ints, fixed, b, k, reaches)
+        hold, per_adhesion = adhesion_speed(ints, fixed, b, k, i, mass)
+        if per_adhesion >= 0 and node.dot(normal) - level < laws.LOOK * edge + reach:
             surface = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps)
             gap = surface.dot(normal) - level
             arriving, _ = surface_response(ints, fixed, state, at, b, i, k, mass, u)
@@ -220,7 +234,7 @@ def surface_response_adjoint(
             bar = ints[PLANE_BAR] + (b * ints[PLANES] + k) * PLANE * nodes + i
             add(False, sums, bar + PLANE_OFFSET * nodes, -sign * gap_bar)
             add(False, sums, bar + PLANE_FRICTION * nodes, by_friction)
-            add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * edge * edge * dt / mass)
+            add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * per_adhesion)
             mass_bar -= hold_bar * hold / mass
             for c in ti.static(range(3)):
                 add(False, sums, bar + (PLANE_NORMAL + c) * nodes, sign * by_normal[c])

@@ -11,6 +11,8 @@ On a GPU the pad is the block's shared memory and begins at 0, on a CPU a part o
 of a block do is written as a loop over those from ``q0`` to ``q1``: one on a GPU, all on a CPU.
 """
 
+from typing import Any, NamedTuple
+
 import taichi as ti
 
 from torchsoro.simulation.kernels.lattice import axis_starts, nodes_per_axis, product
@@ -21,6 +23,7 @@ from torchsoro.simulation.kernels.layout import (
     CHAMBER_START,
     CHAMBERS,
     HEAD,
+    LOADED,
     NY,
     NZ,
     PAD,
@@ -55,6 +58,44 @@ TOTALS = TILE + PARTS
 KEPT = HEAD + 14
 
 
+class Block(NamedTuple):
+    """What a block of threads works with, for functions that are told at compile time; see ``layout`` for the buffers.
+
+    Attributes:
+        gpu: Whether threads are those of a GPU, from ``q0`` to before ``q1``: one each; else a loop runs over all.
+        features: What the kernel is compiled for.
+        head: Beginning of ``ints``, at hand.
+        pad: Where the block works, from ``base`` on.
+    """
+
+    gpu: bool
+    features: int
+    head: Any
+    pad: Any
+    base: Any
+    q0: Any
+    q1: Any
+    ints: Any
+    fixed: Any
+    supply: Any
+    state: Any
+    kept: Any
+    scratch: Any
+    bar: Any = None
+    back: Any = None
+    sums: Any = None
+
+
+def on_cpu(features, base, ints, *buffers):
+    """The block of an iteration of a parallel loop on a CPU, whose pad begins at ``base`` of ``scratch``."""
+    return Block(False, features, ints, buffers[4], base, 0, TILE, ints, *buffers)
+
+
+def on_gpu(features, head, pad, q, *buffers):
+    """The block of a thread on a GPU."""
+    return Block(True, features, head, pad, 0, q, q + 1, *buffers)
+
+
 @ti.func
 def sync(gpu: ti.template()):
     """Wait for the other threads of the block."""
@@ -63,11 +104,11 @@ def sync(gpu: ti.template()):
 
 
 @ti.func
-def thread(gpu: ti.template(), head: ti.template(), each):
+def thread(block: ti.template(), each):
     """Number of a thread, read anew: else what follows from it would be kept, in slow memory, from the start."""
     q = each
-    if ti.static(gpu):
-        q += head[HEAD]  # 0
+    if ti.static(block.gpu):
+        q += block.head[HEAD]  # 0
     return q
 
 
@@ -123,7 +164,7 @@ def tile_number(head: ti.template(), ints: ti.template(), item, k):
 
 
 @ti.func
-def tile_box(gpu: ti.template(), fresh, head: ti.template(), ints: ti.template(), item, each):
+def tile_box(block: ti.template(), fresh, item):
     """What is to be known of a tile, number ``item`` of all simulations; a GPU keeps it at hand until ``fresh``.
 
     Returns:
@@ -131,15 +172,15 @@ def tile_box(gpu: ti.template(), fresh, head: ti.template(), ints: ti.template()
         the tile's number in it.
     """
     box = ti.Vector([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
-    if ti.static(gpu):
-        if fresh == 1 and each < 13:
-            head[HEAD + 1 + each] = tile_number(head, ints, item, each)
-        sync(gpu)
+    if ti.static(block.gpu):
+        if fresh == 1 and block.q0 < 13:
+            block.head[HEAD + 1 + block.q0] = tile_number(block.head, block.ints, item, block.q0)
+        sync(block.gpu)
         for k in ti.static(range(13)):
-            box[k] = head[HEAD + 1 + k]
+            box[k] = block.head[HEAD + 1 + k]
     else:
         for k in ti.static(range(13)):
-            box[k] = tile_number(head, ints, item, k)
+            box[k] = tile_number(block.head, block.ints, item, k)
     cell, cells = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
     return cell, cells, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
 
@@ -174,23 +215,12 @@ def near(place):
 
 
 @ti.func
-def stage(
-    gpu: ti.template(),
-    head: ti.template(),
-    a: ti.template(),
-    at,
-    pad: ti.template(),
-    base,
-    number: ti.template(),
-    node,
-    q0,
-    q1,
-):
+def stage(block: ti.template(), a: ti.template(), at, number: ti.template(), node):
     """Copy a vector field at the nodes of a tile to the pad, as its field of that number."""
-    m = nodes_per_axis(head)
+    m = nodes_per_axis(block.head)
     nodes = product(m)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         for part in ti.static(range((SLOT + TILE - 1) // TILE)):
             one = q + part * TILE
             if one < SLOT:
@@ -199,35 +229,25 @@ def stage(
                 x = ti.min(node[0] + i // ti.static(TILE_Y * TILE_Z), m[0] - 1)
                 y = ti.min(node[1] + i // TILE_Z % TILE_Y, m[1] - 1)
                 z = ti.min(node[2] + i % TILE_Z, m[2] - 1)
-                pad[base + field_start(number) + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
+                block.pad[block.base + field_start(number) + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
 
 
 @ti.func
-def stage_axes(
-    gpu: ti.template(),
-    head: ti.template(),
-    fixed: ti.template(),
-    pad: ti.template(),
-    base,
-    cell,
-    cells,
-    q0,
-    q1,
-):
+def stage_axes(block: ti.template(), cell, cells):
     """Copy weights and slopes of a tile's points along the axes to the pad; zeros for cells that it has not."""
-    starts = axis_starts(head)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+    starts = axis_starts(block.head)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         if q < ti.static(AXIS * (WIDE + DEEP + HIGH)):
             p, start, first, count = q // AXIS, starts[0], cell[0], cells[0]
             if p >= ti.static(WIDE + DEEP):
                 p, start, first, count = p - ti.static(WIDE + DEEP), starts[2], cell[2], cells[2]
             elif p >= WIDE:
                 p, start, first, count = p - WIDE, starts[1], cell[1], cells[1]
-            number = fixed[STEP_SIZE] * 0
+            number = block.fixed[STEP_SIZE] * 0
             if p < 2 * count:
-                number = fixed[start + AXIS * (2 * first + p) + q % AXIS]
-            pad[base + PAD_AXES + q] = number
+                number = block.fixed[start + AXIS * (2 * first + p) + q % AXIS]
+            block.pad[block.base + PAD_AXES + q] = number
 
 
 @ti.func
@@ -240,21 +260,21 @@ def point_axes(q):
 
 
 @ti.func
-def tile_gradient(pad: ti.template(), base, number: ti.template(), q):
+def tile_gradient(block: ti.template(), number: ti.template(), q):
     """Gradient of a staged field by the reference place at the tile's point q."""
     fx, fy, fz, first = point_axes(q)
     corner = near(field_start(number) + first)
-    w = ti.Vector([pad[base + fz + k] for k in ti.static(range(3))])
-    s = ti.Vector([pad[base + fz + 3 + k] for k in ti.static(range(3))])
+    w = ti.Vector([block.pad[block.base + fz + k] for k in ti.static(range(3))])
+    s = ti.Vector([block.pad[block.base + fz + 3 + k] for k in ti.static(range(3))])
     zero = w[0] * 0
     G = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     for i in ti.static(range(3)):
-        wx, sx = pad[base + fx + i], pad[base + fx + 3 + i]
+        wx, sx = block.pad[block.base + fx + i], block.pad[block.base + fx + 3 + i]
         for j in ti.static(range(3)):
-            wy, sy = pad[base + fy + j], pad[base + fy + 3 + j]
+            wy, sy = block.pad[block.base + fy + j], block.pad[block.base + fy + 3 + j]
             for c in ti.static(range(3)):
-                place = base + corner + ti.static(c * TILE_NODES + (i * TILE_Y + j) * TILE_Z)
-                a0, a1, a2 = pad[place], pad[place + 1], pad[place + 2]
+                place = block.base + corner + ti.static(c * TILE_NODES + (i * TILE_Y + j) * TILE_Z)
+                a0, a1, a2 = block.pad[place], block.pad[place + 1], block.pad[place + 2]
                 value = w[0] * a0 + w[1] * a1 + w[2] * a2
                 G[c, 0] += sx * wy * value
                 G[c, 1] += wx * sy * value
@@ -263,37 +283,39 @@ def tile_gradient(pad: ti.template(), base, number: ti.template(), q):
 
 
 @ti.func
-def tile_value(pad: ti.template(), base, number: ti.template(), q):
+def tile_value(block: ti.template(), number: ti.template(), q):
     """A staged field at the tile's point q."""
     fx, fy, fz, first = point_axes(q)
     corner = near(field_start(number) + first)
-    zero = pad[base + fx] * 0
+    zero = block.pad[block.base + fx] * 0
     u = ti.Vector([zero, zero, zero])
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                weight = pad[base + fx + i] * pad[base + fy + j] * pad[base + fz + k]
+                weight = (
+                    block.pad[block.base + fx + i] * block.pad[block.base + fy + j] * block.pad[block.base + fz + k]
+                )
                 for c in ti.static(range(3)):
-                    u[c] += weight * pad[base + corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
+                    u[c] += weight * block.pad[block.base + corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
     return u
 
 
 @ti.func
-def hand_over(pad: ti.template(), base, q, m):
+def hand_over(block: ti.template(), q, m):
     """Write the tensor that the tile's point q hands to the nodes."""
     for i, j in ti.static(ti.ndrange(3, 3)):
-        pad[base + near(q) + (3 * i + j) * TILE] = m[i, j]
+        block.pad[block.base + near(q) + (3 * i + j) * TILE] = m[i, j]
 
 
 @ti.func
-def hand_over_vector(pad: ti.template(), base, q, v):
+def hand_over_vector(block: ti.template(), q, v):
     """Write the vector that goes with it."""
     for i in ti.static(range(3)):
-        pad[base + near(q) + (9 + i) * TILE] = v[i]
+        block.pad[block.base + near(q) + (9 + i) * TILE] = v[i]
 
 
 @ti.func
-def neighbour_point(pad: ti.template(), base, axis, most: ti.template(), node, k, odd):
+def neighbour_point(block: ti.template(), axis, most: ti.template(), node, k, odd):
     """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope.
 
     ``axis`` is where the tile's weights along an axis begin, ``most`` how many cells a tile has along it.
@@ -303,162 +325,144 @@ def neighbour_point(pad: ti.template(), base, axis, most: ti.template(), node, k
     # Elsewhere, a point that is there is read for nothing, so that loads need not wait for branches.
     p = ti.select(inside, 2 * cell + odd, 0)
     at = near(axis + AXIS * p)
-    w, s = pad[base + at + k], pad[base + at + 3 + k]
+    w, s = block.pad[block.base + at + k], block.pad[block.base + at + 3 + k]
     return p, ti.select(inside, w, w * 0), ti.select(inside, s, s * 0)
 
 
 @ti.func
-def sum_tile(
-    gpu: ti.template(),
-    vectors: ti.template(),
-    head: ti.template(),
-    pad: ti.template(),
-    base,
-    with_vector,
-    out: ti.template(),
-    out_at,
-    alone: ti.template(),
-    alone_at,
-    q0,
-    q1,
-):
+def sum_tile(block: ti.template(), with_vector, out, alone):
     """Sum what the points of a tile hand to its nodes: tensors, and vectors too if ``with_vector``.
 
-    Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone_at``
+    Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone``
     is negative.
     """
     axis_x, axis_y, axis_z = PAD_AXES, PAD_AXES + AXIS * WIDE, PAD_AXES + AXIS * (WIDE + DEEP)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         if q < TILE_LINES:
             node, column = q % TILE_Z, q // TILE_Z * HIGH
-            zero = pad[base + axis_x] * 0
+            zero = block.pad[block.base + axis_x] * 0
             along_x = ti.Vector([zero, zero, zero])
             along_y = ti.Vector([zero, zero, zero])
             along_z = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(pad, base, axis_z, TILE_CELLS[2], node, k, odd)
-                    at = base + near(column + p)
+                    p, w, s = neighbour_point(block, axis_z, TILE_CELLS[2], node, k, odd)
+                    at = block.base + near(column + p)
                     for c in ti.static(range(3)):
-                        along_x[c] += w * pad[at + (3 * c) * TILE]
-                        along_y[c] += w * pad[at + (3 * c + 1) * TILE]
-                        along_z[c] += s * pad[at + (3 * c + 2) * TILE]
-                    if ti.static(vectors):
+                        along_x[c] += w * block.pad[at + (3 * c) * TILE]
+                        along_y[c] += w * block.pad[at + (3 * c + 1) * TILE]
+                        along_z[c] += s * block.pad[at + (3 * c + 2) * TILE]
+                    if ti.static(block.features & LOADED):
                         if with_vector == 1:
                             for c in ti.static(range(3)):
-                                along_z[c] += w * pad[at + (9 + c) * TILE]
+                                along_z[c] += w * block.pad[at + (9 + c) * TILE]
             for c in ti.static(range(3)):
-                pad[base + near(q) + ti.static(PAD_LINES + c * TILE_LINES)] = along_x[c]
-                pad[base + near(q) + ti.static(PAD_LINES + (3 + c) * TILE_LINES)] = along_y[c]
-                pad[base + near(q) + ti.static(PAD_LINES + (6 + c) * TILE_LINES)] = along_z[c]
-        elif with_vector == 0 and alone_at >= 0:
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + c * TILE_LINES)] = along_x[c]
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + (3 + c) * TILE_LINES)] = along_y[c]
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + (6 + c) * TILE_LINES)] = along_z[c]
+        elif with_vector == 0 and alone >= 0:
             one = q - TILE_LINES
-            total = pad[base + ALONE + 4 * one]
+            total = block.pad[block.base + ALONE + 4 * one]
             for m in ti.static(range(1, 4)):
-                total += pad[base + ALONE + 4 * one + m]
-            pad[base + ALONE + TILE + one] = total
-    sync(gpu)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+                total += block.pad[block.base + ALONE + 4 * one + m]
+            block.pad[block.base + ALONE + TILE + one] = total
+    sync(block.gpu)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         if q < TILE_SHEETS:
             iz, iy, px = q % TILE_Z, q // TILE_Z % TILE_Y, q // ti.static(TILE_Y * TILE_Z)
-            zero = pad[base + axis_x] * 0
+            zero = block.pad[block.base + axis_x] * 0
             slope = ti.Vector([zero, zero, zero])
             flat = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(pad, base, axis_y, TILE_CELLS[1], iy, k, odd)
-                    at = base + near(PAD_LINES + (px * DEEP + p) * TILE_Z + iz)
+                    p, w, s = neighbour_point(block, axis_y, TILE_CELLS[1], iy, k, odd)
+                    at = block.base + near(PAD_LINES + (px * DEEP + p) * TILE_Z + iz)
                     for c in ti.static(range(3)):
-                        slope[c] += w * pad[at + c * TILE_LINES]
-                        flat[c] += s * pad[at + (3 + c) * TILE_LINES] + w * pad[at + (6 + c) * TILE_LINES]
+                        slope[c] += w * block.pad[at + c * TILE_LINES]
+                        flat[c] += s * block.pad[at + (3 + c) * TILE_LINES] + w * block.pad[at + (6 + c) * TILE_LINES]
             for c in ti.static(range(3)):
-                pad[base + near(q) + c * TILE_SHEETS] = slope[c]
-                pad[base + near(q) + (3 + c) * TILE_SHEETS] = flat[c]
-        elif q < TILE_SHEETS + 8 and with_vector == 0 and alone_at >= 0:
+                block.pad[block.base + near(q) + c * TILE_SHEETS] = slope[c]
+                block.pad[block.base + near(q) + (3 + c) * TILE_SHEETS] = flat[c]
+        elif q < TILE_SHEETS + 8 and with_vector == 0 and alone >= 0:
             one = q - TILE_SHEETS
-            total = pad[base + ALONE + TILE + 8 * one]
+            total = block.pad[block.base + ALONE + TILE + 8 * one]
             for m in ti.static(range(1, 8)):
-                total += pad[base + ALONE + TILE + 8 * one + m]
-            pad[base + ALONE + 2 * TILE + one] = total
-    sync(gpu)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+                total += block.pad[block.base + ALONE + TILE + 8 * one + m]
+            block.pad[block.base + ALONE + 2 * TILE + one] = total
+    sync(block.gpu)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         if q < TILE_NODES:
             rest, ix = q % ti.static(TILE_Y * TILE_Z), q // ti.static(TILE_Y * TILE_Z)
-            zero = pad[base + axis_x] * 0
+            zero = block.pad[block.base + axis_x] * 0
             total = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(pad, base, axis_x, TILE_CELLS[0], ix, k, odd)
-                    at = base + near(p * ti.static(TILE_Y * TILE_Z) + rest)
+                    p, w, s = neighbour_point(block, axis_x, TILE_CELLS[0], ix, k, odd)
+                    at = block.base + near(p * ti.static(TILE_Y * TILE_Z) + rest)
                     for c in ti.static(range(3)):
-                        total[c] += s * pad[at + c * TILE_SHEETS] + w * pad[at + (3 + c) * TILE_SHEETS]
+                        total[c] += s * block.pad[at + c * TILE_SHEETS] + w * block.pad[at + (3 + c) * TILE_SHEETS]
             for c in ti.static(range(3)):
-                out[out_at + c * TILE_NODES + q] = total[c]
-        elif q == TILE_NODES and with_vector == 0 and alone_at >= 0:
-            total = pad[base + ALONE + 2 * TILE]
+                block.scratch[out + c * TILE_NODES + q] = total[c]
+        elif q == TILE_NODES and with_vector == 0 and alone >= 0:
+            total = block.pad[block.base + ALONE + 2 * TILE]
             for m in ti.static(range(1, 8)):
-                total += pad[base + ALONE + 2 * TILE + m]
-            alone[alone_at] = total
-    sync(gpu)
+                total += block.pad[block.base + ALONE + 2 * TILE + m]
+            block.scratch[alone] = total
+    sync(block.gpu)
 
 
 @ti.func
-def sum_tiles(fixed: ti.template(), ints: ti.template(), a: ti.template(), at, sources, i, nodes):
+def sum_tiles(block: ti.template(), at, sources, i, nodes):
     """Sum at node i the shares of tiles; ``sources`` is where the table begins that says where these lie."""
-    zero = fixed[AXES] * 0
+    zero = block.fixed[AXES] * 0
     total = ti.Vector([zero, zero, zero])
     for n in ti.static(range(SHARED)):
-        source = ints[sources + n * nodes + i]
+        source = block.ints[sources + n * nodes + i]
         place = at + ti.max(source, 0)
         for c in ti.static(range(3)):
-            share = a[place + c * TILE_NODES]
+            share = block.scratch[place + c * TILE_NODES]
             total[c] += ti.select(source >= 0, share, zero)
     return total
 
 
 @ti.func
-def sum_chambers(
-    gpu: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    scratch: ti.template(),
-    pad: ti.template(),
-    base,
-    b,
-    q0,
-    q1,
-):
+def fold(block: ti.template(), k):
+    """Sum the 256 numbers at the beginning of the pad, to number k of TOTALS."""
+    sync(block.gpu)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
+        if q < PARTS:
+            total = block.pad[block.base + q]
+            for m in ti.static(range(1, TILE // PARTS)):
+                total += block.pad[block.base + m * PARTS + q]
+            block.pad[block.base + TILE + q] = total
+    sync(block.gpu)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
+        if q == 0:
+            total = block.pad[block.base + TILE]
+            for m in ti.static(range(1, PARTS)):
+                total += block.pad[block.base + TILE + m]
+            block.pad[block.base + TOTALS + k] = total
+    sync(block.gpu)
+
+
+@ti.func
+def sum_chambers(block: ti.template(), b):
     """Sum what the tiles of each chamber of simulation b hand over alone: at TOTALS of the pad, number by number."""
-    chambers, start = head[CHAMBERS], head[CHAMBER_START]
+    chambers, start = block.head[CHAMBERS], block.head[CHAMBER_START]
     for k in range(chambers):
-        first, last = ints[start + k], ints[start + k + 1]
-        swept = head[SWEPT] + b * ints[start + chambers]
-        for each in range(q0, q1):
-            q = thread(gpu, head, each)
-            total = fixed[AXES] * 0
+        first, last = block.ints[start + k], block.ints[start + k + 1]
+        swept = block.head[SWEPT] + b * block.ints[start + chambers]
+        for each in range(block.q0, block.q1):
+            q = thread(block, each)
+            total = block.fixed[AXES] * 0
             one = first + q
             while one < last:
-                total += scratch[swept + one]
+                total += block.scratch[swept + one]
                 one += TILE
-            pad[base + q] = total
-        sync(gpu)
-        for each in range(q0, q1):
-            q = thread(gpu, head, each)
-            if q < PARTS:
-                total = pad[base + q]
-                for m in ti.static(range(1, TILE // PARTS)):
-                    total += pad[base + m * PARTS + q]
-                pad[base + TILE + q] = total
-        sync(gpu)
-        for each in range(q0, q1):
-            q = thread(gpu, head, each)
-            if q == 0:
-                total = pad[base + TILE]
-                for m in ti.static(range(1, PARTS)):
-                    total += pad[base + TILE + m]
-                pad[base + TOTALS + k] = total
-        sync(gpu)
+            block.pad[block.base + q] = total
+        fold(block, k)

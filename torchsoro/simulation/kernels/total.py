@@ -1,28 +1,20 @@
 """One substep forward of the total-Lagrangian form: points, then nodes.
 
 Points find F and their stress from the nodes, tile by tile, and each tile sums what its points hand to its nodes; then
-nodes add up these sums, move, and meet the planes. ``loaded`` says at compile time whether there are forces, springs or
-viscosity, ``stiffens`` whether solids stiffen with stretch.
+nodes add up these sums, move, and meet the planes. What a body has besides (``features``) is known at compile time.
 """
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.forward import (
-    CPU_UNIT,
-    Integers,
-    Reals,
-)
-from torchsoro.simulation.kernels.lattice import nodes_per_axis, particle_place, points_per_axis, product
+from torchsoro.simulation.kernels.forward import CPU_UNIT, Integers, Reals
+from torchsoro.simulation.kernels.lattice import nodes_per_axis, particle_place, points_per_axis, product, state_length
+from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
     ANCHOR,
     BATCH,
     BLOCKS,
     BULK,
-    CHAMBER,
-    CHAMBER_NUMBERS,
-    CHAMBER_STIFFNESS,
-    CHAMBER_VOLUME,
     CHAMBERS,
     COEFFICIENT,
     COEFFICIENTS,
@@ -33,23 +25,30 @@ from torchsoro.simulation.kernels.layout import (
     GRAVITY,
     GROUPS,
     HEAD,
+    HISTORIES,
+    HOLLOW,
+    IMMERSED,
     KEPT_RING,
     KIND,
+    LOADED,
     NEAR_NODES,
     NODAL,
     NODAL_DRAG_FACTOR,
     NODAL_MASS,
+    NODE_SHARE,
     NODES,
     PAD,
     PADS,
     PARTIALS,
     PLANES,
-    PRESSURE,
     PRONY,
     PRONY_DECAY,
     PRONY_GAIN,
     PRONY_MODULUS,
     PUSHED,
+    PUSHED_NODES,
+    PUSHES,
+    QUADRATIC,
     RING,
     SHARE,
     SHARED,
@@ -57,12 +56,17 @@ from torchsoro.simulation.kernels.layout import (
     SLOT,
     SLOT_CHAMBER,
     SLOTS,
+    SOFTENING,
+    SOFTENS,
     SOURCES,
     SPRING,
     SPRINGS,
     STEP_SIZE,
     STIFFENING,
+    STIFFENS,
     SWEPT,
+    TIED,
+    TIES,
     TILE,
     VISCOSITY,
     VISCOUS,
@@ -70,8 +74,10 @@ from torchsoro.simulation.kernels.layout import (
     VOLUME,
     VOLUME_VISCOSITY,
     VOLUMES,
+    WALL_CHUNKS,
 )
 from torchsoro.simulation.kernels.stress import (
+    excess,
     least_ratio,
     piola,
     pull_back,
@@ -79,9 +85,7 @@ from torchsoro.simulation.kernels.stress import (
     viscous_piola,
     void_piola,
 )
-from torchsoro.simulation.kernels.surface import (
-    surface_response,
-)
+from torchsoro.simulation.kernels.surface import surface_response
 from torchsoro.simulation.kernels.tensor import (
     cofactor,
     contract,
@@ -100,6 +104,8 @@ from torchsoro.simulation.kernels.tile import (
     hand_over_vector,
     meet,
     node_chunks,
+    on_cpu,
+    on_gpu,
     point_of,
     stage,
     stage_axes,
@@ -113,89 +119,77 @@ from torchsoro.simulation.kernels.tile import (
     tile_gradient,
     tile_value,
 )
+from torchsoro.simulation.kernels.total_walls import chamber_pressure, tie_pass, tied, wall_force, wall_pass
 
 
 @ti.func
-def state_length(head: ti.template()):
-    """Numbers in the state of a simulation."""
-    return 6 * product(nodes_per_axis(head)) + 6 * head[ELEMENTS] * product(points_per_axis(head))
-
-
-@ti.func
-def chamber_pressure(head: ti.template(), fixed: ti.template(), supply, volume, one):
-    """p_act - k (V/V0 - 1) in chamber number ``one`` of all simulations."""
-    at = head[CHAMBER_NUMBERS] + one * CHAMBER
-    return supply - fixed[at + CHAMBER_STIFFNESS] * (volume / fixed[at + CHAMBER_VOLUME] - 1)
-
-
-@ti.func
-def spring_stretch(head: ti.template(), fixed: ti.template(), d, b, p):
+def spring_stretch(block: ti.template(), d, b, p):
     """From point p, displaced by d, to its anchor."""
-    points = product(points_per_axis(head))
-    anchor = head[COEFFICIENT] + (b * COEFFICIENTS + ANCHOR) * points + p
-    return load_vector(fixed, anchor, points) - particle_place(head, fixed, p) - d
+    points = product(points_per_axis(block.head))
+    anchor = block.head[COEFFICIENT] + (b * COEFFICIENTS + ANCHOR) * points + p
+    return load_vector(block.fixed, anchor, points) - particle_place(block.head, block.fixed, p) - d
 
 
 @ti.func
-def external_force(
-    head: ti.template(), fixed: ti.template(), supply: ti.template(), pad: ti.template(), base, q, t, b, p
-):
+def external_force(block: ti.template(), q, t, b, p):
     """Shares of the group forces, and spring to an anchor [N] at point p; drag is with the nodes."""
+    head = ti.static(block.head)
     points = product(points_per_axis(head))
-    push = ti.Vector([fixed[STEP_SIZE] * 0, fixed[STEP_SIZE] * 0, fixed[STEP_SIZE] * 0])
+    push = load_vector(block.fixed, STEP_SIZE, 0) * 0
     for g in range(head[GROUPS]):
-        force = head[FORCE] + ((t * head[BATCH] + b) * head[GROUPS] + g) * 3
-        push += fixed[head[SHARE] + g * points + p] * load_vector(supply, force, 1)
+        force = force_at(block, t, b, g)
+        push += block.fixed[head[SHARE] + g * points + p] * load_vector(block.supply, force, 1)
     if head[SPRINGS] == 1:
-        spring = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
-        push += spring * spring_stretch(head, fixed, tile_value(pad, base, 0, q), b, p)
+        spring = block.fixed[head[COEFFICIENT] + (b * COEFFICIENTS + SPRING) * points + p]
+        push += spring * spring_stretch(block, tile_value(block, 0, q), b, p)
     return push
 
 
 @ti.func
-def chamber_share(head: ti.template(), fixed: ti.template(), pad: ti.template(), base, q, b, p, mine):
+def force_at(block: ti.template(), t, b, g):
+    """Where force number g of a substep lies: those on points, then those on nodes."""
+    forces = block.head[GROUPS] + block.head[PUSHES]
+    return block.head[FORCE] + ((t * block.head[BATCH] + b) * forces + g) * 3
+
+
+@ti.func
+def chamber_share(block: ti.template(), q, b, p, mine):
     """Hand over the share of point p in its chamber's area, volume times cof F; nothing if it is in none (``mine``).
 
     Returns:
         The reference volume, the volume ratio, and cof F.
     """
-    points = product(points_per_axis(head))
-    zero = fixed[STEP_SIZE] * 0
+    points = product(points_per_axis(block.head))
+    zero = block.fixed[STEP_SIZE] * 0
     cof = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     volume = zero
     ratio = zero
     if mine == 1:
-        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
-        volume = fixed[head[COEFFICIENT] + (b * COEFFICIENTS + VOLUME) * points + p]
+        F = plus_identity(tile_gradient(block, 0, q), 1)
+        volume = block.fixed[block.head[COEFFICIENT] + (b * COEFFICIENTS + VOLUME) * points + p]
         cof = cofactor(F)
         ratio = contract(cof, F) / 3
-    hand_over(pad, base, q, volume * cof)
+    hand_over(block, q, volume * cof)
     return volume, ratio, cof
 
 
 @ti.func
-def stress_point(
-    loaded: ti.template(),
-    stiffens: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    pad: ti.template(),
-    base,
-    q,
-    t,
-    b,
-    p,
-):
-    """Stress of point p in substep t, its elements a substep on; hands over volume times stress, and external force."""
+def softened(block: ti.template(), x, at, b):
+    """``laws.softening`` of a point whose largest x is at a place in the state."""
+    numbers = block.head[SOFTENING] + 2 * b
+    return laws.softening(x, block.state[at], block.fixed[numbers], block.fixed[numbers + 1])
+
+
+@ti.func
+def stress_point(block: ti.template(), q, t, b, p):
+    """Stress of point p in substep t, its history a substep on; hands over volume times stress, and external force."""
+    head, fixed, state = ti.static(block.head, block.fixed, block.state)
     zero = fixed[STEP_SIZE] * 0
     P = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     push = ti.Vector([zero, zero, zero])
     kind = ti.cast(ABSENT, ti.i32)
     if p >= 0:
-        kind = ints[head[KIND] + p]
+        kind = block.ints[head[KIND] + p]
     if kind != ABSENT:
         points, elements = product(points_per_axis(head)), head[ELEMENTS]
         nodes, length = product(nodes_per_axis(head)), state_length(head)
@@ -205,15 +199,20 @@ def stress_point(
         # Read together, before they are needed.
         volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
         bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
-        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
+        F = plus_identity(tile_gradient(block, 0, q), 1)
         if kind < 0:
             Q = F * 0
             factor = void_fraction * 0 + 1
+            solid = shear
             if void_fraction < 1:
                 least = least_ratio(void_fraction)
-                if ti.static(stiffens):
+                if ti.static(block.features & STIFFENS):
                     linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
                     factor = stiffening(F, least, linear, square)
+                if ti.static(block.features & SOFTENS):
+                    left, largest = softened(block, excess(F, least), at + 6 * elements * points, b)
+                    state[out + 6 * elements * points] = largest
+                    solid = shear * left
                 if elements > 0:
                     S = factor * pull_back(F, least)
                     Z = load_symmetric(state, at, points)
@@ -226,56 +225,40 @@ def stress_point(
                         store_symmetric(state, out + 6 * e * points, points, decay * Z - gain * (1 - decay) * S)
                         Z = following
                 if void_fraction == 0 and not F.determinant() > 0:
-                    ti.atomic_min(ints[COLLAPSED], t)
+                    ti.atomic_min(block.ints[COLLAPSED], t)
             else:
-                for c in range(6 * elements):
+                for c in range(head[HISTORIES]):
                     state[out + c * points] = 0
-            P = volume * piola(F, Q, bulk, shear, factor, void_fraction)
+            P = volume * piola(F, Q, bulk, solid, shear, factor, void_fraction)
         else:
-            for c in range(6 * elements):
+            for c in range(head[HISTORIES]):
                 state[out + c * points] = 0
             if not F.determinant() > 0:
-                ti.atomic_min(ints[COLLAPSED], t)
+                ti.atomic_min(block.ints[COLLAPSED], t)
             P = volume * void_piola(F, shear)
-        if ti.static(loaded):
+        if ti.static(block.features & LOADED):
             if kind < 0 and head[VISCOUS] == 1:
                 eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                rate = tile_gradient(pad, base, 1, q)
+                rate = tile_gradient(block, 1, q)
                 P += volume * viscous_piola(F, rate, eta, zeta)
-            push = external_force(head, fixed, supply, pad, base, q, t, b, p)
-    hand_over(pad, base, q, P)
-    if ti.static(loaded):
-        hand_over_vector(pad, base, q, -push)
+            push = external_force(block, q, t, b, p)
+    hand_over(block, q, P)
+    if ti.static(block.features & LOADED):
+        hand_over_vector(block, q, -push)
 
 
 @ti.func
-def point_pass(
-    gpu: ti.template(),
-    loaded: ti.template(),
-    stiffens: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    scratch: ti.template(),
-    pad: ti.template(),
-    base,
-    item,
-    fresh,
-    t,
-    q0,
-    q1,
-):
+def point_pass(block: ti.template(), item, fresh, t):
     """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
-    cell, cells, node, first, last, b, tile = tile_box(gpu, fresh, head, ints, item, q0)
+    gpu, head, ints = ti.static(block.gpu, block.head, block.ints)
+    cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     if fresh == 1:
-        stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
-    stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
-    if ti.static(loaded):
+        stage_axes(block, cell, cells)
+    stage(block, block.state, at, 0, node)
+    if ti.static(block.features & LOADED):
         if head[VISCOUS] == 1:
-            stage(gpu, head, state, at + 3 * product(nodes_per_axis(head)), pad, base, 1, node, q0, q1)
+            stage(block, block.state, at + 3 * product(nodes_per_axis(head)), 1, node)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
     for slot in range(first - 1, last):
@@ -283,53 +266,48 @@ def point_pass(
         out = partials + tile * SLOT
         alone = ti.cast(-1, ti.i32)
         if slot < first:
-            for each in range(q0, q1):
-                q = thread(gpu, head, each)
-                p = point_of(head, cell, cells, q)
-                stress_point(loaded, stiffens, head, ints, fixed, supply, state, pad, base, q, t, b, p)
+            for each in range(block.q0, block.q1):
+                q = thread(block, each)
+                stress_point(block, q, t, b, point_of(head, cell, cells, q))
         else:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
-            for each in range(q0, q1):
-                q = thread(gpu, head, each)
+            for each in range(block.q0, block.q1):
+                q = thread(block, each)
                 p = point_of(head, cell, cells, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
-                volume, ratio, _ = chamber_share(head, fixed, pad, base, q, b, p, mine)
-                pad[base + ALONE + q] = volume * ratio
+                volume, ratio, _ = chamber_share(block, q, b, p, mine)
+                block.pad[block.base + ALONE + q] = volume * ratio
         sync(gpu)
-        own = ti.cast(slot < first, ti.i32)
-        sum_tile(gpu, loaded, head, pad, base, own, scratch, out, scratch, alone, q0, q1)
+        sum_tile(block, ti.cast(slot < first, ti.i32), out, alone)
 
 
 @ti.func
-def node_pass(
-    gpu: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    scratch: ti.template(),
-    pad: ti.template(),
-    base,
-    item,
-    t,
-    q0,
-    q1,
-):
+def slow(block: ti.template(), b, i, nodes, mass, v):
+    """Velocity of node i after quadratic drag."""
+    r = v
+    if ti.static(block.features & IMMERSED):
+        for c in ti.static(range(3)):
+            area = block.fixed[block.head[QUADRATIC] + (3 * b + c) * nodes + i]
+            r[c] = laws.quadratic_drag(v[c], block.fixed[STEP_SIZE] / mass * area)
+    return r
+
+
+@ti.func
+def node_pass(block: ti.template(), item, t):
     """Move the 256 nodes of number ``item`` by substep t."""
+    head, ints, fixed, state, kept = ti.static(block.head, block.ints, block.fixed, block.state, block.kept)
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     slot = (t % head[KEPT_RING]) * head[BATCH] + b
-    sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+    sum_chambers(block, b)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         i = chunk * TILE + q
         if i < chambers:  # every simulation has more nodes than chambers
-            kept[head[VOLUMES] + slot * chambers + i] = pad[base + TOTALS + i]
+            kept[head[VOLUMES] + slot * chambers + i] = block.pad[block.base + TOTALS + i]
         if i < nodes:
             length = state_length(head)
             at = ((t % head[RING]) * head[BATCH] + b) * length + i
@@ -341,30 +319,36 @@ def node_pass(
             # Divide wherever there is mass, with no floor: a void node weighs 1e-12 kg.
             if mass > 0:
                 partials = head[PARTIALS] + b * head[SLOTS] * SLOT
-                f = sum_tiles(fixed, ints, scratch, partials, head[SOURCES], i, nodes)
+                f = sum_tiles(block, partials, head[SOURCES], i, nodes)
                 for k in range(chambers):
                     if ints[head[NEAR_NODES] + k * nodes + i] == 1:
-                        one = b * chambers + k
-                        p_act = supply[head[PRESSURE] + t * head[BATCH] * chambers + one]
-                        p = chamber_pressure(head, fixed, p_act, pad[base + TOTALS + k], one)
                         table = head[SOURCES] + (k + 1) * SHARED * nodes
-                        f -= p * sum_tiles(fixed, ints, scratch, partials, table, i, nodes)
-                pull = load_vector(supply, head[GRAVITY] + (t * head[BATCH] + b) * 3, 1)
+                        p = chamber_pressure(block, t, block.pad[block.base + TOTALS + k], b * chambers + k)
+                        f -= p * sum_tiles(block, partials, table, i, nodes)
+                if ti.static(block.features & HOLLOW):
+                    f += wall_force(block, t, b, i)
+                if ti.static(block.features & TIED):
+                    f += tied(block, b, i, nodes)
+                if ti.static(block.features & PUSHED_NODES):
+                    for g in range(head[PUSHES]):
+                        force = load_vector(block.supply, force_at(block, t, b, head[GROUPS] + g), 1)
+                        f -= fixed[head[NODE_SHARE] + g * nodes + i] * force
+                pull = load_vector(block.supply, head[GRAVITY] + (t * head[BATCH] + b) * 3, 1)
                 drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
-                v = drag_factor * (v + dt * (pull - f / mass))
+                v += dt * (pull - f / mass)
                 store_vector(kept, head[PUSHED] + slot * 3 * nodes + i, nodes, v)
+                v = drag_factor * slow(block, b, i, nodes, mass, v)
                 after, onto = surface_response(ints, fixed, state, at - i, b, i, head[PLANES], mass, v)
                 v = after
                 d += dt * (onto + v)
             store_vector(state, out, nodes, d)
             store_vector(state, out + 3 * nodes, nodes, v)
-    sync(gpu)
+    sync(block.gpu)
 
 
 @ti.kernel
 def total_substep(
-    loaded: ti.template(),
-    stiffens: ti.template(),
+    features: ti.template(),
     t: ti.i32,
     ints: Integers,
     fixed: Reals,
@@ -376,24 +360,33 @@ def total_substep(
     """Substep t on a CPU; the buffers are those of ``layout.BUFFERS``."""
     for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            item = w // CPU_UNIT
-            pad = ints[PADS] + item * PAD
-            point_pass(
-                *(False, loaded, stiffens, ints, ints, fixed, supply, state, scratch, scratch, pad, item, 1, t, 0, TILE)
-            )
+            base = ints[PADS] + w // CPU_UNIT * PAD
+            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+            point_pass(block, w // CPU_UNIT, 1, t)
+    if ti.static(features & HOLLOW):
+        for w in range(ints[BATCH] * ints[WALL_CHUNKS] * CPU_UNIT):
+            if w % CPU_UNIT == 0:
+                base = ints[PADS] + w // CPU_UNIT * PAD
+                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+                wall_pass(block, w // CPU_UNIT, t)
+    if ti.static(features & TIED):
+        for w in range(ints[BATCH] * ints[TIES] * CPU_UNIT):
+            if w % CPU_UNIT == 0:
+                base = ints[PADS] + w // CPU_UNIT * PAD
+                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+                tie_pass(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            item = w // CPU_UNIT
-            pad = ints[PADS] + item * PAD
-            node_pass(False, ints, ints, fixed, supply, state, kept, scratch, scratch, pad, item, t, 0, TILE)
+            base = ints[PADS] + w // CPU_UNIT * PAD
+            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+            node_pass(block, w // CPU_UNIT, t)
 
 
 @ti.kernel
 def total_march(
     real: ti.template(),
     most: ti.template(),
-    loaded: ti.template(),
-    stiffens: ti.template(),
+    features: ti.template(),
     first: ti.i32,
     last: ti.i32,
     before: ti.i32,
@@ -411,7 +404,7 @@ def total_march(
     """
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
-        q, block = w % TILE, w // TILE
+        q, number = w % TILE, w // TILE
         head = ti.simt.block.SharedArray((KEPT,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
@@ -420,22 +413,30 @@ def total_march(
         sync(True)
         blocks = head[BLOCKS]
         arrivals = before
-        if block < blocks:
+        block = ti.static(on_gpu(features, head, pad, q, ints, fixed, supply, state, kept, scratch))
+        if number < blocks:
             for t in range(first, last):
-                item = block
+                item = number
                 while item < head[BATCH] * tile_count(head):
                     # A block that has one tile keeps what it knows of it.
                     fresh = ti.cast(t == first or head[BATCH] * tile_count(head) > blocks, ti.i32)
-                    point_pass(
-                        *(True, loaded, stiffens, head, ints, fixed, supply, state, scratch, pad, 0, item, fresh),
-                        *(t, q, q + 1),
-                    )
+                    point_pass(block, item, fresh, t)
                     item += blocks
+                if ti.static(features & HOLLOW):
+                    item = blocks - 1 - number
+                    while item < head[BATCH] * head[WALL_CHUNKS]:
+                        wall_pass(block, item, t)
+                        item += blocks
+                if ti.static(features & TIED):
+                    item = blocks - 1 - number
+                    while item < head[BATCH] * head[TIES]:
+                        tie_pass(block, item, t)
+                        item += blocks
                 arrivals += blocks
                 meet(ints, arrivals, q)
-                item = block
+                item = number
                 while item < head[BATCH] * node_chunks(head):
-                    node_pass(True, head, ints, fixed, supply, state, kept, scratch, pad, 0, item, t, q, q + 1)
+                    node_pass(block, item, t)
                     item += blocks
                 arrivals += blocks
                 meet(ints, arrivals, q)

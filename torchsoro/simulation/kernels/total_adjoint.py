@@ -7,12 +7,9 @@ substeps between two passes.
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.forward import (
-    CPU_UNIT,
-    Integers,
-    Reals,
-)
-from torchsoro.simulation.kernels.lattice import gather_value, nodes_per_axis, points_per_axis, product
+from torchsoro.simulation.kernels.forward import CPU_UNIT, Integers, Reals
+from torchsoro.simulation.kernels.lattice import gather_value, nodes_per_axis, points_per_axis, product, state_length
+from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     BATCH,
     BLOCKS,
@@ -28,11 +25,15 @@ from torchsoro.simulation.kernels.layout import (
     GRAVITY_BAR,
     GROUPS,
     HEAD,
+    HOLLOW,
+    IMMERSED,
     KIND,
+    LOADED,
     NEAR_NODES,
     NODAL,
     NODAL_DRAG_FACTOR,
     NODAL_MASS,
+    NODE_SHARE,
     NODES,
     NODES_BAR,
     PAD,
@@ -41,6 +42,10 @@ from torchsoro.simulation.kernels.layout import (
     PLANES,
     PRESSURE_BAR,
     PUSHED,
+    PUSHED_NODES,
+    PUSHES,
+    QUADRATIC,
+    QUADRATIC_BAR,
     SHARE,
     SHARED,
     SLOT,
@@ -52,21 +57,16 @@ from torchsoro.simulation.kernels.layout import (
     SURFACES,
     SWEPT,
     TALLIES,
+    TIED,
+    TIES,
     TILE,
     VISCOUS,
     VOLUME_BAR,
     VOLUMES,
+    WALL_CHUNKS,
 )
-from torchsoro.simulation.kernels.surface import (
-    surface_response_adjoint,
-    surface_spread,
-)
-from torchsoro.simulation.kernels.tensor import (
-    add,
-    contract,
-    load_vector,
-    store_vector,
-)
+from torchsoro.simulation.kernels.surface import surface_response_adjoint, surface_spread
+from torchsoro.simulation.kernels.tensor import add, contract, load_vector, store_vector
 from torchsoro.simulation.kernels.tile import (
     ALONE,
     KEPT,
@@ -74,6 +74,8 @@ from torchsoro.simulation.kernels.tile import (
     chamber_slots,
     meet,
     node_chunks,
+    on_cpu,
+    on_gpu,
     point_of,
     stage,
     stage_axes,
@@ -86,178 +88,145 @@ from torchsoro.simulation.kernels.tile import (
     tile_count,
     tile_gradient,
 )
-from torchsoro.simulation.kernels.total import (
-    chamber_share,
-    state_length,
-)
+from torchsoro.simulation.kernels.total import chamber_share, slow
 from torchsoro.simulation.kernels.total_points_adjoint import rate_point_adjoint, stress_point_adjoint
+from torchsoro.simulation.kernels.total_walls import (
+    chamber_volume_bar,
+    tie_pass_adjoint,
+    tied,
+    wall_pass_adjoint,
+    wall_spread,
+)
 
 
 @ti.func
-def node_adjoint(
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    scratch: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    pad: ti.template(),
-    base,
-    t,
-    b,
-    i,
-    rates: ti.template(),
-):
+def node_adjoint(block: ti.template(), t, b, i):
     """Finish the gradient by the place of node i after t + 1 substeps, and go back to the force on it in substep t."""
+    head, ints, fixed, state, bar, sums = ti.static(
+        block.head, block.ints, block.fixed, block.state, block.bar, block.sums
+    )
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     here = b * state_length(head) + i
     mass = fixed[head[NODES] + (b * NODAL + NODAL_MASS) * nodes + i]
-    if mass > 0:
-        d_bar = load_vector(bar, here, nodes)
-        v_bar = load_vector(bar, here + 3 * nodes, nodes)
-        if t + 1 < head[STEPS]:
-            partials = head[PARTIALS] + b * head[SLOTS] * SLOT
-            d_bar += sum_tiles(fixed, ints, scratch, partials, head[SOURCES], i, nodes)
-            for k in range(chambers):
-                if ints[head[NEAR_NODES] + k * nodes + i] == 1:
-                    one = b * chambers + k
-                    by_volume = chamber_volume_bar(head, fixed, pad[base + TOTALS + k], one)
-                    table = head[SOURCES] + (k + 1) * SHARED * nodes
-                    d_bar += by_volume * sum_tiles(fixed, ints, scratch, partials, table, i, nodes)
-            if head[PLANES] > 0:
-                after = ((t + 1) * head[BATCH] + b) * state_length(head)
-                d_bar += surface_spread(ints, fixed, state, after, back, (t + 1) % 2, b, i)
-            if ti.static(rates):
-                if head[VISCOUS] == 1:
-                    rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * SLOT
-                    v_bar += sum_tiles(fixed, ints, scratch, rates_at, head[SOURCES], i, nodes)
-            store_vector(bar, here, nodes, d_bar)
-        if t >= 0:
-            dt = fixed[STEP_SIZE]
-            slot = t * head[BATCH] + b
-            at = slot * state_length(head)
-            v = load_vector(state, at + 3 * nodes + i, nodes)
-            u = load_vector(kept, head[PUSHED] + slot * 3 * nodes + i, nodes)
-            v_bar += dt * d_bar
-            mass_bar = mass * 0
-            if head[PLANES] > 0:
-                u_bar, by_surface, by_mass = surface_response_adjoint(
-                    ints, fixed, state, at, sums, b, i, mass, u, v_bar, dt * d_bar
-                )
-                v_bar, mass_bar = u_bar, by_mass
-                surfaces = head[SURFACES] + ((t % 2) * head[BATCH] + b) * 3 * nodes
-                store_vector(back, surfaces + i, nodes, by_surface)
-            drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
-            add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i, u.dot(v_bar) / drag_factor)
-            v_bar *= drag_factor
-            pull = dt * load_vector(supply, head[GRAVITY] + slot * 3, 1)
-            mass_bar -= (u / drag_factor - v - pull).dot(v_bar) / mass
-            add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_MASS) * nodes + i, mass_bar)
-            store_vector(back, head[FORCES] + b * 3 * nodes + i, nodes, (dt / mass) * v_bar)
-        store_vector(bar, here + 3 * nodes, nodes, v_bar)
+    d_bar = load_vector(bar, here, nodes)
+    v_bar = load_vector(bar, here + 3 * nodes, nodes)
+    if t + 1 < head[STEPS]:
+        partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+        d_bar += sum_tiles(block, partials, head[SOURCES], i, nodes)
+        for k in range(chambers):
+            if ints[head[NEAR_NODES] + k * nodes + i] == 1:
+                by_volume = chamber_volume_bar(block, block.pad[block.base + TOTALS + k], b * chambers + k)
+                table = head[SOURCES] + (k + 1) * SHARED * nodes
+                d_bar += by_volume * sum_tiles(block, partials, table, i, nodes)
+        if ti.static(block.features & HOLLOW):
+            d_bar += wall_spread(block, b, i)
+        if ti.static(block.features & TIED):
+            d_bar += tied(block, b, i, nodes)
+        if head[PLANES] > 0:
+            after = ((t + 1) * head[BATCH] + b) * state_length(head)
+            d_bar += surface_spread(ints, fixed, state, after, block.back, (t + 1) % 2, b, i)
+        if ti.static(block.features & LOADED):
+            if head[VISCOUS] == 1:
+                rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * SLOT
+                v_bar += sum_tiles(block, rates_at, head[SOURCES], i, nodes)
+        store_vector(bar, here, nodes, d_bar)
+    # Nodes that are held have no mass here, but the forces on others depend on where they are.
+    if t >= 0 and mass > 0:
+        dt = fixed[STEP_SIZE]
+        slot = t * head[BATCH] + b
+        at = slot * state_length(head)
+        v = load_vector(state, at + 3 * nodes + i, nodes)
+        # Velocity before drag, and after the quadratic one.
+        u = load_vector(block.kept, head[PUSHED] + slot * 3 * nodes + i, nodes)
+        s = slow(block, b, i, nodes, mass, u)
+        drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
+        v_bar += dt * d_bar
+        mass_bar = mass * 0
+        if head[PLANES] > 0:
+            u_bar, by_surface, by_mass = surface_response_adjoint(
+                ints, fixed, state, at, sums, b, i, mass, drag_factor * s, v_bar, dt * d_bar
+            )
+            v_bar, mass_bar = u_bar, by_mass
+            surfaces = head[SURFACES] + ((t % 2) * head[BATCH] + b) * 3 * nodes
+            store_vector(block.back, surfaces + i, nodes, by_surface)
+        add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i, s.dot(v_bar))
+        v_bar *= drag_factor
+        if ti.static(block.features & IMMERSED):
+            for c in ti.static(range(3)):
+                area = fixed[head[QUADRATIC] + (3 * b + c) * nodes + i]
+                by_u, by_sink = laws.quadratic_drag_adjoint(u[c], dt / mass * area, v_bar[c])
+                v_bar[c] = by_u
+                add(False, sums, head[QUADRATIC_BAR] + (3 * b + c) * nodes + i, dt / mass * by_sink)
+                mass_bar -= dt / mass * area * by_sink / mass
+        pull = dt * load_vector(block.supply, head[GRAVITY] + slot * 3, 1)
+        mass_bar -= (u - v - pull).dot(v_bar) / mass
+        add(False, sums, head[NODES_BAR] + (b * NODAL + NODAL_MASS) * nodes + i, mass_bar)
+        store_vector(block.back, head[FORCES] + b * 3 * nodes + i, nodes, (dt / mass) * v_bar)
+    store_vector(bar, here + 3 * nodes, nodes, v_bar)
 
 
 @ti.func
-def chamber_volume_bar(head: ti.template(), fixed: ti.template(), p_bar, one):
-    """Gradient by a chamber's volume, from that by its pressure."""
-    at = head[CHAMBER_NUMBERS] + one * CHAMBER
-    return -p_bar * fixed[at + CHAMBER_STIFFNESS] / fixed[at + CHAMBER_VOLUME]
-
-
-@ti.func
-def chamber_adjoint(
-    head: ti.template(),
-    fixed: ti.template(),
-    kept: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    t,
-    one,
-    p_bar,
-):
+def chamber_adjoint(block: ti.template(), t, one, p_bar):
     """Gradients by the pressure, stiffness and volumes of a chamber in substep t."""
-    volume_bar = chamber_volume_bar(head, fixed, p_bar, one)
+    head, sums = ti.static(block.head, block.sums)
+    volume_bar = chamber_volume_bar(block, p_bar, one)
     step = t * head[BATCH] * head[CHAMBERS] + one
-    ratio = kept[head[VOLUMES] + step] / fixed[head[CHAMBER_NUMBERS] + one * CHAMBER + CHAMBER_VOLUME]
+    ratio = block.kept[head[VOLUMES] + step] / block.fixed[head[CHAMBER_NUMBERS] + one * CHAMBER + CHAMBER_VOLUME]
     mine = head[CHAMBER_BAR] + one * CHAMBER
     add(False, sums, mine + CHAMBER_STIFFNESS, -p_bar * (ratio - 1))
     add(False, sums, mine + CHAMBER_VOLUME, -volume_bar * ratio)
     add(False, sums, head[PRESSURE_BAR] + step, p_bar)
-    back[head[VOLUME_BAR] + one] = volume_bar
+    block.back[head[VOLUME_BAR] + one] = volume_bar
 
 
 @ti.func
-def tally(
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    t,
-    b,
-    row,
-):
-    """One share of the sums over all nodes and points that gravity and group forces of substep t need."""
+def tally(block: ti.template(), t, b, row):
+    """One share of the sums over all nodes and points that gravity and forces of substep t need."""
+    head, fixed, sums = ti.static(block.head, block.fixed, block.sums)
     nodes, points, tallies = product(nodes_per_axis(head)), product(points_per_axis(head)), head[TALLIES]
     mine = (t * tallies + row) * head[BATCH] + b
-    velocity = b * state_length(head) + 3 * nodes
+    velocity, forces = b * state_length(head) + 3 * nodes, head[FORCES] + b * 3 * nodes
     total = load_vector(fixed, 0, 1) * 0
     for m in range((nodes + tallies - 1) // tallies):
         i = row + m * tallies
         if i < nodes and fixed[head[NODES] + (b * NODAL + NODAL_MASS) * nodes + i] > 0:
-            total += load_vector(bar, velocity + i, nodes)
+            total += load_vector(block.bar, velocity + i, nodes)
     store_vector(sums, head[GRAVITY_BAR] + 3 * mine, 1, fixed[STEP_SIZE] * total)
+    out = head[FORCE_BAR] + 3 * mine * (head[GROUPS] + head[PUSHES])
     for g in range(head[GROUPS]):
         total *= 0
         for m in range((points + tallies - 1) // tallies):
             i = row + m * tallies
             if i < points and fixed[head[SHARE] + g * points + i] != 0:
-                by_push = gather_value(head, ints, fixed, back, head[FORCES] + b * 3 * nodes, i)
+                by_push = gather_value(head, block.ints, fixed, block.back, forces, i)
                 total += fixed[head[SHARE] + g * points + i] * by_push
-        store_vector(sums, head[FORCE_BAR] + 3 * (mine * head[GROUPS] + g), 1, total)
+        store_vector(sums, out + 3 * g, 1, total)
+    if ti.static(block.features & PUSHED_NODES):
+        for g in range(head[PUSHES]):
+            total *= 0
+            for m in range((nodes + tallies - 1) // tallies):
+                i = row + m * tallies
+                if i < nodes:
+                    total += fixed[head[NODE_SHARE] + g * nodes + i] * load_vector(block.back, forces + i, nodes)
+            store_vector(sums, out + 3 * (head[GROUPS] + g), 1, total)
 
 
 @ti.func
-def point_pass_adjoint(
-    gpu: ti.template(),
-    loaded: ti.template(),
-    stiffens: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    scratch: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    pad: ti.template(),
-    base,
-    item,
-    fresh,
-    t,
-    q0,
-    q1,
-):
+def point_pass_adjoint(block: ti.template(), item, fresh, t):
     """Adjoint of ``total.point_pass``."""
-    cell, cells, node, first, last, b, tile = tile_box(gpu, fresh, head, ints, item, q0)
+    gpu, head, ints = ti.static(block.gpu, block.head, block.ints)
+    cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
     if fresh == 1:
-        stage_axes(gpu, head, fixed, pad, base, cell, cells, q0, q1)
-    stage(gpu, head, state, at, pad, base, 0, node, q0, q1)
-    stage(gpu, head, back, head[FORCES] + b * 3 * nodes, pad, base, 1, node, q0, q1)
-    if ti.static(loaded):
+        stage_axes(block, cell, cells)
+    stage(block, block.state, at, 0, node)
+    stage(block, block.back, head[FORCES] + b * 3 * nodes, 1, node)
+    if ti.static(block.features & LOADED):
         viscous = head[VISCOUS]
         if viscous == 1:
-            stage(gpu, head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)
+            stage(block, block.state, at + 3 * nodes, 2, node)
     sync(gpu)
     partials = head[PARTIALS] + b * head[SLOTS] * SLOT
     for slot in range(first - 1, last + viscous):
@@ -265,78 +234,53 @@ def point_pass_adjoint(
         out = partials + tile * SLOT
         alone = ti.cast(-1, ti.i32)
         if slot < first:
-            for each in range(q0, q1):
-                q = thread(gpu, head, each)
-                p = point_of(head, cell, cells, q)
-                stress_point_adjoint(
-                    *(loaded, stiffens, head, ints, fixed, supply, state, kept, bar, back, sums),
-                    *(pad, base, q, t, b, p),
-                )
+            for each in range(block.q0, block.q1):
+                q = thread(block, each)
+                stress_point_adjoint(block, q, t, b, point_of(head, cell, cells, q))
         elif slot < last:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
-            for each in range(q0, q1):
-                q = thread(gpu, head, each)
+            for each in range(block.q0, block.q1):
+                q = thread(block, each)
                 p = point_of(head, cell, cells, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
-                volume, _, cof = chamber_share(head, fixed, pad, base, q, b, p, mine)
-                P_bar = tile_gradient(pad, base, 1, ti.select(mine == 1, q, 0))
-                pad[base + ALONE + q] = volume * contract(P_bar, cof)
+                volume, _, cof = chamber_share(block, q, b, p, mine)
+                P_bar = tile_gradient(block, 1, ti.select(mine == 1, q, 0))
+                block.pad[block.base + ALONE + q] = volume * contract(P_bar, cof)
         else:
             out = partials + (tile_count(head) + chamber_slots(head, ints) + tile) * SLOT
-            if ti.static(loaded):
-                stage(gpu, head, state, at + 3 * nodes, pad, base, 2, node, q0, q1)  # lines have been there
+            if ti.static(block.features & LOADED):
+                stage(block, block.state, at + 3 * nodes, 2, node)  # lines have been there
                 sync(gpu)
-                for each in range(q0, q1):
-                    q = thread(gpu, head, each)
-                    p = point_of(head, cell, cells, q)
-                    rate_point_adjoint(head, ints, fixed, pad, base, q, b, p)
+                for each in range(block.q0, block.q1):
+                    q = thread(block, each)
+                    rate_point_adjoint(block, q, b, point_of(head, cell, cells, q))
         sync(gpu)
-        own = ti.cast(slot < first, ti.i32)
-        sum_tile(gpu, loaded, head, pad, base, own, scratch, out, scratch, alone, q0, q1)
+        sum_tile(block, ti.cast(slot < first, ti.i32), out, alone)
 
 
 @ti.func
-def node_pass_adjoint(
-    gpu: ti.template(),
-    loaded: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    scratch: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    pad: ti.template(),
-    base,
-    item,
-    t,
-    q0,
-    q1,
-):
+def node_pass_adjoint(block: ti.template(), item, t):
     """Adjoint of ``total.node_pass``."""
+    head = ti.static(block.head)
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     b, chunk = item // node_chunks(head), item % node_chunks(head)
-    sum_chambers(gpu, head, ints, fixed, scratch, pad, base, b, q0, q1)
-    for each in range(q0, q1):
-        q = thread(gpu, head, each)
+    sum_chambers(block, b)
+    for each in range(block.q0, block.q1):
+        q = thread(block, each)
         i = chunk * TILE + q
         if i < chambers and t + 1 < head[STEPS]:
-            chamber_adjoint(head, fixed, kept, back, sums, t + 1, b * chambers + i, pad[base + TOTALS + i])
+            chamber_adjoint(block, t + 1, b * chambers + i, block.pad[block.base + TOTALS + i])
         if i < nodes:
-            node_adjoint(head, ints, fixed, supply, state, kept, scratch, bar, back, sums, pad, base, t, b, i, loaded)
-    sync(gpu)
+            node_adjoint(block, t, b, i)
+    sync(block.gpu)
 
 
 @ti.kernel
 def total_substep_adjoint(
-    loaded: ti.template(),
-    stiffens: ti.template(),
+    features: ti.template(),
     t: ti.i32,
     ints: Integers,
     fixed: Reals,
@@ -351,31 +295,38 @@ def total_substep_adjoint(
     """Back by substep t on a CPU; substep -1 only finishes the sums of the first."""
     for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            item = w // CPU_UNIT
-            pad = ints[PADS] + item * PAD
-            node_pass_adjoint(
-                *(False, loaded, ints, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                *(scratch, pad, item, t, 0, TILE),
-            )
+            base = ints[PADS] + w // CPU_UNIT * PAD
+            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            node_pass_adjoint(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            item = w // CPU_UNIT
-            pad = ints[PADS] + item * PAD
-            point_pass_adjoint(
-                *(False, loaded, stiffens, ints, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                *(scratch, pad, item, 1, t, 0, TILE),
-            )
+            base = ints[PADS] + w // CPU_UNIT * PAD
+            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            point_pass_adjoint(block, w // CPU_UNIT, 1, t)
+    if ti.static(features & HOLLOW):
+        for w in range(ints[BATCH] * ints[WALL_CHUNKS] * CPU_UNIT):
+            if w % CPU_UNIT == 0 and t >= 0:
+                base = ints[PADS] + w // CPU_UNIT * PAD
+                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+                wall_pass_adjoint(block, w // CPU_UNIT, t)
+    if ti.static(features & TIED):
+        for w in range(ints[BATCH] * ints[TIES] * CPU_UNIT):
+            if w % CPU_UNIT == 0 and t >= 0:
+                base = ints[PADS] + w // CPU_UNIT * PAD
+                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+                tie_pass_adjoint(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * ints[TALLIES]):
         if t >= 0:
-            tally(ints, ints, fixed, bar, back, sums, t, w // ints[TALLIES], w % ints[TALLIES])
+            base = ints[PADS] + w // CPU_UNIT * PAD
+            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            tally(block, t, w // ints[TALLIES], w % ints[TALLIES])
 
 
 @ti.kernel
 def total_march_adjoint(
     real: ti.template(),
     most: ti.template(),
-    loaded: ti.template(),
-    stiffens: ti.template(),
+    features: ti.template(),
     first: ti.i32,
     last: ti.i32,
     before: ti.i32,
@@ -392,7 +343,7 @@ def total_march_adjoint(
     """Back from substep ``last - 1`` to ``first`` on a GPU, as ``total.total_march``."""
     ti.loop_config(block_dim=TILE)
     for w in range(most * TILE):
-        q, block = w % TILE, w // TILE
+        q, number = w % TILE, w // TILE
         head = ti.simt.block.SharedArray((KEPT,), ti.i32)
         pad = ti.simt.block.SharedArray((PAD,), real)
         if q < HEAD:
@@ -401,30 +352,35 @@ def total_march_adjoint(
         sync(True)
         blocks = head[BLOCKS]
         arrivals = before
-        if block < blocks:
+        block = ti.static(on_gpu(features, head, pad, q, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+        if number < blocks:
             for passed in range(last - first):
                 t = last - 1 - passed
-                item = block
+                item = number
                 while item < head[BATCH] * node_chunks(head):
-                    node_pass_adjoint(
-                        *(True, loaded, head, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                        *(pad, 0, item, t, q, q + 1),
-                    )
+                    node_pass_adjoint(block, item, t)
                     item += blocks
                 arrivals += blocks
                 meet(ints, arrivals, q)
-                item = block
+                item = number
                 while item < head[BATCH] * tile_count(head):
                     fresh = ti.cast(passed == 0 or head[BATCH] * tile_count(head) > blocks, ti.i32)
-                    point_pass_adjoint(
-                        *(True, loaded, stiffens, head, ints, fixed, supply, state, kept, scratch, bar, back, sums),
-                        *(pad, 0, item, fresh, t, q, q + 1),
-                    )
+                    point_pass_adjoint(block, item, fresh, t)
                     item += blocks
+                if ti.static(features & HOLLOW):
+                    item = blocks - 1 - number
+                    while item < head[BATCH] * head[WALL_CHUNKS] and t >= 0:
+                        wall_pass_adjoint(block, item, t)
+                        item += blocks
+                if ti.static(features & TIED):
+                    item = blocks - 1 - number
+                    while item < head[BATCH] * head[TIES] and t >= 0:
+                        tie_pass_adjoint(block, item, t)
+                        item += blocks
                 if t >= 0:
                     row = w
                     while row < head[BATCH] * head[TALLIES]:
-                        tally(head, ints, fixed, bar, back, sums, t, row // head[TALLIES], row % head[TALLIES])
+                        tally(block, t, row // head[TALLIES], row % head[TALLIES])
                         row += blocks * TILE
                 arrivals += blocks
                 meet(ints, arrivals, q)

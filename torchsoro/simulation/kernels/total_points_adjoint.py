@@ -2,7 +2,8 @@
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.lattice import nodes_per_axis, points_per_axis, product
+from torchsoro.simulation.kernels.lattice import nodes_per_axis, points_per_axis, product, state_length
+from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
     ANCHOR,
@@ -15,19 +16,24 @@ from torchsoro.simulation.kernels.layout import (
     ELEMENT,
     ELEMENT_BAR,
     ELEMENTS,
+    HISTORIES,
     JACOBIANS,
     KIND,
-    PRESSURE,
+    LOADED,
     PRONY,
     PRONY_DECAY,
     PRONY_GAIN,
     PRONY_MODULUS,
     SHEAR,
+    SOFTENING,
+    SOFTENING_BAR,
+    SOFTENS,
     SPRING,
     SPRINGS,
     STEP_SIZE,
     STEPS,
     STIFFENING,
+    STIFFENS,
     VISCOSITY,
     VISCOUS,
     VOID_FRACTION,
@@ -38,6 +44,8 @@ from torchsoro.simulation.kernels.layout import (
     WANT_PRONY,
 )
 from torchsoro.simulation.kernels.stress import (
+    excess,
+    excess_adjoint,
     least_ratio,
     piola_adjoint,
     pull_back,
@@ -59,29 +67,14 @@ from torchsoro.simulation.kernels.tensor import (
     store_symmetric_adjoint,
 )
 from torchsoro.simulation.kernels.tile import hand_over, hand_over_vector, tile_gradient, tile_value
-from torchsoro.simulation.kernels.total import (
-    chamber_pressure,
-    spring_stretch,
-    state_length,
-)
+from torchsoro.simulation.kernels.total import softened, spring_stretch
+from torchsoro.simulation.kernels.total_walls import chamber_pressure
 
 
 @ti.func
-def maxwell_adjoint(
-    head: ti.template(),
-    fixed: ti.template(),
-    state: ti.template(),
-    at,
-    bar: ti.template(),
-    here,
-    sums: ti.template(),
-    b,
-    p,
-    points,
-    S,
-    Q_bar,
-):
+def maxwell_adjoint(block: ti.template(), at, here, b, p, points, S, Q_bar):
     """Through the Maxwell elements of a point, whose places in state and adjoint are given: the gradient by S."""
+    head, fixed, bar, sums = ti.static(block.head, block.fixed, block.bar, block.sums)
     elements = head[ELEMENTS]
     S_bar = S * 0
     for e in range(elements):
@@ -91,7 +84,7 @@ def maxwell_adjoint(
         Z_bar = load_symmetric_adjoint(bar, place, points)
         S_bar += gain * (g * Q_bar - (1 - a) * Z_bar)
         if head[WANT_PRONY] == 1:
-            Z = load_symmetric(state, at + 6 * e * points, points)
+            Z = load_symmetric(block.state, at + 6 * e * points, points)
             mine = head[ELEMENT_BAR] + (b * elements + e) * PRONY * points + p
             by_stress, by_history = contract(Q_bar, S), contract(Z_bar, S)
             add(False, sums, mine + PRONY_MODULUS * points, contract(Q_bar, Z) + gain * by_stress)
@@ -102,23 +95,15 @@ def maxwell_adjoint(
 
 
 @ti.func
-def external_adjoint(
-    head: ti.template(),
-    fixed: ti.template(),
-    pad: ti.template(),
-    base,
-    q,
-    sums: ti.template(),
-    b,
-    p,
-):
+def external_adjoint(block: ti.template(), q, b, p):
     """Adjoint of ``total.external_force``, group forces excepted: by springs, anchors, and (returned) the place."""
+    head, sums = ti.static(block.head, block.sums)
     points = product(points_per_axis(head))
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
-    push_bar = tile_value(pad, base, 1, q)
-    spring = fixed[mat + SPRING * points]
-    stretch = spring_stretch(head, fixed, tile_value(pad, base, 0, q), b, p)
+    push_bar = tile_value(block, 1, q)
+    spring = block.fixed[mat + SPRING * points]
+    stretch = spring_stretch(block, tile_value(block, 0, q), b, p)
     add(False, sums, mat_bar + SPRING * points, push_bar.dot(stretch))
     for c in ti.static(range(3)):
         add(False, sums, mat_bar + (ANCHOR + c) * points, spring * push_bar[c])
@@ -126,45 +111,43 @@ def external_adjoint(
 
 
 @ti.func
-def stress_point_adjoint(
-    loaded: ti.template(),
-    stiffens: ti.template(),
-    head: ti.template(),
-    ints: ti.template(),
-    fixed: ti.template(),
-    supply: ti.template(),
-    state: ti.template(),
-    kept: ti.template(),
-    bar: ti.template(),
-    back: ti.template(),
-    sums: ti.template(),
-    pad: ti.template(),
-    base,
-    q,
-    t,
-    b,
-    p,
-):
-    """Adjoint of ``total.stress_point``: sums of its own; hands over the gradients by F and by the place of point p."""
+def softened_adjoint(block: ti.template(), x, at, here, b, p, points, left_bar):
+    """Adjoint of ``total.softened``: gradients by its numbers and, in place, by the largest x; returns that by x."""
+    head, fixed = ti.static(block.head, block.fixed)
+    depth, reach = fixed[head[SOFTENING] + 2 * b], fixed[head[SOFTENING] + 2 * b + 1]
+    x_bar, largest_bar, depth_bar, reach_bar = laws.softening_adjoint(
+        x, block.state[at], depth, reach, left_bar, block.bar[here]
+    )
+    block.bar[here] = largest_bar
+    mine = head[SOFTENING_BAR] + 2 * b * points + p
+    add(False, block.sums, mine, depth_bar)
+    add(False, block.sums, mine + points, reach_bar)
+    return x_bar
+
+
+@ti.func
+def stress_point_adjoint(block: ti.template(), q, t, b, p):
+    """Adjoint of ``total.stress_point``: hands over the gradients by F and by the place of point p."""
+    head, fixed, state, bar, sums = ti.static(block.head, block.fixed, block.state, block.bar, block.sums)
     zero = fixed[STEP_SIZE] * 0
     F_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     place_bar = ti.Vector([zero, zero, zero])
     kind = ti.cast(ABSENT, ti.i32)
     if p >= 0:
-        kind = ints[head[KIND] + p]
+        kind = block.ints[head[KIND] + p]
     points, elements, nodes = product(points_per_axis(head)), head[ELEMENTS], product(nodes_per_axis(head))
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
     if kind >= 0 and t + 1 < head[STEPS]:
         # The gradient by a chamber's volume is known one pass after the points that fill it.
-        by_volume = back[head[VOLUME_BAR] + b * head[CHAMBERS] + kind]
-        add(False, sums, mat_bar + VOLUME * points, by_volume * back[head[JACOBIANS] + b * points + p])
+        by_volume = block.back[head[VOLUME_BAR] + b * head[CHAMBERS] + kind]
+        add(False, sums, mat_bar + VOLUME * points, by_volume * block.back[head[JACOBIANS] + b * points + p])
     if t >= 0 and kind != ABSENT:
         history = b * state_length(head) + 6 * nodes + p
         maxwell = (t * head[BATCH] + b) * state_length(head) + 6 * nodes + p
-        F = plus_identity(tile_gradient(pad, base, 0, q), 1)
+        F = plus_identity(tile_gradient(block, 0, q), 1)
         volume, shear = fixed[mat + VOLUME * points], fixed[mat + SHEAR * points]
-        P_bar = -volume * tile_gradient(pad, base, 1, q)
+        P_bar = -volume * tile_gradient(block, 1, q)
         work = volume * 0  # P : P_bar, by which the gradient by the volume is known
         if kind < 0:
             bulk, void_fraction = fixed[mat + BULK * points], fixed[mat + VOID_FRACTION * points]
@@ -172,81 +155,91 @@ def stress_point_adjoint(
             Q = F * 0
             S = F * 0
             factor, linear, square = void_fraction * 0 + 1, void_fraction * 0, void_fraction * 0
-            if ti.static(stiffens):
+            if ti.static(block.features & STIFFENS):
                 linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
                 factor = stiffening(F, least, linear, square)
-            if elements > 0 and void_fraction < 1:
-                S = factor * pull_back(F, least)
-                for e in range(elements):
-                    number = head[ELEMENT] + (b * elements + e) * PRONY
-                    Z = load_symmetric(state, maxwell + 6 * e * points, points)
-                    Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
-            by_F, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
-                F, Q, bulk, shear, factor, void_fraction, P_bar
+            solid, x, x_bar = shear, void_fraction * 0, void_fraction * 0
+            if void_fraction < 1:
+                if ti.static(block.features & SOFTENS):
+                    x = excess(F, least)
+                    left, _ = softened(block, x, maxwell + 6 * elements * points, b)
+                    solid = shear * left
+                if elements > 0:
+                    S = factor * pull_back(F, least)
+                    for e in range(elements):
+                        number = head[ELEMENT] + (b * elements + e) * PRONY
+                        Z = load_symmetric(state, maxwell + 6 * e * points, points)
+                        Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
+            by_F, Q_bar, bulk_bar, solid_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
+                F, Q, bulk, solid, shear, factor, void_fraction, P_bar
             )
             F_bar = by_F
-            work = bulk * bulk_bar + shear * shear_bar
+            work = bulk * bulk_bar + solid * solid_bar + shear * shear_bar
             add(False, sums, mat_bar + BULK * points, bulk_bar)
-            add(False, sums, mat_bar + SHEAR * points, shear_bar)
             add(False, sums, mat_bar + VOID_FRACTION * points, void_bar)
-            if elements > 0 and void_fraction < 1:
-                S_bar = maxwell_adjoint(head, fixed, state, maxwell, bar, history, sums, b, p, points, S, Q_bar)
-                F_bar += pull_back_adjoint(F, least, factor * S_bar)
-                if ti.static(stiffens):
-                    factor_bar += contract(S_bar, pull_back(F, least))
+            if void_fraction < 1:
+                if elements > 0:
+                    S_bar = maxwell_adjoint(block, maxwell, history, b, p, points, S, Q_bar)
+                    F_bar += pull_back_adjoint(F, least, factor * S_bar)
+                    if ti.static(block.features & STIFFENS):
+                        factor_bar += contract(S_bar, pull_back(F, least))
+                if ti.static(block.features & SOFTENS):
+                    last = 6 * elements * points
+                    x_bar = softened_adjoint(block, x, maxwell + last, history + last, b, p, points, shear * solid_bar)
+                    F_bar += excess_adjoint(F, least, x_bar)
+                    solid_bar *= solid / shear
             else:
-                for c in range(6 * elements):
+                for c in range(head[HISTORIES]):
                     bar[history + c * points] = 0
-            if ti.static(stiffens):
+            add(False, sums, mat_bar + SHEAR * points, solid_bar + shear_bar)
+            if ti.static(block.features & STIFFENS):
                 by_F, linear_bar, square_bar = stiffening_adjoint(F, least, linear, square, factor_bar)
                 F_bar += by_F
                 add(False, sums, mat_bar + STIFFENING * points, linear_bar)
                 add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
         else:
-            for c in range(6 * elements):
+            for c in range(head[HISTORIES]):
                 bar[history + c * points] = 0
             cof = cofactor(F)
             one = b * head[CHAMBERS] + kind
             step = t * head[BATCH] * head[CHAMBERS] + one
-            p_act, swelled = supply[head[PRESSURE] + step], kept[head[VOLUMES] + step]
-            pressure = chamber_pressure(head, fixed, p_act, swelled, one)
+            pressure = chamber_pressure(block, t, block.kept[head[VOLUMES] + step], one)
             shear_bar = void_work(F, P_bar)
             F_bar = void_piola_adjoint(F, shear, P_bar) - pressure * cross(F, P_bar)
             work = shear * shear_bar - pressure * contract(P_bar, cof)
             add(False, sums, mat_bar + SHEAR * points, shear_bar)
-            back[head[JACOBIANS] + b * points + p] = contract(cof, F) / 3
-        if ti.static(loaded):
+            block.back[head[JACOBIANS] + b * points + p] = contract(cof, F) / 3
+        if ti.static(block.features & LOADED):
             if kind < 0 and head[VISCOUS] == 1:
                 eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
-                rate = tile_gradient(pad, base, 2, q)
+                rate = tile_gradient(block, 2, q)
                 by_F, _, eta_bar, zeta_bar = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
                 F_bar += by_F
                 work += eta * eta_bar + zeta * zeta_bar
                 add(False, sums, mat_bar + VISCOSITY * points, eta_bar)
                 add(False, sums, mat_bar + VOLUME_VISCOSITY * points, zeta_bar)
             if head[SPRINGS] == 1:
-                place_bar = external_adjoint(head, fixed, pad, base, q, sums, b, p)
+                place_bar = external_adjoint(block, q, b, p)
         add(False, sums, mat_bar + VOLUME * points, work / volume)
-    hand_over(pad, base, q, F_bar)
-    if ti.static(loaded):
-        hand_over_vector(pad, base, q, place_bar)
+    hand_over(block, q, F_bar)
+    if ti.static(block.features & LOADED):
+        hand_over_vector(block, q, place_bar)
 
 
 @ti.func
-def rate_point_adjoint(
-    head: ti.template(), ints: ti.template(), fixed: ti.template(), pad: ti.template(), base, q, b, p
-):
+def rate_point_adjoint(block: ti.template(), q, b, p):
     """Hand over the gradient by the rate of F at point p, through viscosity."""
+    head, fixed = ti.static(block.head, block.fixed)
     zero = fixed[STEP_SIZE] * 0
     rate_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     if p >= 0:
-        if ints[head[KIND] + p] == -1:
+        if block.ints[head[KIND] + p] == -1:
             points = product(points_per_axis(head))
             mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
-            F = plus_identity(tile_gradient(pad, base, 0, q), 1)
-            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(pad, base, 1, q)
-            rate = tile_gradient(pad, base, 2, q)
+            F = plus_identity(tile_gradient(block, 0, q), 1)
+            P_bar = -fixed[mat + VOLUME * points] * tile_gradient(block, 1, q)
+            rate = tile_gradient(block, 2, q)
             eta, zeta = fixed[mat + VISCOSITY * points], fixed[mat + VOLUME_VISCOSITY * points]
             _, by_rate, _, _ = viscous_piola_adjoint(F, rate, eta, zeta, P_bar)
             rate_bar = by_rate
-    hand_over(pad, base, q, rate_bar)
+    hand_over(block, q, rate_bar)

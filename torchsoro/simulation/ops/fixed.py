@@ -14,7 +14,7 @@ from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Scene
-from torchsoro.simulation.ops.tiles import tables
+from torchsoro.simulation.ops.tiles import tables, wall_numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -35,24 +35,54 @@ class Fixed:
 
 
 def fixed(scene: Scene, inputs: Inputs) -> Fixed:
-    """The constants of a run, computed once for the same coefficients, Maxwell elements and planes."""
-    given = [inputs.coefficients, inputs.prony, inputs.planes, inputs.attached]
+    """The constants of a run, computed once for the same tensors."""
+    names = ("coefficients", "prony", "planes", "attached", "softening", "fluid", "ties", "air")
+    given = [getattr(inputs, name) for name in names]
     chambers = inputs.pressure.shape[2]
 
     def compute() -> Fixed:
-        lattice, (c, prony, planes, attached) = scene.lattice, (t.detach() for t in given)
+        lattice, (c, prony, planes, attached, softening, fluid, ties, air) = scene.lattice, (t.detach() for t in given)
         assert lattice is not None
         nodal = lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], scene.dt, attached)
-        chamber = chamber_means(scene, c, chambers)
-        constants = numbers(lattice, scene.dt, scene.cell).to(c)
+        chamber = chamber_means(scene, c, scene.gas_chambers)
+        if lattice.walls is not None:
+            hollow = torch.stack([air, lattice.walls.volume.to(air).expand_as(air)], -1)
+            chamber = torch.cat([chamber, hollow], 1)
+        held = nodal
+        if scene.held is not None:  # what has no mass keeps its state
+            held = nodal.clone()
+            held[:, layout.NODAL_MASS].masked_fill_(scene.held, 0)
+        quadratic = c.new_zeros(0)
+        if scene.immersed:
+            assert lattice.faces is not None
+            quadratic = lattice.faces.front.T.to(c) * fluid.view(-1, 1, 1) / 2
+        none = c.new_zeros(0)
         return Fixed(
             tables=once(scene, "tables", [], lambda: Arena("integers", *_integers(scene, chambers))),
             nodal=nodal,
             chamber=chamber,
-            arena=Arena("fixed", constants, c, prony, planes, nodal, chamber, scene.share),
+            arena=Arena(
+                "fixed",
+                *(numbers(lattice, scene.dt, scene.cell).to(c), c, prony, planes, held, chamber, scene.share),
+                *(_areas(scene, planes), softening, quadratic),
+                *(none if scene.tie_share is None else scene.tie_share.to(c), ties),
+                none if scene.node_share is None else scene.node_share.to(c),
+                torch.from_numpy(wall_numbers(lattice)).to(c),
+            ),
         )
 
     return once(scene, "fixed", given, compute)
+
+
+def _areas(scene: Scene, planes: Tensor) -> Tensor:
+    """Area by which each node adheres to each plane [B, planes, nodes] m2, negative if it meets none."""
+    lattice = scene.lattice
+    assert lattice is not None
+    sign = scene.plane_kind[:, layout.PLANE_SIGN, None].to(planes)
+    found = lattice.facing(planes[..., layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] * sign)
+    if lattice.faces is not None:
+        found = found.masked_fill(~lattice.faces.touches.to(planes.device), -1.0)
+    return found
 
 
 def _integers(scene: Scene, chambers: int) -> list[Tensor]:

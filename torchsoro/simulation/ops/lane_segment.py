@@ -148,10 +148,10 @@ class LaneIntegrator:
         numbered = i.planes[..., PLANE_NUMBERS] * signs(s, like)
         elastic = s.plane_kind[:, layout.PLANE_ELASTIC].bool()
         ways = torch.einsum("bcn,bkc->bkn", self.nodal[:, 1:4], numbered[..., :3])
-        far, area = (ways > 0).to(like), torch.full_like(ways, s.cell**2)
+        far, area = (ways > 0).to(like), self.lattice.facing(numbered[..., :3])
         touches = torch.ones_like(mass[0])
         if faces is not None:
-            far, area = torch.ones_like(far), faces.facing(numbered[..., :3]).to(like)
+            far = torch.ones_like(far)
             touches = faces.touches.to(like).unsqueeze(0)
         shares = lanes.from_common_nodes(node_shares(s, self.lattice, like))
         ties = like.new_zeros(self.batch, 0, self.lattice.nodes) if s.tie_share is None else s.tie_share.to(like)

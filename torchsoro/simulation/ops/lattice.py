@@ -275,6 +275,18 @@ class Lattice:
         return _mesh(*(a.spreads for a in self.axes))
 
     @cached_property
+    def _areas(self) -> Tensor:
+        """Area of the nodes across each axis [3, nodes] m2, float64."""
+        x, y, z = _mesh(*(a.lengths for a in self.axes)).unbind(1)
+        return torch.stack([y * z, x * z, x * y])
+
+    def facing(self, normals: Tensor) -> Tensor:
+        """Area of the nodes across the axis that planes with normals [..., 3] face most [..., nodes] m2."""
+        if self.faces is not None:
+            return self.faces.facing(normals).to(normals)
+        return self.on("_areas", normals)[normals.abs().argmax(-1)]
+
+    @cached_property
     def _copies(self) -> dict[tuple[str, torch.dtype, torch.device], Tensor]:
         return {}
 

@@ -24,7 +24,7 @@ from torch.autograd import forward_ad
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lane_segment import LaneIntegrator, in_lanes
-from torchsoro.simulation.ops.limits import refuse_gradient, refuse_without_lanes
+from torchsoro.simulation.ops.limits import refuse_gradient
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.observation import observe, observe_adjoint
 from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
@@ -291,8 +291,6 @@ def rollout(
             raise ValueError(f"{name}: on {tensor.device}, wanted {state.device}, the device of the state")
     if scene.chambers > chambers:
         raise ValueError(f"kind: {scene.chambers} chambers, wanted at most the {chambers} of pressure")
-    if not in_lanes(scene, state):
-        refuse_without_lanes(scene, inputs)
     if torch.is_grad_enabled() and any(t.requires_grad for t in (state, weight, *tensors.values())):
         refuse_gradient(scene)
     if list(samples) != sorted(set(samples)) or (samples and not 0 <= samples[0] <= samples[-1] <= steps):

@@ -45,7 +45,8 @@ def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
         In the order of ``layout.BUFFERS``: the lowest node of the cells along x, y and z; the tiles along them; where
         each chamber's pairs of it and a tile begin; likewise each tile's; the chamber of each tile's pair, and its
         number among those of the chambers; for all tiles, and for each chamber's, where what they hand to a node lies,
-        -1 for none; whether a node has any of a chamber's.
+        -1 for none; whether a node has any of a chamber's; then those of :func:`wall_tables`. A chamber's pairs are
+        followed by the chunks of its wall points.
     """
     along = [tiles_along(a, n) for a, n in zip(lattice.axes, layout.TILE_CELLS, strict=True)]
     counts = tile_counts(lattice)
@@ -72,15 +73,73 @@ def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
         slots = np.concatenate([tile[..., None], slot[tile]], -1)
         rows.append(np.where(there[..., None] & (slots >= 0), slots * layout.SLOT + node[..., None], -1))
     sources = np.stack(rows).reshape(layout.SHARED, lattice.nodes, 1 + chambers).transpose(2, 0, 1)
+    gas = int(kinds.max()) + 1 if (kinds >= 0).any() else 0
+    walls, chunk_chamber = wall_tables(lattice, gas, len(pairs))
     return [
         np.concatenate([a.first for a in lattice.axes]),
         np.concatenate(along),
-        _starts(pairs[:, 1], chambers),
+        _starts(np.concatenate([pairs[:, 1], chunk_chamber]), chambers),
         _starts(pairs[:, 0], tile_count(lattice)),
         np.stack([pairs[:, 1], place], 1),
         sources,
         np.asarray((sources[1:] >= 0).any(1)),
+        *walls,
     ]
+
+
+def wall_slots(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """How wall points of hollow chambers go into chunks of 256 of one chamber each.
+
+    Returns:
+        Of each place in the chunks its wall point, -1 for none [256 chunks]; of each chunk the hollow chamber [chunks].
+    """
+    if lattice.walls is None:
+        return np.zeros(0, int), np.zeros(0, int)
+    points, of = [], []
+    for chamber in range(lattice.walls.count):
+        mine = np.flatnonzero(lattice.walls.chambers.numpy() == chamber)
+        chunks = -(-len(mine) // layout.TILE)
+        points.append(np.pad(mine, (0, chunks * layout.TILE - len(mine)), constant_values=-1))
+        of += [chamber] * chunks
+    return np.concatenate(points), np.array(of, int)
+
+
+def wall_tables(lattice: Lattice, gas: int, pairs: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Index tables of wall points.
+
+    Args:
+        lattice: Of the body.
+        gas: Number of chambers of gas particles.
+        pairs: Of a tile and a chamber, which chunks follow.
+
+    Returns:
+        In the order of ``layout.BUFFERS``: the number of each chunk among what chambers sum; lowest node, chamber and
+        axis of each wall point; where those of each node begin, and for each of these 27 times the wall point and which
+        of its nodes it is. And the chamber of each chunk.
+    """
+    points, of = wall_slots(lattice)
+    kind = np.zeros((len(points), layout.WALL_INTEGERS), int)
+    there, walls = np.flatnonzero(points >= 0), lattice.walls
+    node = np.zeros((0, 27), int)
+    if walls is not None:
+        p = points[there]
+        node = walls.nodes.numpy()[p]
+        kind[there] = np.stack([node[:, 0], gas + walls.chambers.numpy()[p], walls.axes.numpy()[p]], 1)
+    entry = (27 * there[:, None] + np.arange(27)).reshape(-1)
+    order = np.argsort(node.reshape(-1), kind="stable")
+    start = _starts(node.reshape(-1), lattice.nodes)
+    return [pairs + np.arange(len(of)), kind, start, entry[order]], gas + of
+
+
+def wall_numbers(lattice: Lattice) -> np.ndarray:
+    """Numbers of wall points, in the order of :func:`wall_slots`: place, area, values [places, WALL]."""
+    points, _ = wall_slots(lattice)
+    found, there = np.zeros((len(points), layout.WALL)), points >= 0
+    if lattice.walls is not None:
+        w = lattice.walls
+        places, areas, values = (t.numpy()[points[there]] for t in (w.places, w.areas, w.values))
+        found[there] = np.concatenate([places, areas[:, None], values.reshape(len(values), -1)], 1)
+    return found
 
 
 def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:

@@ -27,7 +27,7 @@ TALLIES = 64  # shares in which sums over all nodes or points are taken
 _NEVER = 2**31 - 1
 
 
-_SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")
+_SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")  # those of inputs that come first
 
 
 @lru_cache
@@ -36,6 +36,21 @@ def most_blocks(device: torch.device, dtype: torch.dtype) -> int:
     gpu = torch.cuda.get_device_properties(device)
     shared = 1024 + layout.PAD * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
     return min(BLOCKS, gpu.shared_memory_per_multiprocessor // shared) * gpu.multi_processor_count
+
+
+def _features(scene: Scene) -> int:
+    """What the kernels are compiled for, see ``layout``."""
+    assert scene.lattice is not None
+    there = {
+        layout.LOADED: scene.viscous or scene.springs or len(scene.share) > 0,
+        layout.STIFFENS: scene.stiffens,
+        layout.SOFTENS: scene.softens,
+        layout.IMMERSED: scene.immersed,
+        layout.TIED: scene.tie_share is not None,
+        layout.PUSHED_NODES: scene.node_share is not None,
+        layout.HOLLOW: scene.lattice.walls is not None,
+    }
+    return sum(feature for feature, on in there.items() if on)
 
 
 class TotalSegmentIntegrator:
@@ -64,21 +79,38 @@ class TotalSegmentIntegrator:
         self.batch, self.points, self.nodes = like.shape[0], self.lattice.count, self.lattice.nodes
         self.elements, self.chambers = inputs.prony.shape[1], inputs.pressure.shape[2]
         self.planes, self.groups = inputs.planes.shape[1], scene.share.shape[0]
-        self.loaded = scene.viscous or scene.springs or self.groups > 0
+        self.history = 6 * self.elements + scene.softens
+        self.features = _features(scene)
         common = fixed(scene, inputs)
         self.nodal, self.chamber, self.tables, self.fixed = common.nodal, common.chamber, common.tables, common.arena
         self.checked = False
-        self.supply = Arena("supply", inputs.pressure, inputs.gravity, inputs.force)
+        self.supply = Arena("supply", inputs.pressure, inputs.gravity, self._forces())
         tiles, chunks = tile_count(self.lattice), -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
-        in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND])
+        self.wall_chunks = len(self.tables.views[layout.WALL_CHUNK - layout.KIND])
+        in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND]) + self.wall_chunks
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
-        items = self.batch * max(tiles, chunks)
+        self.ties = inputs.ties.shape[1]
+        items = self.batch * max(tiles, chunks, self.wall_chunks, self.ties)
         self.blocks = min(most_blocks(like.device, like.dtype), items) if self.gpu else 0
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, layout.SLOT), (self.batch, in_chambers), (pads, layout.PAD)
-        self.scratch = Arena.zeros("scratch", like, *shapes)
+        vectors = self.batch, self.wall_chunks * layout.TILE, layout.WALL_VECTORS
+        self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors)
         self.kept = Arena.zeros("kept", like, (0,), (0,))
+
+    def _started(self) -> Tensor:
+        """Which forces act in each substep [steps, 1, forces, 1]; all of those with a row for each."""
+        starts = self.scene.force_start
+        if starts is None:
+            return torch.ones(self.steps, 1, self.scene.forces, 1, dtype=torch.bool)
+        step = self.first + torch.arange(self.steps)
+        return (step[:, None] >= torch.tensor(starts)).view(self.steps, 1, -1, 1)
+
+    def _forces(self) -> Tensor:
+        """In each substep [steps, B, forces, 3]."""
+        force = self.inputs.force
+        return force if self.scene.force_start is None else force * self._started().to(force)
 
     def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
         """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
@@ -115,6 +147,8 @@ class TotalSegmentIntegrator:
 
     def _wrong(self, ints: Tensor, state: Tensor) -> bool:
         """Whether a solid has collapsed, or a state is not finite or outside of the box; the host waits once."""
+        if self.scene.apart:
+            return False
         out = outside(self.scene, self.inputs, state)
         return bool((ints[layout.COLLAPSED] < _NEVER) | ~torch.isfinite(state).all() | out.any())
 
@@ -132,7 +166,7 @@ class TotalSegmentIntegrator:
         i, steps, b, nodes, points = self.inputs, self.steps, self.batch, self.nodes, self.points
         tallies = TALLIES if {"gravity", "force"} & wanted else 0
         if self.scene.absent is not None:
-            bar[:, 6 * nodes :].view(b, 6 * self.elements, points).masked_fill_(self.scene.absent, 0)
+            bar[:, 6 * nodes :].view(b, self.history, points).masked_fill_(self.scene.absent, 0)
         sums = Arena.zeros(
             "sums",
             bar,
@@ -140,10 +174,13 @@ class TotalSegmentIntegrator:
             (b, self.elements, layout.PRONY, points if "prony" in wanted else 1),
             i.pressure.shape,
             (steps, tallies, b, 3),
-            (steps, tallies, b, self.groups, 3),
+            (steps, tallies, b, self.scene.forces, 3),
             (b, self.planes, layout.PLANE, nodes),
             self.nodal.shape,
             self.chamber.shape,
+            (b, 2, points if self.scene.softens else 0),
+            (b, 3, nodes if self.scene.immersed else 0),
+            i.ties.shape,
         )
         shapes = (b, 3, nodes), (2, b, 3, nodes), (b, self.chambers), (b, points if self.chambers else 0)
         back = Arena.zeros("backward", bar, *shapes)
@@ -163,25 +200,34 @@ class TotalSegmentIntegrator:
             if stop in self.samples:
                 add(stop, bar)
         march(-1, 0)
-        *views, nodal_bar, chamber_bar = sums.views
-        found: dict[str, Tensor] = dict(zip(_SUMS, views, strict=True))
+        found: dict[str, Tensor] = dict(zip(_SUMS, sums.views, strict=False))
+        nodal_bar, chamber_bar, softening_bar, quadratic_bar, ties_bar = sums.views[len(_SUMS) :]
         mass, drag = i.coefficients[:, layout.MASS], i.coefficients[:, layout.DRAG]
         mass_bar, drag_bar, attached_bar = self.lattice.nodal_adjoint(mass, drag, self.scene.dt, i.attached, nodal_bar)
-        by_chamber = chamber_adjoint(self.scene, i.coefficients, self.chamber, chamber_bar)
+        gas = self.scene.gas_chambers
+        by_chamber = chamber_adjoint(self.scene, i.coefficients, self.chamber[:, :gas], chamber_bar[:, :gas])
         found["coefficients"] = found["coefficients"] + by_chamber
         found["coefficients"][:, layout.MASS] += mass_bar
         found["coefficients"][:, layout.DRAG] += drag_bar
         found |= {name: found[name].sum(-1) for name in ("prony", "planes")}
         found |= {name: found[name].sum(1) for name in ("gravity", "force")}
         found["pressure"] = found["pressure"].clone()
+        if self.scene.force_start is not None:
+            found["force"] = (found["force"] * self._started().to(bar)).sum(0, keepdim=True)
+        if self.scene.immersed:
+            assert self.lattice.faces is not None
+            found["fluid"] = torch.einsum("bcn,nc->b", quadratic_bar, self.lattice.faces.front.to(bar)) / 2
+        found |= {"softening": softening_bar.sum(-1), "ties": ties_bar.clone()}
+        found["air"] = chamber_bar[:, gas:, layout.CHAMBER_STIFFNESS].clone()
         return {**found, "attached": attached_bar}
 
     def _march(self, on_gpu, on_cpu, *buffers: Tensor, backward: bool = False) -> Callable[[int, int], None]:
         """A function that takes the substeps from its first number to before its second, or these back."""
-        flags = (self.loaded, self.scene.stiffens)
         if self.gpu:
             real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
-            launch = capture(on_gpu, real, most_blocks(buffers[0].device, buffers[1].dtype), *flags, 0, 0, 0, *buffers)
+            launch = capture(
+                on_gpu, real, most_blocks(buffers[0].device, buffers[1].dtype), self.features, 0, 0, 0, *buffers
+            )
             arrivals = 0
 
             def go(first: int, last: int) -> None:
@@ -193,7 +239,7 @@ class TotalSegmentIntegrator:
                     arrivals += 2 * self.blocks * (stop - start)
 
             return go
-        step = capture(on_cpu, *flags, 0, *buffers)
+        step = capture(on_cpu, self.features, 0, *buffers)
 
         def march(first: int, last: int) -> None:
             for t in reversed(range(first, last)) if backward else range(first, last):
@@ -209,7 +255,9 @@ class TotalSegmentIntegrator:
             **dict(zip(names, values, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
-            **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps},
+            **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "history": self.history},
+            **{"faced": int(self.lattice.faces is not None), "ties": self.ties, "wall_chunks": self.wall_chunks},
+            "pushes": self.scene.forces - self.groups,
             **{name: int(value) for name, value in more.items()},
         }
         head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
