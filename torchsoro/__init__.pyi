@@ -6,18 +6,19 @@ from .design.objective import center_of_gravity, intermediate_density, stride, t
 from .errors import SimulationDiverged
 from .simulation.actuation import Waveform, read_pressure_csv, square_wave
 from .simulation.contact import Plane, ground
-from .simulation.loads import Drag, Force, PointMass, Spring
+from .simulation.loads import Clamp, Drag, Force, PointMass, QuadraticDrag, Spring
 from .simulation.material import Body, Gas, Prony, Solid
 from .simulation.runtime import init
 from .simulation.simulator import Simulator
 from .simulation.stability import stable_step
-from .simulation.trajectory import Trajectory
+from .simulation.trajectory import Start, Trajectory
 
 __version__: str
 __all__ = [
     "AugmentedLagrangian",
     "Body",
     "Chamber",
+    "Clamp",
     "DesignField",
     "Domain",
     "Drag",
@@ -27,11 +28,13 @@ __all__ = [
     "Plateau",
     "PointMass",
     "Prony",
+    "QuadraticDrag",
     "Region",
     "SimulationDiverged",
     "Simulator",
     "Solid",
     "Spring",
+    "Start",
     "Trajectory",
     "Waveform",
     "center_of_gravity",
