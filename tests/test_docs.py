@@ -17,7 +17,7 @@ from torchsoro import cli
 from torchsoro.sim2real.data.schema import (
     BodyTable,
     ChamberTable,
-    Clamp,
+    ClampTable,
     ForceTable,
     Marker,
     Material,
@@ -155,7 +155,13 @@ def test_every_command_is_a_recipe_that_knows_its_flags(name, capsys, monkeypatc
 
 def test_every_field_of_an_experiment_is_described():
     page = (ROOT / "docs/pages/explain.md").read_text(encoding="utf-8")
-    tables = {"body": BodyTable, "material": Material, "clamp": Clamp, "chamber": ChamberTable, "plane": PlaneTable}
+    tables = {
+        "body": BodyTable,
+        "material": Material,
+        "clamp": ClampTable,
+        "chamber": ChamberTable,
+        "plane": PlaneTable,
+    }
     tables |= {"load": ForceTable, "marker": Marker, "recording": RecordingTable}
     for name, model in tables.items():
         text = re.split(r"^(?:`\[|#)", part_of(page, name), maxsplit=1, flags=re.M)[0]

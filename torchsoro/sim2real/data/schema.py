@@ -99,7 +99,7 @@ class Table(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Start(Table):
+class StartTable(Table):
     """How the body moves at t = 0, undeformed; at rest if nothing is said.
 
     Attributes:
@@ -178,7 +178,7 @@ class Material(Table):
     )
 
 
-class Clamp(Table):
+class ClampTable(Table):
     """Body points in a box are held still.
 
     Attributes:
@@ -284,13 +284,13 @@ class SetupFile(Table):
     duration: Annotated[Number, Gt(0.0), Le(LONGEST)] = Field(
         description=f"a finite number of seconds from release, up to {LONGEST:g}"
     )
-    start: Annotated[Start, BeforeValidator(_at_rest)] = Field(
-        default=Start(), description='"rest", or a table of velocity and angular_velocity'
+    start: Annotated[StartTable, BeforeValidator(_at_rest)] = Field(
+        default=StartTable(), description='"rest", or a table of velocity and angular_velocity'
     )
     body: BodyTable = Field(description="a table [body]")
     material: Material = Field(description="a table [material]")
     recording: RecordingTable = Field(default=RecordingTable(), description="a table [recording]")
-    clamp: tuple[Clamp, ...] = Field(default=(), description="[[clamp]] tables")
+    clamp: tuple[ClampTable, ...] = Field(default=(), description="[[clamp]] tables")
     chamber: tuple[ChamberTable, ...] = Field(default=(), description="[[chamber]] tables")
     plane: tuple[PlaneTable, ...] = Field(default=(), description="[[plane]] tables")
     load: tuple[ForceTable, ...] = Field(default=(), description="[[load]] tables")
