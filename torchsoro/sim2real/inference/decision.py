@@ -6,12 +6,12 @@ Everything else in the decision follows from them, from the noise of the recordi
 from __future__ import annotations
 
 CREDIBLE = 0.95  # posterior probability of the set of candidates that is told: odds of twenty to one, as is customary
-MATTERS = 0.02  # of the motion: what is smaller is no reason to change a design, and no laboratory builds better bodies
+MATTERS = 0.02  # of the motion: what is smaller is no reason to change a design, and bodies are built no better
 VISIBLE = 3.0  # times the noise: what is larger is seen in a plot by eye, so that it must not be passed over
 STRENGTH = 3.0  # noticeable changes (Quantity.scale): width of the prior of an effect that is missing
-FREEDOM = 4.0  # degrees of freedom of priors that are not to be trusted in their tails: 30 widths are still credible
+FREEDOM = 4.0  # degrees of freedom of priors that are not to be trusted in their tails: 10 widths are still credible
 TOLERANCE = 0.5  # standard deviation of a belief over its stated tolerance, which thus holds in 95 of 100 setups
-COMMON = 0.5  # share of a discrepancy's variance that all markers have in common: a body moves in modes, not by markers
-MISSING = 0.5  # prior probability that something is missing; the names share it evenly, pairs 1/n of it
-LASTING = 0.25  # share of the noise's variance that lasts (trackers drift), unless repeated trials tell it
-UNEXPLAINED = 0.1  # of the discrepancy's variance without an effect: an effect that leaves more is not what is missing
+MISSING = 0.5  # prior probability that something is missing; names share it evenly, a pair has 1/n of a name's share
+COMMON = 0.5  # share of a discrepancy's variance that all markers have in common: bodies move in modes, not by markers
+LASTING = 0.25  # share of the noise's variance that lasts from sample to sample, as trackers drift
+UNEXPLAINED = 0.1  # of the discrepancy's variance without an effect: one that leaves more is not what is missing

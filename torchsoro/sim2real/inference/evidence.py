@@ -5,7 +5,8 @@
 x are strengths, places, beliefs and measurement errors with their priors; S_num is the covariance of the twin's own
 error, s that of what the model does not explain, as a share of the motion, and tau its correlation time. Given s and
 tau, x is integrated out by Laplace's approximation (:mod:`torchsoro.sim2real.inference.laplace`); s and tau follow by
-restricted maximum likelihood, within a prior that has s = 0 in it.
+restricted maximum likelihood. No law of an effect is nature's to the last digit: s is at least what does not matter,
+so that differences between candidates that do not matter decide nothing.
 """
 
 from __future__ import annotations
@@ -19,15 +20,19 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import minimize
 
-from torchsoro.sim2real.inference.decision import COMMON, LASTING
+from torchsoro.sim2real.inference.decision import COMMON, LASTING, MATTERS
 from torchsoro.sim2real.inference.laplace import Mode, posterior
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
-SHARES = (1e-3, 1.0)  # of the motion: where the prior of a discrepancy is uniform in ln s
+SHARES = (MATTERS, 1.0)  # of the motion: where the prior of a discrepancy that matters is uniform in ln s
+NARROW = 0.05  # of ln s and ln tau: what they need not be known better than
+APART = 0.15  # of ln s and ln tau, for second differences
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
 STILL = 0.1  # of the mean motion: least amplitude of a discrepancy along an axis without motion
+
+Motions = tuple[np.ndarray, ...]  # of each trial, as recorded [T, M, A] m
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +104,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """A process by which motions differ, in proportion to how far each marker moves along each axis.
+    """What a model does not explain: a process in proportion to how far each marker moves along each axis.
 
     Attributes:
         share: Of the motion, standard deviation; 0 for none.
@@ -111,16 +116,33 @@ class Discrepancy:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class TwinError:
+    """The twin's own error, once it is corrected by a finer one.
+
+    Attributes:
+        amplitude: Standard deviation by axis and marker [A, M] m.
+        time: Correlation time [s].
+        draws: Errors as they may be, as far as beliefs and measurement errors do not take them up.
+    """
+
+    amplitude: np.ndarray
+    time: float = NOISE_TIME
+    draws: tuple[Motions, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
     """What may be missing, with the priors of all that is fitted.
 
     Attributes:
         effects: Names; none for the setup as stated.
-        priors: Of the unknowns of effects and beliefs, then of the measurement errors [K].
+        priors: Of the unknowns: beliefs, effects, measurement errors [K].
+        own: Numbers of the unknowns that belong to the effects.
     """
 
     effects: tuple[str, ...]
     priors: tuple[Prior, ...]
+    own: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:
@@ -144,7 +166,7 @@ class Linearised:
     at: np.ndarray
     residuals: tuple[np.ndarray, ...]
     slopes: tuple[np.ndarray, ...]
-    numerics: Discrepancy = Discrepancy()
+    numerics: TwinError
 
     def chunks(self, data: Data, trial: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Times, and columns of residual and slopes, of a trial in parts."""
@@ -166,20 +188,25 @@ class Posterior:
         near: The model, and where it was linearised.
         discrepancy: With which it is most probable.
         mode: Of its unknowns, with that.
-        ln_evidence: With s and tau integrated out, s > 0.
-        ln_exact: The same with s = 0.
+        ln_some: ln evidence with s and tau integrated out, s being large enough to matter.
+        ln_none: The same with s as large as what does not matter.
     """
 
     near: Linearised
     discrepancy: Discrepancy
     mode: Mode
-    ln_evidence: float
-    ln_exact: float
+    ln_some: float
+    ln_none: float
 
     @property
-    def ln_marginal(self) -> float:
-        """With s = 0 and s > 0 equally probable before."""
-        return float(np.logaddexp(self.ln_evidence, self.ln_exact)) - math.log(2)
+    def ln_evidence(self) -> float:
+        """With a discrepancy that matters as probable before as one that does not."""
+        return float(np.logaddexp(self.ln_some, self.ln_none)) - math.log(2)
+
+    @property
+    def matters(self) -> bool:
+        """Whether a discrepancy that matters is more probable."""
+        return self.ln_some > self.ln_none
 
     @cached_property
     def left(self) -> tuple[np.ndarray, ...]:
@@ -187,21 +214,27 @@ class Posterior:
         return self.near.left(self.mode.at)
 
 
-def errors(data: Data, processes: Sequence[Discrepancy]) -> ErrorModel:
+def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> ErrorModel:
     """All that separates the prediction of a trial from its recording.
 
     Args:
         data: With the noise and the motion.
-        processes: The twin's own error, and what the model does not explain.
+        numerics: The twin's own error.
+        discrepancy: What the model does not explain.
     """
     lasting = np.full_like(data.amplitude, math.sqrt(LASTING) * data.noise)
-    found = [Process(time=NOISE_TIME, loading=_each(lasting))]
-    own = math.sqrt(1 - COMMON) * _each(data.amplitude)
-    together = math.sqrt(COMMON) * data.amplitude[..., None]
-    loading = np.concatenate([together, own], -1)
-    found += [Process(time=p.time, loading=p.share * loading) for p in processes if p.share > 0]
+    found = [
+        Process(time=NOISE_TIME, loading=_each(lasting)),
+        Process(time=numerics.time, loading=_moving(numerics.amplitude)),
+        Process(time=discrepancy.time, loading=_moving(discrepancy.share * data.amplitude)),
+    ]
     white = np.full_like(data.amplitude, math.sqrt(1 - LASTING) * data.noise)
     return ErrorModel(white=white, processes=tuple(found))
+
+
+def _moving(deviation: np.ndarray) -> np.ndarray:
+    """Loadings of processes of standard deviation [A, M]: one that all markers share, and one of each [A, M, 1 + M]."""
+    return np.concatenate([math.sqrt(COMMON) * deviation[..., None], math.sqrt(1 - COMMON) * _each(deviation)], -1)
 
 
 def _each(deviation: np.ndarray) -> np.ndarray:
@@ -211,7 +244,7 @@ def _each(deviation: np.ndarray) -> np.ndarray:
 
 def grams(data: Data, near: Linearised, discrepancy: Discrepancy) -> list[Gram]:
     """Products of residual and slopes under the errors of each trial."""
-    model = errors(data, (near.numerics, discrepancy))
+    model = errors(data, near.numerics, discrepancy)
     return [model.gram(near.chunks(data, i)) for i in range(len(data.trials))]
 
 
@@ -223,36 +256,47 @@ def infer(data: Data, near: Linearised) -> Posterior:
         near: The model linearised at a point, which should be close to its mode.
     """
 
-    def at(discrepancy: Discrepancy) -> Mode:
-        return posterior(total(grams(data, near, discrepancy)), near.at, near.model.priors)
-
-    exact = at(Discrepancy())
-    low, high = _ranges(data)
-    best: tuple[float, np.ndarray, Mode] | None = None
-    # From little and from much: with much, the first mode is not bent by a wrong model.
-    for share in (math.sqrt(SHARES[0] * SHARES[1]), SHARES[1] / 3):
-        x = np.array([math.log(share), 0.5 * (low[1] + high[1])])
+    def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, np.ndarray, Mode]:
+        """The mode, and the ln s and ln tau that its residual tells, within bounds."""
+        x = start
         for _ in range(ALTERNATIONS):
-            mode = at(_discrepancy(x))
-            before, x = x, _restricted(data, near, near.left(mode.at), x)
-            if np.abs(x - before).max() < 0.05:
+            mode = _mode(data, near, x)
+            before, x = x, _restricted(data, near, near.left(mode.at), x, low, high)
+            if np.abs(x - before).max() < NARROW:
                 break
-        mode = at(_discrepancy(x))
-        if best is None or mode.ln_evidence > best[0]:
-            best = mode.ln_evidence, x, mode
-    assert best is not None
-    ln_evidence, x, mode = best
-    ln_evidence += _ln_occam(data, near, near.left(mode.at), x)
-    return Posterior(
-        near=near, discrepancy=_discrepancy(x), mode=mode, ln_evidence=ln_evidence, ln_exact=exact.ln_evidence
+        mode = _mode(data, near, x)
+        return mode.ln_evidence, x, mode
+
+    low, high = _ranges(data)
+    middle = 0.5 * (low + high)
+    least = np.array([low[0], high[1]])
+    # From little and from much: with much, the first mode is not bent by a wrong model.
+    some = max(
+        (settled(np.array([ln_s, middle[1]]), low, high) for ln_s in (middle[0], high[0])), key=lambda found: found[0]
     )
+    none = settled(np.array([low[0], middle[1]]), low, least)
+    ln_some = some[0] + _ln_occam(data, near, near.left(some[2].at), some[1], low, high)
+    ln_none = none[0] + _ln_occam(data, near, near.left(none[2].at), none[1], low, least)
+    _, x, mode = some if ln_some > ln_none else none
+    return Posterior(near=near, discrepancy=_discrepancy(x), mode=mode, ln_some=ln_some, ln_none=ln_none)
+
+
+def _mode(data: Data, near: Linearised, x: np.ndarray) -> Mode:
+    """With ln s and ln tau."""
+    return posterior(total(grams(data, near, _discrepancy(x))), near.at, near.model.priors)
+
+
+def time_range(data: Data) -> tuple[float, float]:
+    """Of ln tau: from the interval of samples to the longest trial."""
+    shortest = min(float(np.median(np.diff(t.time))) for t in data.trials)
+    longest = max(float(t.time[-1] - t.time[0]) for t in data.trials)
+    return math.log(shortest), math.log(longest)
 
 
 def _ranges(data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Of ln s and ln tau: from the interval of samples to the longest trial."""
-    shortest = min(float(np.median(np.diff(t.time))) for t in data.trials)
-    longest = max(float(t.time[-1] - t.time[0]) for t in data.trials)
-    return np.log([SHARES[0], shortest]), np.log([SHARES[1], longest])
+    """Of ln s and ln tau."""
+    low, high = time_range(data)
+    return np.array([math.log(SHARES[0]), low]), np.array([math.log(SHARES[1]), high])
 
 
 def _discrepancy(x: np.ndarray) -> Discrepancy:
@@ -261,44 +305,47 @@ def _discrepancy(x: np.ndarray) -> Discrepancy:
 
 def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
     """Of residuals, with a discrepancy."""
-    value, model = 0.0, errors(data, (near.numerics, _discrepancy(x)))
+    value, model = 0.0, errors(data, near.numerics, _discrepancy(x))
     for trial, r in zip(data.trials, left, strict=True):
         gram = model.gram([(trial.time, r[..., None])])
         value -= 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
     return value
 
 
-def _restricted(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> np.ndarray:
-    """Ln s and ln tau with which residuals are most probable."""
-    low, high = _ranges(data)
+def _restricted(
+    data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Ln s and ln tau with which residuals are most probable, within bounds."""
+    moving = np.flatnonzero(high > low)
+
+    def at(free: np.ndarray) -> np.ndarray:
+        full = low.copy()
+        full[moving] = free
+        return full
+
     found = minimize(
-        lambda x: -_ln_likelihood(data, near, left, x),
-        np.clip(x, low, high),
+        lambda free: -_ln_likelihood(data, near, left, at(free)),
+        np.clip(x, low, high)[moving],
         method="Nelder-Mead",
-        bounds=list(zip(low, high, strict=True)),
-        options={"maxfev": 60, "xatol": 0.02, "fatol": 0.05},
+        bounds=[(low[k], high[k]) for k in moving],
+        options={"maxfev": 30 * len(moving), "xatol": 0.5 * NARROW, "fatol": 0.05},
     )
-    return np.clip(found.x, low, high)
+    return np.clip(at(found.x), low, high)
 
 
-def _ln_occam(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
-    """Ln of the share of the prior range of ln s and ln tau that residuals leave."""
-    low, high = _ranges(data)
-    found, h = 0.0, 0.15
-    middle = _ln_likelihood(data, near, left, x)
-    for i, reach in enumerate(high - low):
-        inside = np.clip(x[i], low[i] + h, high[i] - h)
-        ends = []
-        for side in (-h, h):
+def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Ln of the share of the prior range of ln s and ln tau that residuals leave, by second differences."""
+    found = 0.0
+    for k in np.flatnonzero(high > low):
+        middle = float(np.clip(x[k], low[k] + APART, high[k] - APART))
+        values = []
+        for off in (-APART, 0.0, APART):
             y = x.copy()
-            y[i] = inside + side
-            ends.append(_ln_likelihood(data, near, left, y))
-        y = x.copy()
-        y[i] = inside
-        at = middle if inside == x[i] else _ln_likelihood(data, near, left, y)
-        curvature = (2 * at - ends[0] - ends[1]) / h**2
-        width = math.sqrt(2 * math.pi / curvature) if curvature > 0 else math.inf
-        found += min(0.0, math.log(width / reach)) if math.isfinite(width) else 0.0
+            y[k] = middle + off
+            values.append(_ln_likelihood(data, near, left, y))
+        curvature = (2 * values[1] - values[0] - values[2]) / APART**2
+        if curvature > 0:
+            found += min(0.0, 0.5 * math.log(2 * math.pi / curvature) - math.log(high[k] - low[k]))
     return found
 
 

@@ -1,0 +1,248 @@
+"""What can be concluded from evidence: the smallest set of candidates with most of the posterior probability.
+
+Candidates are: nothing is missing; a discrepancy that no effect explains; each effect; each pair. Their evidences are
+compared after an adjustment for how errors really vary. The covariance of the errors takes markers and axes nearly as
+independent, while errors of contact move the whole body: sums over samples are then more uncertain than it says. Along
+the change D by an effect, draws d of the twin's error tell by how much (magnitude adjustment of a composite
+likelihood: Ribatet, Cooley and Davison 2012),
+
+    kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
+
+and ln evidences are divided by kappa.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, errors, leave_one_out
+
+NOTHING, UNKNOWN = "nothing", "unknown"
+SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Candidate:
+    """One name, by all modes that were found of it.
+
+    Attributes:
+        modes: Distinct ones, most probable first.
+        size: Root mean square of the change of the motion by it, once all else is fitted [m].
+        ln_evidence: Summed over modes, adjusted.
+        probability: Posterior.
+    """
+
+    modes: tuple[Posterior, ...]
+    size: float
+    ln_evidence: float
+    probability: float
+
+    @property
+    def name(self) -> str:
+        """Of its effects."""
+        return self.modes[0].near.model.name
+
+    @property
+    def best(self) -> Posterior:
+        """Its most probable mode."""
+        return self.modes[0]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Conclusion:
+    """What can be said.
+
+    Attributes:
+        kind: "explained", "cannot_distinguish", "nothing_missing", "cannot_tell" or "unknown_physics".
+        chosen: Names in the credible set.
+        probabilities: Posterior, of nothing, of what is unknown, and of each name.
+        candidates: Effects and pairs, most probable first.
+        nothing: The model without an effect.
+        kappa: By which ln evidences were divided.
+        limit: Change of the motion that would have been seen [m].
+        matters: Change of the motion that has to be seen [m].
+        predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
+        remedies: For "cannot_tell": what would make it tellable.
+    """
+
+    kind: str
+    chosen: tuple[str, ...]
+    probabilities: dict[str, float]
+    candidates: tuple[Candidate, ...]
+    nothing: Posterior
+    kappa: float
+    limit: float
+    matters: float
+    predictive: tuple[float, float] = (0.0, math.inf)
+    remedies: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Weighing:
+    """Posterior probabilities of names.
+
+    Attributes:
+        data: Recordings.
+        nothing: Modes of the model without an effect.
+        effects: Modes of all others.
+        names: Number of single effects that can be named.
+    """
+
+    data: Data
+    nothing: tuple[Posterior, ...]
+    effects: tuple[Posterior, ...]
+    names: int
+
+    @cached_property
+    def null(self) -> Posterior:
+        """The most probable mode of the model without an effect."""
+        return max(self.nothing, key=lambda p: p.ln_evidence)
+
+    def change(self, found: Posterior) -> Motions:
+        """Of the motion, by an effect."""
+        return tuple(a - b for a, b in zip(self.null.left, found.left, strict=True))
+
+    @cached_property
+    def kappa(self) -> float:
+        """Mean adjustment over the changes by all names, by the errors of the most probable model."""
+        best = self.best
+        changes = [self.change(modes[0]) for modes in self.groups.values()]
+        draws, n = best.near.numerics.draws, len(changes)
+        if not draws or not changes:
+            return 1.0
+        model = errors(self.data, best.near.numerics, best.discrepancy)
+        grams = [
+            model.gram([(trial.time, np.stack([c[i] for c in (*changes, *draws)], -1))]).product
+            for i, trial in enumerate(self.data.trials)
+        ]
+        product = np.sum(grams, 0)
+        lengths = np.maximum(np.diag(product)[:n], 1e-300)
+        return 1.0 + float(((product[:n, n:] ** 2).mean(1) / lengths).mean())
+
+    @cached_property
+    def groups(self) -> dict[str, tuple[Posterior, ...]]:
+        """Distinct modes of each name, most probable first."""
+        found: dict[str, list[Posterior]] = {}
+        for p in sorted(self.effects, key=lambda p: -p.ln_evidence):
+            mine = found.setdefault(p.near.model.name, [])
+            if not any(_same(p, q) for q in mine):
+                mine.append(p)
+        return {name: tuple(modes) for name, modes in found.items()}
+
+    @cached_property
+    def best(self) -> Posterior:
+        """The most probable of all."""
+        return max((*self.effects, *self.nothing), key=lambda p: p.ln_evidence)
+
+    def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
+        """Posterior probabilities of all names, and what has an effect, most probable first."""
+        kappa = self.kappa
+        share = math.log(MISSING / (self.names + 1))
+        # Without a discrepancy that matters nothing is missing, with one something is that has no name.
+        ln_p = {
+            NOTHING: math.log(1 - MISSING) + self.null.ln_none / kappa,
+            UNKNOWN: share + self.null.ln_some / kappa,
+        }
+        for name, modes in self.groups.items():
+            pair = -math.log(self.names) if len(modes[0].near.model.effects) > 1 else 0.0
+            ln_p[name] = share + pair + float(logsumexp([p.ln_evidence / kappa for p in modes]))
+        whole = float(logsumexp(list(ln_p.values())))
+        probabilities = {name: math.exp(value - whole) for name, value in ln_p.items()}
+        found = [
+            Candidate(
+                modes=modes,
+                size=size_of(self.change(modes[0])),
+                ln_evidence=ln_p[name] - share,
+                probability=probabilities[name],
+            )
+            for name, modes in self.groups.items()
+        ]
+        return probabilities, sorted(found, key=lambda c: -c.probability)
+
+
+def _same(one: Posterior, other: Posterior) -> bool:
+    """Whether two modes of a name are one, by the narrower of them."""
+    own = list(one.near.model.own)
+    off = (one.mode.at - other.mode.at)[own]
+    spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
+    return bool((np.abs(off) < SAME * spread).all())
+
+
+def size_of(change: Motions) -> float:
+    """Root mean square over all samples [m]."""
+    return float(np.sqrt(np.nanmean(np.concatenate([c.ravel() for c in change]) ** 2)))
+
+
+def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None = None) -> Conclusion:
+    """The conclusion from evidence.
+
+    Args:
+        weighing: Of all that was fitted.
+        limit: Change of the motion that would have been seen [m].
+        remedies: By what, and with which factor, the limit would come to what matters.
+    """
+    data, null = weighing.data, weighing.null
+    probabilities, candidates = weighing.candidates()
+    least = MATTERS * data.size
+    matters = max(least, VISIBLE * data.noise)
+    # What does not matter is nothing, and what leaves most of the discrepancy is not what is missing.
+    told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
+    told[NOTHING] = probabilities[NOTHING]
+    told[UNKNOWN] = probabilities[UNKNOWN]
+    for c in candidates:
+        left = c.best.discrepancy.share
+        if c.size < least:
+            told[NOTHING] += c.probability
+        elif c.best.matters and left**2 > UNEXPLAINED * null.discrepancy.share**2:
+            told[UNKNOWN] += c.probability
+        else:
+            told[c.name] = c.probability
+    chosen: list[str] = []
+    for name in sorted(told, key=lambda name: -told[name]):
+        chosen.append(name)
+        if sum(told[n] for n in chosen) >= CREDIBLE:
+            break
+    predictive = (0.0, math.inf)
+    first = next((c for c in candidates if c.name == chosen[0]), None)
+    if first is not None:
+        predictive = compared(data, first.best, null, weighing.kappa)
+    if chosen[0] == UNKNOWN:
+        kind = "unknown_physics"
+    elif chosen == [NOTHING]:
+        kind = "nothing_missing" if limit <= matters else "cannot_tell"
+    elif NOTHING in chosen or predictive[0] <= 0:
+        kind = "cannot_tell"
+    else:
+        kind = "explained" if len(chosen) == 1 else "cannot_distinguish"
+    return Conclusion(
+        kind=kind,
+        chosen=tuple(n for n in chosen if n not in (NOTHING, UNKNOWN)),
+        probabilities=told,
+        candidates=tuple(candidates),
+        nothing=null,
+        kappa=weighing.kappa,
+        limit=limit,
+        matters=matters,
+        predictive=predictive,
+        remedies=(remedies or {}) if kind == "cannot_tell" else {},
+    )
+
+
+def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tuple[float, float]:
+    """Gain in ln predictive density of trials left out, and its standard error over trials.
+
+    Args:
+        data: Recordings.
+        one: The one that may be better.
+        other: The other.
+        kappa: By which ln densities are divided.
+    """
+    gain = (leave_one_out(data, one) - leave_one_out(data, other)) / kappa
+    n = len(gain)
+    return float(gain.sum()), float(math.sqrt(n * gain.var(ddof=1))) if n > 1 else math.inf

@@ -1,0 +1,127 @@
+"""Price of the twin's own error that is left once a finer twin corrects it, at a candidate's own parameters.
+
+Smooth motion: the error falls with the square of the edge of the cells, so that two twins of edges h1 > h2 tell that of
+the finer one (Richardson 1911),
+
+    e = (y2 - y1) / ((h1 / h2)^2 - 1).
+
+Contact: which node touches when is decided by distances far below a cell, and motion after that differs by more than
+what finer cells change. Twins whose planes or lattice are shifted below a cell are equally good: R of them are draws of
+one distribution, and so is nature. Their mean predicts best, and its error has the variance
+
+    S^2 = (1 + 1/R) 1/(R - 1) sum_r (y_r - mean)^2.
+
+In both, only that counts which beliefs and measurement errors cannot take up.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.optimize import minimize
+
+from torchsoro.sim2real.inference.evidence import (
+    Data,
+    Discrepancy,
+    Linearised,
+    Model,
+    Motions,
+    TwinError,
+    errors,
+    grams,
+    time_range,
+)
+from torchsoro.sim2real.inference.laplace import posterior
+from torchsoro.sim2real.inference.state_space import total
+
+ORDER = 2  # of convergence with the edge of the cells, of smooth motion
+FAINT = 1e-3  # of the differences' size: white noise with which their correlation time is found
+
+
+def by_richardson(data: Data, near: Linearised, coarser: Motions, ratio: float) -> Linearised:
+    """The finer of two twins, with the error that this one has.
+
+    Args:
+        data: Recordings.
+        near: Residuals by the finer twin.
+        coarser: Residuals by the other.
+        ratio: Edge of its cells over that of the finer one.
+
+    Raises:
+        ValueError: for a ratio that is not above one.
+    """
+    if not ratio > 1:
+        raise ValueError(f"ratio = {ratio:g}, wanted one above 1: the other twin has larger cells")
+    share = 1 / (ratio**ORDER - 1)
+    error = cleared(data, near, tuple(share * (b - a) for a, b in zip(near.residuals, coarser, strict=True)))
+    return dataclasses.replace(near, numerics=_process(data, (error,)))
+
+
+def by_spread(data: Data, near: Linearised, variants: Sequence[Motions]) -> Linearised:
+    """The mean of equally good twins, with the error that this has.
+
+    Args:
+        data: Recordings.
+        near: Of which residuals do not count.
+        variants: Residuals by each of R twins.
+
+    Raises:
+        ValueError: for fewer than two.
+    """
+    count = len(variants)
+    if count < 2:
+        raise ValueError(f"variants: {count}, wanted two or more twins")
+    mean = tuple(np.mean(same, 0) for same in zip(*variants, strict=True))
+    factor = math.sqrt((1 + 1 / count) * count / (count - 1))
+    draws = tuple(
+        cleared(data, near, tuple(factor * (r - m) for r, m in zip(one, mean, strict=True))) for one in variants
+    )
+    return dataclasses.replace(near, residuals=mean, numerics=_process(data, draws))
+
+
+def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
+    """What is left of differences between motions once beliefs and measurement errors are fitted to them."""
+    free = [k for k in range(len(near.at)) if k not in near.model.own]
+    model = Model(effects=(), priors=tuple(near.model.priors[k] for k in free))
+    still = Linearised(
+        model=model,
+        at=np.zeros(len(free)),
+        residuals=difference,
+        slopes=tuple(J[..., free] for J in near.slopes),
+        numerics=TwinError(amplitude=np.zeros_like(data.amplitude)),
+    )
+    return still.left(posterior(total(grams(data, still, Discrepancy())), still.at, model.priors).at)
+
+
+def _process(data: Data, draws: tuple[Motions, ...]) -> TwinError:
+    """The process that errors are draws of: its size by axis and marker, and its correlation time."""
+    squares = [np.nanmean(d**2, 0).T for draw in draws for d in draw]
+    own = np.mean(squares, 0)
+    # A few draws tell an average better than each of its parts.
+    amplitude = np.sqrt((own + own.mean()) / 2)
+    if not amplitude.any():
+        return TwinError(amplitude=amplitude, draws=draws)
+    quiet = dataclasses.replace(data, noise=FAINT * float(amplitude.mean()))
+
+    def lost(x: np.ndarray) -> float:
+        model = errors(quiet, TwinError(amplitude=math.exp(x[0]) * amplitude, time=math.exp(x[1])), Discrepancy())
+        value = 0.0
+        for draw in draws:
+            for trial, d in zip(data.trials, draw, strict=True):
+                gram = model.gram([(trial.time, d[..., None])])
+                value += 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
+        return value
+
+    low, high = time_range(data)
+    found = minimize(
+        lost,
+        [0.0, 0.5 * (low + high)],
+        method="Nelder-Mead",
+        bounds=[(-1.0, 1.0), (low, high)],
+        options={"maxfev": 60, "xatol": 0.02, "fatol": 0.1},
+    )
+    # The size is that of the differences: of smooth ones, likelihood by itself would make it up.
+    return TwinError(amplitude=amplitude, time=math.exp(float(found.x[1])), draws=draws)

@@ -1,0 +1,87 @@
+"""Which changes of the motion would have been seen, and what would make smaller ones visible.
+
+An effect changes the motion by a c, where c is its response as far as beliefs and measurement errors cannot imitate it,
+of information I = c' C^-1 c. It comes to have more than the credible probability where
+
+    a^2 I / (2 kappa) = ln(credible / (1 - credible)) + ln(names + 1).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, VISIBLE
+from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, errors
+
+FACTORS = (2.0, 4.0, 8.0, 16.0)  # by which an experiment or a twin may be made better
+
+
+def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: int, *, trials: float = 1.0) -> float:
+    """Root mean square of the change of the motion that would have been seen, for the median response [m].
+
+    Args:
+        data: Recordings.
+        null: The model without an effect.
+        responses: Change of the motion by each of E effects, of each trial [T, M, A, E].
+        kappa: By which ln evidences are divided.
+        names: Number of effects that can be named.
+        trials: Times as many trials as there are.
+    """
+    near = null.near
+    model = errors(data, near.numerics, null.discrepancy)
+    count = responses[0].shape[-1]
+    columns = [
+        # A sample that was lost tells nothing of a response either.
+        np.concatenate([np.where(np.isfinite(r)[..., None], c, np.nan), J], -1)
+        for r, c, J in zip(near.residuals, responses, near.slopes, strict=True)
+    ]
+    grams = [model.gram([(t.time, x)]).product for t, x in zip(data.trials, columns, strict=True)]
+    product = trials * np.sum(grams, 0)
+    A, B, G = product[count:, count:], product[count:, :count], product[:count, :count]
+    weight = np.diag([p.weight(x) for p, x in zip(near.model.priors, null.mode.at, strict=True)])
+    taken = np.linalg.solve(A + weight, B)
+    information = np.diag(G - B.T @ taken)
+    left = np.concatenate([(c - J @ taken).reshape(-1, count) for c, J in zip(responses, near.slopes, strict=True)])
+    size = np.sqrt((left**2).mean(0))
+    seen = information > 0
+    if not seen.any():
+        return math.inf
+    needed = 2 * kappa * (math.log(CREDIBLE / (1 - CREDIBLE)) + math.log(names + 1))
+    return float(np.median(size[seen] * np.sqrt(needed / information[seen])))
+
+
+def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, names: int) -> dict[str, float]:
+    """What would make a change visible that matters, by the least factor of each that does alone.
+
+    Args:
+        data: Recordings.
+        null: The model without an effect.
+        responses: As of :func:`limit`.
+        kappa: The same.
+        names: The same.
+
+    Returns:
+        Factors, for "noise" (quieter markers), "twin" (a smaller error of the twin), "trials" (more of them), and
+        "motion" (a larger one, as of a larger load).
+    """
+    wanted = max(MATTERS * data.size, VISIBLE * data.noise)
+    found: dict[str, float] = {}
+    now = limit(data, null, responses, kappa, names)
+    for factor in FACTORS:
+        numerics = dataclasses.replace(null.near.numerics, amplitude=null.near.numerics.amplitude / factor)
+        finer = dataclasses.replace(null, near=dataclasses.replace(null.near, numerics=numerics))
+        quiet = dataclasses.replace(data, noise=data.noise / factor)
+        ways: Sequence[tuple[str, float]] = (
+            ("noise", limit(quiet, null, responses, kappa, names)),
+            ("twin", limit(data, finer, responses, 1 + (kappa - 1) / factor**2, names)),
+            ("trials", limit(data, null, responses, kappa, names, trials=factor)),
+            ("motion", now / factor),
+        )
+        for name, value in ways:
+            if value <= wanted:
+                found.setdefault(name, factor)
+    return found
