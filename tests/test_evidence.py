@@ -13,15 +13,11 @@ from hypothesis import strategies as st
 from scipy import stats
 from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
+from swings import AXES, EXACT, recorded
 
 from torchsoro.sim2real.inference.decision import MATTERS
 from torchsoro.sim2real.inference.evidence import (
-    Data,
     Discrepancy,
-    Linearised,
-    Model,
-    TrialData,
-    TwinError,
     errors,
     grams,
     infer,
@@ -192,47 +188,6 @@ def test_a_prior_that_is_no_density_is_refused(numbers):
 
 
 # Discrepancies -------------------------------------------------------------------------------------------------------
-
-MARKERS, AXES = 3, 2
-EXACT = TwinError(amplitude=np.zeros((AXES, MARKERS)))
-
-
-def recorded(share, seed, trials=2, count=60, effect=0.0):
-    """Markers that swing, with a discrepancy of a share of the motion, noise, and an effect that slows the swing."""
-    rng = np.random.default_rng(seed)
-    time = np.linspace(0, 1, count)
-    shape = np.array([[0.2, 0.6, 1.0], [0.05, 0.3, 0.5]])
-    swing = np.stack([np.sin(2 * np.pi * (1.5 + 0.5 * i) * time) for i in range(trials)])
-    slope = np.stack([np.sin(2 * np.pi * (1.5 + 0.5 * i) * time) * time for i in range(trials)])
-    believed = tuple(s[:, None, None] * shape.T for s in swing)
-    slopes = tuple((s[:, None, None] * shape.T)[..., None] for s in slope)
-    quiet = Data(
-        trials=tuple(TrialData(name=str(i), time=time, position=b) for i, b in enumerate(believed)), noise=0.01
-    )
-    model = errors(quiet, EXACT, Discrepancy(share, 0.1))
-    position = []
-    for b, J in zip(believed, slopes, strict=True):
-        off = np.stack([np.linalg.cholesky(model.dense(time, a)) @ rng.normal(size=3 * count) for a in range(AXES)])
-        position.append(b + effect * J[..., 0] + off.reshape(AXES, MARKERS, count).transpose(2, 1, 0))
-    data = dataclasses.replace(
-        quiet, trials=tuple(dataclasses.replace(t, position=p) for t, p in zip(quiet.trials, position, strict=True))
-    )
-    left = tuple(p - b for p, b in zip(position, believed, strict=True))
-    effects = Linearised(
-        model=Model(effects=("drag",), priors=(Prior(1.0),)),
-        at=np.zeros(1),
-        residuals=left,
-        slopes=slopes,
-        numerics=EXACT,
-    )
-    nothing = Linearised(
-        model=Model(effects=(), priors=()),
-        at=np.zeros(0),
-        residuals=left,
-        slopes=tuple(J[..., :0] for J in slopes),
-        numerics=EXACT,
-    )
-    return data, nothing, effects
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2])

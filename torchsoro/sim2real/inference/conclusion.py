@@ -179,6 +179,11 @@ def size_of(change: Motions) -> float:
     return float(np.sqrt(np.nanmean(np.concatenate([c.ravel() for c in change]) ** 2)))
 
 
+def apart(one: Posterior, other: Posterior) -> float:
+    """Root mean square distance of two predictions [m]."""
+    return size_of(tuple(a - b for a, b in zip(one.left, other.left, strict=True)))
+
+
 def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None = None) -> Conclusion:
     """The conclusion from evidence.
 
@@ -195,14 +200,21 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
+    names = {c.name: c for c in candidates}
     for c in candidates:
         left = c.best.discrepancy.share
+        # An extension that moves as what it extends adds nothing.
+        plain = [names[n] for n in c.best.near.model.simpler if n in names]
+        plain = [d for d in plain if apart(c.best, d.best) < least]
         if c.size < least:
             told[NOTHING] += c.probability
+        elif plain:
+            name = max(plain, key=lambda d: d.ln_evidence).name
+            told[name] = told.get(name, 0.0) + c.probability
         elif c.best.matters and left**2 > UNEXPLAINED * null.discrepancy.share**2:
             told[UNKNOWN] += c.probability
         else:
-            told[c.name] = c.probability
+            told[c.name] = told.get(c.name, 0.0) + c.probability
     chosen: list[str] = []
     for name in sorted(told, key=lambda name: -told[name]):
         chosen.append(name)

@@ -138,11 +138,13 @@ class Model:
         effects: Names; none for the setup as stated.
         priors: Of the unknowns: beliefs, effects, measurement errors [K].
         own: Numbers of the unknowns that belong to the effects.
+        simpler: Names of which this one is an extension, as a tether is of a mass, or a pair of its members.
     """
 
     effects: tuple[str, ...]
     priors: tuple[Prior, ...]
     own: tuple[int, ...] = ()
+    simpler: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:

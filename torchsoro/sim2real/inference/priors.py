@@ -51,15 +51,17 @@ class Prior:
         """Ln of the integral of the distribution within the bounds."""
         if math.isinf(self.scale):
             return math.log(self.high - self.low)
-        family = norm if math.isinf(self.freedom) else t(self.freedom)
-        return math.log(float(family.cdf(self.high / self.scale) - family.cdf(self.low / self.scale)))
+        ends = np.array([self.low, self.high]) / self.scale
+        low, high = norm.cdf(ends) if math.isinf(self.freedom) else t.cdf(ends, self.freedom)
+        return math.log(float(high) - float(low))
 
     def ln_density(self, x: float) -> float:
         """Ln of the density at a value within the bounds."""
         if math.isinf(self.scale):
             return -self.ln_mass
-        family = norm if math.isinf(self.freedom) else t(self.freedom)
-        return float(family.logpdf(x / self.scale)) - math.log(self.scale) - self.ln_mass
+        z = x / self.scale
+        ln_p = norm.logpdf(z) if math.isinf(self.freedom) else t.logpdf(z, self.freedom)
+        return float(ln_p) - math.log(self.scale) - self.ln_mass
 
     def weight(self, x: float) -> float:
         """The w of -ln density = w x^2 / 2 + const near a value: the weight of iterated least squares."""

@@ -1,0 +1,180 @@
+"""What follows from evidence: the twin's own error, the credible set, and what would have been seen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from swings import EXACT, recorded
+
+from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude
+from torchsoro.sim2real.inference.decision import MATTERS, VISIBLE
+from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer
+from torchsoro.sim2real.inference.priors import Prior
+from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
+from torchsoro.sim2real.inference.visible import limit, remedies
+
+# The twin's own error ------------------------------------------------------------------------------------------------
+
+
+def test_richardson_finds_an_error_that_falls_with_the_square_of_the_edge():
+    data, nothing, _ = recorded(0.0, 1)
+    time = data.trials[0].time
+    error = 0.03 * np.sin(40 * time)[:, None, None] * np.ones((1, 3, 2))
+    finer = tuple(r + error for r in nothing.residuals)
+    coarser = tuple(r + 1.5**2 * error for r in nothing.residuals)
+    priced = by_richardson(data, dataclasses.replace(nothing, residuals=finer), coarser, 1.5)
+    assert priced.numerics.amplitude == pytest.approx(float(np.sqrt((error**2).mean())), rel=1e-6)
+    assert np.abs(priced.numerics.draws[0][0]) == pytest.approx(np.abs(error), abs=1e-12)
+
+
+def test_richardson_refuses_a_twin_that_is_no_coarser():
+    data, nothing, _ = recorded(0.0, 1)
+    with pytest.raises(ValueError, match=r"ratio = 1, wanted one above 1"):
+        by_richardson(data, nothing, nothing.residuals, 1.0)
+
+
+def draws(data, count, size, seed, time=0.1):
+    """Motions that differ as contact makes them: by a process that all markers share."""
+    rng = np.random.default_rng(seed)
+    times = data.trials[0].time
+    root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / time) + 1e-9 * np.eye(len(times)))
+    return [
+        tuple(size * (root @ rng.normal(size=(len(times), 2)))[:, None] * np.ones((1, 3, 1)) for _ in data.trials)
+        for _ in range(count)
+    ]
+
+
+def test_spread_of_equally_good_twins_is_priced_within_a_third_of_the_error_of_their_mean():
+    data, nothing, _ = recorded(0.0, 2)
+    off = draws(data, 7, 0.05, 3)
+    variants = [tuple(r + d for r, d in zip(nothing.residuals, one, strict=True)) for one in off]
+    priced = by_spread(data, nothing, variants)
+    mean = tuple(np.mean(same, 0) for same in zip(*off, strict=True))
+    for r, m, n in zip(priced.residuals, mean, nothing.residuals, strict=True):
+        assert r - m == pytest.approx(n, abs=1e-12, nan_ok=True)
+    truth = draws(data, 40, 0.05, 4)
+    real = np.sqrt(np.mean([(t - m) ** 2 for one in truth for t, m in zip(one, mean, strict=True)]))
+    assert float(np.sqrt((priced.numerics.amplitude**2).mean())) == pytest.approx(real, rel=0.33)
+    assert 0.03 < priced.numerics.time < 0.3
+
+
+def test_one_twin_has_no_spread():
+    data, nothing, _ = recorded(0.0, 2)
+    with pytest.raises(ValueError, match="variants: 1, wanted two or more"):
+        by_spread(data, nothing, [nothing.residuals])
+
+
+def test_a_difference_that_a_measurement_error_makes_is_no_error_of_the_twin():
+    data, _, drag = recorded(0.0, 3)
+    difference = tuple(0.2 * J[..., 0] for J in drag.slopes)
+    clock = dataclasses.replace(drag, model=dataclasses.replace(drag.model, own=()))
+    assert max(np.abs(c).max() for c in cleared(data, clock, difference)) < 1e-3
+    for kept, whole in zip(cleared(data, drag, difference), difference, strict=True):
+        assert kept == pytest.approx(whole)
+
+
+# Conclusions ---------------------------------------------------------------------------------------------------------
+
+
+def weighed(data, *models, names=10):
+    found = [infer(data, m) for m in models]
+    return Weighing(
+        data=data,
+        nothing=tuple(p for p in found if not p.near.model.effects),
+        effects=tuple(p for p in found if p.near.model.effects),
+        names=names,
+    )
+
+
+def test_an_effect_that_is_there_is_explained():
+    data, nothing, drag = recorded(0.0, 4, effect=0.3)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    assert (found.kind, found.chosen) == ("explained", ("drag",))
+    assert found.probabilities["drag"] > 0.95
+    gain, deviation = found.predictive
+    assert gain > deviation > 0
+
+
+def test_nothing_is_missing_where_an_effect_that_matters_would_have_been_seen():
+    data, nothing, drag = recorded(0.0, 5)
+    assert conclude(weighed(data, nothing, drag), limit=0.0).kind == "nothing_missing"
+    blind = conclude(weighed(data, nothing, drag), limit=1.0, remedies={"twin": 2.0})
+    assert (blind.kind, blind.remedies) == ("cannot_tell", {"twin": 2.0})
+
+
+def test_a_discrepancy_that_no_effect_explains_is_unknown():
+    data, nothing, drag = recorded(0.3, 6)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    assert (found.kind, found.chosen) == ("unknown_physics", ())
+
+
+def test_two_effects_that_move_alike_are_not_told_apart():
+    data, nothing, drag = recorded(0.0, 7, effect=0.3)
+    other = dataclasses.replace(drag, model=dataclasses.replace(drag.model, effects=("leak",)))
+    found = conclude(weighed(data, nothing, drag, other), limit=0.0)
+    assert (found.kind, set(found.chosen)) == ("cannot_distinguish", {"drag", "leak"})
+
+
+def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
+    data, nothing, drag = recorded(0.0, 8, effect=0.3)
+    spring = tuple(np.concatenate([J, 0.01 * J**2], -1) for J in drag.slopes)
+    model = Model(effects=("tether",), priors=(Prior(1.0), Prior(1.0)), own=(0, 1), simpler=("drag",))
+    tether = Linearised(model=model, at=np.zeros(2), residuals=drag.residuals, slopes=spring, numerics=EXACT)
+    weighing = weighed(data, nothing, drag, tether)
+    assert apart(*(modes[0] for modes in weighing.groups.values())) < MATTERS * data.size
+    found = conclude(weighing, limit=0.0)
+    assert (found.kind, found.chosen) == ("explained", ("drag",))
+    assert found.probabilities["drag"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_evidence_counts_less_where_the_twin_errs_along_an_effect():
+    data, nothing, drag = recorded(0.0, 9, effect=0.05)
+    size = np.full_like(data.amplitude, 0.02)
+    along = tuple(tuple(sign * 0.1 * J[..., 0] for J in drag.slopes) for sign in (-1, 1))
+    aside = draws(data, 2, 0.02, 10)
+    kappas = [
+        weighed(
+            data, *(dataclasses.replace(m, numerics=TwinError(amplitude=size, draws=tuple(d))) for m in (nothing, drag))
+        ).kappa
+        for d in ((), aside, along)
+    ]
+    assert kappas[0] == 1.0
+    assert kappas[2] > 2 * kappas[1] > 2.0
+
+
+def test_a_mode_that_was_found_twice_counts_once():
+    data, nothing, drag = recorded(0.0, 11, effect=0.3)
+    once, twice = weighed(data, nothing, drag), weighed(data, nothing, drag, drag)
+    assert len(twice.groups["drag"]) == 1
+    assert twice.candidates()[0] == once.candidates()[0]
+
+
+# What would have been seen -------------------------------------------------------------------------------------------
+
+
+def test_an_effect_of_the_limit_is_near_the_credible_probability():
+    data, nothing, drag = recorded(0.0, 12)
+    weighing = weighed(data, nothing, drag)
+    seen = limit(data, weighing.null, drag.slopes, 1.0, weighing.names)
+    size = float(np.sqrt(np.mean([J**2 for J in drag.slopes])))
+    probabilities = []
+    for share in (0.5, 2.0):
+        # The mean recording with an effect of this size, without its noise.
+        change = tuple(share * seen / size * J[..., 0] for J in drag.slopes)
+        near = [dataclasses.replace(m, residuals=change, at=np.zeros(len(m.at))) for m in (nothing, drag)]
+        probabilities.append(weighed(data, *near).candidates()[0]["drag"])
+    assert probabilities[0] < 0.5
+    assert probabilities[1] > 0.95
+
+
+def test_remedies_name_what_hides_an_effect():
+    data, nothing, drag = recorded(0.0, 13)
+    wanted = max(MATTERS * data.size, VISIBLE * data.noise)
+    still = infer(data, nothing)
+    kappa = next(k for k in np.geomspace(1, 1e6, 100) if limit(data, still, drag.slopes, k, 10) > 1.5 * wanted)
+    found = remedies(data, still, drag.slopes, float(kappa), 10)
+    assert found["twin"] == 2.0  # kappa is of the twin's error
+    assert found["motion"] == 2.0
+    assert found["trials"] == 4.0
