@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, errors, leave_one_out
@@ -151,8 +150,8 @@ class Weighing:
         }
         for name, modes in self.groups.items():
             pair = -math.log(self.names) if len(modes[0].near.model.effects) > 1 else 0.0
-            ln_p[name] = share + pair + float(logsumexp([p.ln_evidence / kappa for p in modes]))
-        whole = float(logsumexp(list(ln_p.values())))
+            ln_p[name] = share + pair + float(np.logaddexp.reduce([p.ln_evidence / kappa for p in modes]))
+        whole = float(np.logaddexp.reduce(list(ln_p.values())))
         probabilities = {name: math.exp(value - whole) for name, value in ln_p.items()}
         found = [
             Candidate(
