@@ -8,11 +8,12 @@ likelihood: Ribatet, Cooley and Davison 2012),
 
     kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
-and ln evidences are divided by kappa.
+and the likelihood is taken to the power of 1 / kappa.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,7 +21,9 @@ from functools import cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, errors, leave_one_out
+from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, adjusted, errors, grams, leave_one_out
+from torchsoro.sim2real.inference.laplace import posterior
+from torchsoro.sim2real.inference.state_space import total
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
@@ -31,9 +34,9 @@ class Candidate:
     """One name, by all modes that were found of it.
 
     Attributes:
-        modes: Distinct ones, most probable first.
-        size: Root mean square of the change of the motion by it, once all else is fitted [m].
-        ln_evidence: Summed over modes, adjusted.
+        modes: Distinct ones, adjusted, most probable first.
+        size: Root mean square of the change of the motion by it, from what is believed, within tolerances [m].
+        ln_evidence: Summed over modes.
         probability: Posterior.
     """
 
@@ -63,7 +66,7 @@ class Conclusion:
         probabilities: Posterior, of nothing, of what is unknown, and of each name.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
-        kappa: By which ln evidences were divided.
+        kappa: To the power of whose inverse the likelihood was taken.
         limit: Change of the motion that would have been seen [m].
         matters: Change of the motion that has to be seen [m].
         predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
@@ -104,8 +107,17 @@ class Weighing:
         return max(self.nothing, key=lambda p: p.ln_evidence)
 
     def change(self, found: Posterior) -> Motions:
-        """Of the motion, by an effect."""
-        return tuple(a - b for a, b in zip(self.null.left, found.left, strict=True))
+        """Of the motion, by an effect: from what is believed, within its tolerances."""
+        return tuple(a - b for a, b in zip(self.believed, found.left, strict=True))
+
+    @cached_property
+    def believed(self) -> Motions:
+        """Residuals of the model without an effect, its beliefs within their tolerances [T, M, A] m."""
+        null = self.null
+        near, n = null.near, null.near.model.beliefs
+        priors = [dataclasses.replace(p, low=-1.0, high=1.0) for p in near.model.priors[:n]]
+        gram = total(grams(self.data, near, null.discrepancy))
+        return near.left(posterior(gram, near.at, [*priors, *near.model.priors[n:]]).at)
 
     @cached_property
     def kappa(self) -> float:
@@ -142,25 +154,27 @@ class Weighing:
     def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
         """Posterior probabilities of all names, and what has an effect, most probable first."""
         kappa = self.kappa
+        null = adjusted(self.data, self.null, kappa)
+        groups = {name: [adjusted(self.data, p, kappa) for p in modes] for name, modes in self.groups.items()}
         share = math.log(MISSING / (self.names + 1))
         # Without a discrepancy that matters nothing is missing, with one something is that has no name.
         ln_p = {
-            NOTHING: math.log(1 - MISSING) + self.null.ln_none / kappa,
-            UNKNOWN: share + self.null.ln_some / kappa,
+            NOTHING: math.log(1 - MISSING) + null.none.ln_evidence,
+            UNKNOWN: share + null.some.ln_evidence,
         }
-        for name, modes in self.groups.items():
+        for name, modes in groups.items():
             pair = -math.log(self.names) if len(modes[0].near.model.effects) > 1 else 0.0
-            ln_p[name] = share + pair + float(np.logaddexp.reduce([p.ln_evidence / kappa for p in modes]))
+            ln_p[name] = share + pair + float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
         whole = float(np.logaddexp.reduce(list(ln_p.values())))
         probabilities = {name: math.exp(value - whole) for name, value in ln_p.items()}
         found = [
             Candidate(
-                modes=modes,
-                size=size_of(self.change(modes[0])),
+                modes=tuple(modes),
+                size=size_of(self.change(self.groups[name][0])),
                 ln_evidence=ln_p[name] - share,
                 probability=probabilities[name],
             )
-            for name, modes in self.groups.items()
+            for name, modes in groups.items()
         ]
         return probabilities, sorted(found, key=lambda c: -c.probability)
 
@@ -195,13 +209,12 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
-    # What does not matter is nothing, and what leaves most of the discrepancy is not what is missing.
+    # What does not matter is nothing, and what leaves more than its law may be wrong by is not what is missing.
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
     names = {c.name: c for c in candidates}
     for c in candidates:
-        left = c.best.discrepancy.share
         # An extension that moves as what it extends adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
         plain = [d for d in plain if apart(c.best, d.best) < least]
@@ -210,7 +223,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name
             told[name] = told.get(name, 0.0) + c.probability
-        elif c.best.matters and left**2 > UNEXPLAINED * null.discrepancy.share**2:
+        elif c.best.matters and c.best.discrepancy.share * data.size > UNEXPLAINED * apart(c.best, null):
             told[UNKNOWN] += c.probability
         else:
             told[c.name] = told.get(c.name, 0.0) + c.probability
@@ -252,8 +265,8 @@ def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tupl
         data: Recordings.
         one: The one that may be better.
         other: The other.
-        kappa: By which ln densities are divided.
+        kappa: Of whose inverse the likelihood is taken to the power.
     """
-    gain = (leave_one_out(data, one) - leave_one_out(data, other)) / kappa
+    gain = leave_one_out(data, one, kappa) - leave_one_out(data, other, kappa)
     n = len(gain)
     return float(gain.sum()), float(math.sqrt(n * gain.var(ddof=1))) if n > 1 else math.inf

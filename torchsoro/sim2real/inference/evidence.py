@@ -23,7 +23,7 @@ from scipy.optimize import minimize
 from torchsoro.sim2real.inference.decision import COMMON, LASTING, MATTERS
 from torchsoro.sim2real.inference.laplace import Mode, posterior
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, total
+from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, tempered, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
 SHARES = (MATTERS, 1.0)  # of the motion: where the prior of a discrepancy that matters is uniform in ln s
@@ -64,7 +64,7 @@ class TrialData:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Data:
-    """The trials that decide. Trials that are only predicted are in a :class:`HeldOut`, which no decision takes.
+    """The trials that decide. Trials that are only predicted are not among them, and reach no decision.
 
     Attributes:
         trials: Recordings.
@@ -89,17 +89,6 @@ class Data:
     def size(self) -> float:
         """Root mean square of the motion over markers and axes [m]."""
         return float(np.sqrt(np.mean(self.motion**2)))
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class HeldOut:
-    """Trials that are only predicted.
-
-    Attributes:
-        trials: Recordings.
-    """
-
-    trials: tuple[TrialData, ...]
 
 
 @dataclass(frozen=True)
@@ -139,12 +128,14 @@ class Model:
         priors: Of the unknowns: beliefs, effects, measurement errors [K].
         own: Numbers of the unknowns that belong to the effects.
         simpler: Names of which this one is an extension, as a tether is of a mass, or a pair of its members.
+        beliefs: Number of the first unknowns, which are beliefs over their tolerances.
     """
 
     effects: tuple[str, ...]
     priors: tuple[Prior, ...]
     own: tuple[int, ...] = ()
     simpler: tuple[str, ...] = ()
+    beliefs: int = 0
 
     @property
     def name(self) -> str:
@@ -183,35 +174,66 @@ class Linearised:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Branch:
+    """A model after the recordings, near one mode, with a discrepancy that matters or with one that does not.
+
+    Attributes:
+        discrepancy: With which it is most probable.
+        mode: Of its unknowns, with that.
+        ln_occam: ln of the share of the prior range of s and tau that is left.
+    """
+
+    discrepancy: Discrepancy
+    mode: Mode
+    ln_occam: float
+
+    @property
+    def ln_evidence(self) -> float:
+        """With s and tau integrated out."""
+        return self.mode.ln_evidence + self.ln_occam
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Posterior:
     """A model after the recordings, near one mode.
 
     Attributes:
         near: The model, and where it was linearised.
-        discrepancy: With which it is most probable.
-        mode: Of its unknowns, with that.
-        ln_some: ln evidence with s and tau integrated out, s being large enough to matter.
-        ln_none: The same with s as large as what does not matter.
+        some: With a discrepancy that matters.
+        none: With one as large as what does not matter.
     """
 
     near: Linearised
-    discrepancy: Discrepancy
-    mode: Mode
-    ln_some: float
-    ln_none: float
+    some: Branch
+    none: Branch
 
     @property
     def ln_evidence(self) -> float:
         """With a discrepancy that matters as probable before as one that does not."""
-        return float(np.logaddexp(self.ln_some, self.ln_none)) - math.log(2)
+        return float(np.logaddexp(self.some.ln_evidence, self.none.ln_evidence)) - math.log(2)
 
     @property
     def matters(self) -> bool:
         """Whether a discrepancy that matters is more probable."""
-        return self.ln_some > self.ln_none
+        return self.some.ln_evidence > self.none.ln_evidence
+
+    @property
+    def best(self) -> Branch:
+        """The more probable of the two."""
+        return self.some if self.matters else self.none
+
+    @property
+    def discrepancy(self) -> Discrepancy:
+        """That is more probable."""
+        return self.best.discrepancy
+
+    @property
+    def mode(self) -> Mode:
+        """Of the unknowns, with that discrepancy."""
+        return self.best.mode
 
     @cached_property
-    def left(self) -> tuple[np.ndarray, ...]:
+    def left(self) -> Motions:
         """Residuals at the mode [T, M, A] m."""
         return self.near.left(self.mode.at)
 
@@ -258,34 +280,44 @@ def infer(data: Data, near: Linearised) -> Posterior:
         near: The model linearised at a point, which should be close to its mode.
     """
 
-    def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[float, np.ndarray, Mode]:
+    def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> Branch:
         """The mode, and the ln s and ln tau that its residual tells, within bounds."""
         x = start
         for _ in range(ALTERNATIONS):
-            mode = _mode(data, near, x)
-            before, x = x, _restricted(data, near, near.left(mode.at), x, low, high)
+            left = near.left(mode_of(data, near, _discrepancy(x)).at)
+            before, x = x, _restricted(data, near, left, x, low, high)
             if np.abs(x - before).max() < NARROW:
                 break
-        mode = _mode(data, near, x)
-        return mode.ln_evidence, x, mode
+        mode = mode_of(data, near, _discrepancy(x))
+        ln_occam = _ln_occam(data, near, near.left(mode.at), x, low, high)
+        return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
 
     low, high = _ranges(data)
     middle = 0.5 * (low + high)
-    least = np.array([low[0], high[1]])
     # From little and from much: with much, the first mode is not bent by a wrong model.
-    some = max(
-        (settled(np.array([ln_s, middle[1]]), low, high) for ln_s in (middle[0], high[0])), key=lambda found: found[0]
-    )
-    none = settled(np.array([low[0], middle[1]]), low, least)
-    ln_some = some[0] + _ln_occam(data, near, near.left(some[2].at), some[1], low, high)
-    ln_none = none[0] + _ln_occam(data, near, near.left(none[2].at), none[1], low, least)
-    _, x, mode = some if ln_some > ln_none else none
-    return Posterior(near=near, discrepancy=_discrepancy(x), mode=mode, ln_some=ln_some, ln_none=ln_none)
+    some = [settled(np.array([ln_s, middle[1]]), low, high) for ln_s in (middle[0], high[0])]
+    none = settled(np.array([low[0], middle[1]]), low, np.array([low[0], high[1]]))
+    return Posterior(near=near, some=max(some, key=lambda branch: branch.ln_evidence), none=none)
 
 
-def _mode(data: Data, near: Linearised, x: np.ndarray) -> Mode:
-    """With ln s and ln tau."""
-    return posterior(total(grams(data, near, _discrepancy(x))), near.at, near.model.priors)
+def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
+    """The posterior with the likelihood to the power of 1 / kappa, and the priors as they are.
+
+    Args:
+        data: Recordings.
+        found: With the likelihood as it is.
+        kappa: How much more uncertain sums over samples are than the covariance of the errors says.
+    """
+
+    def again(branch: Branch) -> Branch:
+        return dataclasses.replace(branch, mode=mode_of(data, found.near, branch.discrepancy, kappa))
+
+    return dataclasses.replace(found, some=again(found.some), none=again(found.none))
+
+
+def mode_of(data: Data, near: Linearised, discrepancy: Discrepancy, kappa: float = 1.0) -> Mode:
+    """Of the unknowns, with a discrepancy."""
+    return posterior(tempered(total(grams(data, near, discrepancy)), kappa), near.at, near.model.priors)
 
 
 def time_range(data: Data) -> tuple[float, float]:
@@ -336,8 +368,8 @@ def _restricted(
 
 
 def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """Ln of the share of the prior range of ln s and ln tau that residuals leave, by second differences."""
-    found = 0.0
+    """Logarithm of the share of the prior range of ln s and ln tau that residuals leave: by a parabola along each."""
+    found, top = 0.0, _ln_likelihood(data, near, left, x)
     for k in np.flatnonzero(high > low):
         middle = float(np.clip(x[k], low[k] + APART, high[k] - APART))
         values = []
@@ -345,26 +377,31 @@ def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: n
             y = x.copy()
             y[k] = middle + off
             values.append(_ln_likelihood(data, near, left, y))
-        curvature = (2 * values[1] - values[0] - values[2]) / APART**2
-        if curvature > 0:
-            found += min(0.0, 0.5 * math.log(2 * math.pi / curvature) - math.log(high[k] - low[k]))
+        slope = (values[2] - values[0]) / (2 * APART)
+        bend = min((values[2] + values[0] - 2 * values[1]) / APART**2, 0.0)
+        # Finer steps where the parabola is narrow, so that its top is not missed.
+        away = np.linspace(-1, 1, 2001) ** 3 * (high[k] - low[k]) + x[k] - middle
+        away = away[(away >= low[k] - middle) & (away <= high[k] - middle)]
+        height = values[1] - top + slope * away + 0.5 * bend * away**2
+        mass = float(np.trapezoid(np.exp(np.minimum(height, 0.0)), away))
+        found += min(0.0, math.log(mass / (high[k] - low[k])))
     return found
 
 
-def leave_one_out(data: Data, found: Posterior) -> np.ndarray:
+def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarray:
     """Ln of the predictive density of each trial, given the others [trials].
 
     ln p(y_i | y_-i) = ln Z(y) - ln Z(y_-i), with s and tau of all trials.
+
+    Args:
+        data: Recordings.
+        found: A model after all of them.
+        kappa: See :func:`adjusted`.
     """
-    parts = grams(data, found.near, found.discrepancy)
     near = found.near
-    whole = posterior(total(parts), near.at, near.model.priors).ln_evidence
-    if len(parts) == 1:
-        return np.array([whole])
-    rest = [total([g for j, g in enumerate(parts) if j != i]) for i in range(len(parts))]
-    return np.array([whole - posterior(g, near.at, near.model.priors).ln_evidence for g in rest])
+    parts = [tempered(g, kappa) for g in grams(data, near, found.discrepancy)]
 
+    def ln_z(of: list[Gram]) -> float:
+        return posterior(total(of), near.at, near.model.priors).ln_evidence if of else 0.0
 
-def without(data: Data, trial: str) -> Data:
-    """The data without one of its trials."""
-    return dataclasses.replace(data, trials=tuple(t for t in data.trials if t.name != trial))
+    return np.array([ln_z(parts) - ln_z(parts[:i] + parts[i + 1 :]) for i in range(len(parts))])

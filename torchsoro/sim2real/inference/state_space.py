@@ -104,7 +104,7 @@ class Gram:
 
     product: np.ndarray
     ln_det: float
-    count: int
+    count: float
 
     def __add__(self, other: Gram) -> Gram:
         """Of samples whose errors are independent of these."""
@@ -113,6 +113,11 @@ class Gram:
             ln_det=self.ln_det + other.ln_det,
             count=self.count + other.count,
         )
+
+
+def tempered(gram: Gram, kappa: float) -> Gram:
+    """Of a likelihood to the power of 1 / kappa."""
+    return Gram(product=gram.product / kappa, ln_det=gram.ln_det / kappa, count=gram.count / kappa)
 
 
 def total(grams: Sequence[Gram]) -> Gram:
