@@ -12,7 +12,6 @@ from torchsoro.sim2real.inference.candidates import data_of, model_of, responses
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.visible import limit
-from torchsoro.sim2real.twin.ensemble import Ensemble
 from torchsoro.sim2real.twin.twin import Twin
 
 NAMES = ("density",)
@@ -21,11 +20,11 @@ NAMES = ("density",)
 @pytest.fixture(scope="module")
 def weighed(tmp_path_factory):
     """A bar that is a half heavier than believed, and one that is as believed."""
-    twin, ensemble, record = bar(tmp_path_factory.mktemp("bar"))
-    middle, fine = (Ensemble(Twin(twin.setup, edge=e, across=n)) for e, n in ((0.0075, 3), (0.006, 4)))
+    twin, record = bar(tmp_path_factory.mktemp("bar"))
+    middle, fine = (Twin(twin.setup, edge=e, across=n) for e, n in ((0.0075, 3), (0.006, 4)))
     found = {}
     for name, values in (("density", (math.log(1.5),)), (None, ())):
-        problem = FitProblem(record(name, values, by=fine), ensemble)
+        problem = FitProblem(record(name, values, by=fine), twin)
         tasks = [((), None), *(((effect(n),), None) for n in NAMES)]
         fits = [f for f in problem.fit(tasks, rounds=5) if f is not None]
         found[name] = problem, fits, weigh(problem, fits, middle, fine, names=20)
@@ -55,7 +54,7 @@ def test_nothing_is_named_in_a_bar_that_is_as_believed(weighed):
 def test_trials_that_are_only_predicted_change_no_evidence(weighed):
     problem, _, weighing = weighed["density"]
     trial = dataclasses.replace(problem.trials[0], name="other")
-    other = FitProblem(dataclasses.replace(problem.experiment, heldout=(trial,)), problem.ensemble)
+    other = FitProblem(dataclasses.replace(problem.experiment, heldout=(trial,)), problem.twin)
     assert [t.name for t in data_of(other).trials] == [t.name for t in weighing.data.trials]
 
 

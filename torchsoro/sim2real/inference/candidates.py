@@ -18,8 +18,7 @@ from torchsoro.sim2real.inference.likelihood import Effects, Likelihood
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.ensemble import Ensemble
-from torchsoro.sim2real.twin.twin import MarkerTrajectory
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
 WEAK = 0.1  # strength of a response, over that of the weakest probe point: it is linear there
@@ -83,14 +82,14 @@ def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def near(problem: FitProblem, fits: Sequence[Fit], middle: Ensemble, fine: Ensemble) -> list[Linearised | None]:
+def near(problem: FitProblem, fits: Sequence[Fit], middle: Twin, fine: Twin) -> list[Linearised | None]:
     """Fits as linearised models, with the error that finer twins leave; all simulated together.
 
     Args:
         problem: That was fitted.
         fits: Ends of searches.
-        middle: Of a twin with cells between those of the twin in use and of the finest.
-        fine: Of the finest twin.
+        middle: A twin with cells between those of the twin in use and of the finest.
+        fine: The finest twin.
 
     Returns:
         A model of each; None where a simulation breaks down.
@@ -98,7 +97,7 @@ def near(problem: FitProblem, fits: Sequence[Fit], middle: Ensemble, fine: Ensem
     data, bare = data_of(problem), DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
     finer, between = (
-        problem.only(problem.trials, ensemble=e, discretization=DiscretizationError()) for e in (fine, middle)
+        problem.only(problem.trials, twin=e, discretization=DiscretizationError()) for e in (fine, middle)
     )
     planes = any(s.planes for s in problem.scenarios)
     steps = [np.where(f.point + STEP > coarse.bounds(f.effects)[1], -STEP, STEP) for f in fits]
@@ -113,7 +112,7 @@ def near(problem: FitProblem, fits: Sequence[Fit], middle: Ensemble, fine: Ensem
         ask = [(f.effects, f.point[None]) for f in fits]
     best = finer.simulate(ask)
     rest = between.simulate([(f.effects, f.point[None]) for f in fits])
-    ratio = middle.twin.edge / fine.twin.edge
+    ratio = middle.edge / fine.edge
     found: list[Linearised | None] = []
     for f, h, motions, sharp, dull in zip(fits, steps, beside, best, rest, strict=True):
         if not all(m.sound.all() for m in (*motions, *sharp, *dull)):
@@ -158,7 +157,7 @@ def _slopes(
     return tuple(found)
 
 
-def weigh(problem: FitProblem, fits: Sequence[Fit], middle: Ensemble, fine: Ensemble, names: int) -> Weighing:
+def weigh(problem: FitProblem, fits: Sequence[Fit], middle: Twin, fine: Twin, names: int) -> Weighing:
     """Posterior of all fits.
 
     Args:
