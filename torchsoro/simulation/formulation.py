@@ -65,8 +65,8 @@ class Formulation(Protocol):
         """Refuse what the formulation cannot simulate (``ValueError``)."""
         ...
 
-    def constant_forces(self, like: Tensor) -> bool:
-        """Whether forces that are constant since they begin are taken as such, where nothing has a gradient."""
+    def in_lanes(self, like: Tensor) -> bool:
+        """Whether simulations run in lanes: forces may have one row for all steps, and simulations may diverge apart."""
         ...
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
@@ -147,8 +147,8 @@ class Updated:
         """There are no nodes to attach anything to."""
         refuse_nodes(attached)
 
-    def constant_forces(self, like: Tensor) -> bool:
-        """Every step has its own."""
+    def in_lanes(self, like: Tensor) -> bool:
+        """Particles have none."""
         return False
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
@@ -223,8 +223,8 @@ class Total:
         if self.lattice is None and given:
             raise ValueError(f"loads: a {type(given[0]).__name__} on nodes, wanted Total(lattice=...), or particles")
 
-    def constant_forces(self, like: Tensor) -> bool:
-        """In lanes."""
+    def in_lanes(self, like: Tensor) -> bool:
+        """On a CPU, unless told otherwise."""
         return self.lanes and not like.is_cuda
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:

@@ -156,6 +156,10 @@ class Simulator(nn.Module):
             steps, every = _steps(duration, sample_every, self.dt)
         if divergence not in ("raise", "mark"):
             raise ValueError(f"divergence = {divergence!r}: wanted 'raise' or 'mark'")
+        if divergence == "mark" and not self.formulation.in_lanes(x):
+            raise ValueError(
+                "divergence = 'mark': simulations diverge apart: wanted the total-Lagrangian formulation in lanes on a CPU"
+            )
         check_body(body)
         self.formulation.check_planes(planes)
         if start is None:
@@ -226,7 +230,7 @@ class Simulator(nn.Module):
         """Forces that are constant from a substep of the run on, with a row for each of this one if they need it."""
         tensors = [*others, *(getattr(inputs, f.name) for f in fields(inputs))]
         gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-        if not gradient and self.formulation.constant_forces(inputs.coefficients):
+        if not gradient and self.formulation.in_lanes(inputs.coefficients):
             return replace(scene, force_start=firsts), inputs
         force, steps = inputs.force, began + torch.arange(len(inputs.gravity), device=inputs.force.device)
         rows = force.expand(len(steps), *force.shape[1:])
