@@ -158,7 +158,7 @@ class Simulator(nn.Module):
             raise ValueError(f"divergence = {divergence!r}: wanted 'raise' or 'mark'")
         if divergence == "mark" and not self.formulation.in_lanes(x):
             raise ValueError(
-                "divergence = 'mark': simulations diverge apart: wanted the total-Lagrangian formulation in lanes on a CPU"
+                "divergence = 'mark': diverge apart: wanted the total-Lagrangian formulation in lanes of a CPU"
             )
         check_body(body)
         self.formulation.check_planes(planes)
