@@ -21,9 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, adjusted, errors, grams, leave_one_out
-from torchsoro.sim2real.inference.laplace import posterior
-from torchsoro.sim2real.inference.state_space import total
+from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, adjusted, errors, leave_one_out, mode_of
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
@@ -113,11 +111,8 @@ class Weighing:
     @cached_property
     def believed(self) -> Motions:
         """Residuals of the model without an effect, its beliefs within their tolerances [T, M, A] m."""
-        null = self.null
-        near, n = null.near, null.near.model.beliefs
-        priors = [dataclasses.replace(p, low=-1.0, high=1.0) for p in near.model.priors[:n]]
-        gram = total(grams(self.data, near, null.discrepancy))
-        return near.left(posterior(gram, near.at, [*priors, *near.model.priors[n:]]).at)
+        found = within(self.null)
+        return found.near.left(mode_of(self.data, found.near, found.discrepancy).at)
 
     @cached_property
     def kappa(self) -> float:
@@ -235,7 +230,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     predictive = (0.0, math.inf)
     first = next((c for c in candidates if c.name == chosen[0]), None)
     if first is not None:
-        predictive = compared(data, first.best, null, weighing.kappa)
+        predictive = compared(data, first.best, within(null), weighing.kappa)
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"
     elif chosen == [NOTHING]:
@@ -256,6 +251,14 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )
+
+
+def within(null: Posterior) -> Posterior:
+    """The model without an effect whose beliefs cannot leave their tolerances; its modes are those of before."""
+    model = null.near.model
+    bounded = [dataclasses.replace(p, low=-1.0, high=1.0) for p in model.priors[: model.beliefs]]
+    model = dataclasses.replace(model, priors=(*bounded, *model.priors[model.beliefs :]))
+    return dataclasses.replace(null, near=dataclasses.replace(null.near, model=model))
 
 
 def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tuple[float, float]:
