@@ -129,10 +129,12 @@ def draw_walking(path: Path, rows: Sequence[Row], courses: Mapping[tuple[int, st
     save()
 
 
+# fmt: off
 Check = Literal[
-    *("damping", "bar", "creep", "sphere", "rheology", "restitution", "ball", "contact", "stability", "fall"),
-    *("walking", "all"),
+    "damping", "bar", "creep", "sphere", "rheology", "restitution",
+    "ball", "contact", "stability", "fall", "walking", "all",
 ]
+# fmt: on
 
 
 def main(check: tyro.conf.Positional[Check], out: Path | None = None) -> None:
