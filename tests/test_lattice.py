@@ -273,7 +273,10 @@ def test_a_lattice_that_is_not_half_a_cell_is_refused():
 
 # Where a quantity of ``layout.BUFFERS`` begins is told by the constant of its name, or by this one.
 RENAMED = {
-    "fixed": {"coefficients": "COEFFICIENT", "prony": "ELEMENT", "nodal": "NODES", "chamber": "CHAMBER_NUMBERS"},
+    "fixed": {
+        **{"coefficients": "COEFFICIENT", "prony": "ELEMENT", "nodal": "NODES", "chamber": "CHAMBER_NUMBERS"},
+        **{"areas": "AREA", "ties": "TIE_STIFFNESS", "walls": "WALL_NUMBERS"},
+    },
     "sums": {
         **{"coefficients_bar": "COEFFICIENT_BAR", "prony_bar": "ELEMENT_BAR", "plane_numbers_bar": "PLANE_BAR"},
         "nodal_bar": "NODES_BAR",

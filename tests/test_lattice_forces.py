@@ -212,7 +212,7 @@ def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
     lat = wide()
     kind = torch.full((lat.count,), -1, dtype=torch.int32)
     kind[: lat.count // 3], kind[-9:] = 0, layout.ABSENT
-    *_, chamber_start, slot_start, slots, sources, near = tables(lat, kind, 2)
+    _, _, chamber_start, slot_start, slots, sources, near, *_ = tables(lat, kind, 2)
     many = len(slot_start) - 1 + len(slots)
     at = np.sort(sources[sources >= 0])
     assert len(np.unique(at)) == len(at)

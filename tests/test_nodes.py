@@ -240,6 +240,38 @@ def test_gradients_by_a_force_of_places_and_deformations_are_those_of_difference
         assert float(by[k]) == pytest.approx(float(difference), rel=1e-6)
 
 
+@pytest.mark.parametrize("name", ["softening", "air_stiffness", "drag", "stiffness"])
+def test_gradients_by_what_acts_on_nodes_are_those_of_differences(name):
+    lattice, body = bar(hollow=True)
+    held = torch.nonzero(lattice.particles[:, 0] > 0.02).squeeze(-1)
+    supply = Waveform(time=vector(0.0, 1.0), pressure=vector(2e3, 2e3))
+    wide = torch.zeros(lattice.nodes, 3, dtype=torch.float64)
+    wide[:, 0] = 0.2 * (lattice.node_places[:, 0] - 0.015)
+    start = Start(displacement=wide, velocity=torch.full_like(wide, 0.5))
+    places = torch.tensor([[0.013, 0.003, 0.011], [0.03, 0.02, 0.02]], dtype=torch.float64)
+    numbers = {
+        "softening": vector(0.5, 0.02),
+        "air_stiffness": vector(3e4),
+        "drag": vector(1500.0),
+        "stiffness": vector(300.0),
+    }
+
+    def loss(value: Tensor) -> Tensor:
+        now = {**numbers, name: value}
+        loads = [QuadraticDrag(now["drag"][0]), Spring(particles=held, stiffness=now["stiffness"][0], mean=True)]
+        soft = replace(body, softening=now["softening"], air_stiffness=now["air_stiffness"])
+        found = run(lattice, soft, 30, loads=loads, start=start, pressure=supply, probes=places)
+        seen = torch.cat([found.position.flatten() / 1e-3, found.velocity.flatten() / 0.1])
+        return (seen * torch.arange(len(seen)).cos()).sum()
+
+    value = numbers[name].clone().requires_grad_()
+    (by,) = torch.autograd.grad(loss(value), value)
+    for k, unit in enumerate(torch.eye(len(value), dtype=torch.float64)):
+        step = 1e-4 * float(numbers[name][k])
+        parts = [w * float(loss(numbers[name] + n * step * unit)) for n, w in ((-2, 1), (-1, -8), (1, 8), (2, -1))]
+        assert float(by[k]) == pytest.approx(sum(parts) / (12 * step), rel=1e-6)
+
+
 def test_a_simulation_that_diverges_is_marked_and_leaves_the_others_as_they_are():
     lattice, body = bar()
     wild = torch.stack([vector(0.1, 0.0, 0.0), vector(0.1, 0.0, 3e4)]).unsqueeze(1).expand(2, lattice.nodes, 3).clone()

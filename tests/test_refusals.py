@@ -83,7 +83,7 @@ def test_bad_bodies_are_refused(body, message):
         ({"gravity": (0.0, 0.0, math.nan)}, r"gravity = .*: wanted finite"),
         ({"gravity": (vector(0.0, 1.0), torch.zeros(2, 2))}, r"gravity: shape \(2, 2\), wanted \[\.\.\., S, 3\]"),
         ({"pressure": constant(1.0)}, r"pressure: 1 chambers, wanted the body's 0"),
-        ({"probes": torch.tensor([0.5])}, r"probes: torch\.float32 of shape \(1,\), wanted int64 \[P\]"),
+        ({"probes": torch.tensor([0.5])}, r"probes: places of shape \(1,\), wanted finite places \[P, 3\] m"),
         ({"probes": torch.tensor([[1]])}, r"probes: torch\.int64 of shape \(1, 1\), wanted int64 \[P\]"),
         ({"probes": torch.tensor([64])}, r"probes: 64 to 64, wanted 0 to 63"),
         ({"probes": torch.tensor([-1, 3])}, r"probes: -1 to 3, wanted 0 to 63"),

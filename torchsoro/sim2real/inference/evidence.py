@@ -58,7 +58,7 @@ class TrialData:
             )
         for name in ("time", "position"):
             value = np.array(getattr(self, name), dtype=np.float64)
-            value.flags.writeable = False
+            value.setflags(write=False)
             object.__setattr__(self, name, value)
 
 

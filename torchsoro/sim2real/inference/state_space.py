@@ -59,7 +59,8 @@ class ErrorModel:
         """
         parts, ln_det = [], 0.0
         for axis in range(values.shape[2]):
-            white, ln_part = Filter(self, axis, values.shape[-1]).advance(time, values[:, :, axis])
+            one = Filter(self, axis)
+            _, white, ln_part = one.advance(one.start(values.shape[-1]), time, values[:, :, axis])
             parts.append(white)
             ln_det += ln_part
         return np.concatenate(parts), ln_det
@@ -71,13 +72,15 @@ class ErrorModel:
             chunks: Times [T] s and columns [T, M, A, C] m of each part.
         """
         filters: list[Filter] = []
+        states: list[State] = []
         product, ln_det, count = np.zeros((0, 0)), 0.0, 0
         for time, values in chunks:
             if not filters:
-                filters = [Filter(self, axis, values.shape[-1]) for axis in range(values.shape[2])]
+                filters = [Filter(self, axis) for axis in range(values.shape[2])]
+                states = [one.start(values.shape[-1]) for one in filters]
                 product = np.zeros((values.shape[-1],) * 2)
             for axis, one in enumerate(filters):
-                white, ln_part = one.advance(time, values[:, :, axis])
+                states[axis], white, ln_part = one.advance(states[axis], time, values[:, :, axis])
                 product += white.T @ white
                 ln_det += ln_part
                 count += len(white)
@@ -128,37 +131,54 @@ def total(grams: Sequence[Gram]) -> Gram:
     return first
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class State:
+    """What a filter expects after the samples so far.
+
+    Attributes:
+        time: Of the last of them [s]; minus infinity before the first.
+        mean: Of the processes, column by column [K, C].
+        covariance: Of the processes [K, K].
+    """
+
+    time: float
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
 class Filter:
-    """A Kalman filter of many columns along one axis; it goes on where it stopped.
+    """A Kalman filter of many columns along one axis.
 
     Args:
         model: Of the errors.
         axis: Number of the recorded axis.
-        columns: Number of columns.
     """
 
-    def __init__(self, model: ErrorModel, axis: int, columns: int) -> None:
+    def __init__(self, model: ErrorModel, axis: int) -> None:
         rates = [np.full(p.loading.shape[2], 1 / p.time) for p in model.processes]
-        self.rate = np.concatenate([np.zeros(0), *rates])
         loadings = [p.loading[axis] for p in model.processes]
-        self.loading = np.concatenate([np.zeros((len(model.white[axis]), 0)), *loadings], 1)
+        loading = np.concatenate([np.zeros((len(model.white[axis]), 0)), *loadings], 1)
         # A process that no marker sees would only cost time.
-        seen = self.loading.any(0)
-        self.rate, self.loading = self.rate[seen], np.ascontiguousarray(self.loading[:, seen])
+        seen = loading.any(0)
+        self.rate = np.concatenate([np.zeros(0), *rates])[seen]
+        self.loading = np.ascontiguousarray(loading[:, seen])
         self.variance = model.white[axis] ** 2
-        self.mean = np.zeros((len(self.rate), columns))
-        self.covariance = np.eye(len(self.rate))
-        self.last = -math.inf
 
-    def advance(self, time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Innovations over their standard deviation [N, C], and the ln of the product of their variances.
+    def start(self, columns: int) -> State:
+        """Before the first sample: each process with the variance that it has at all times."""
+        return State(time=-math.inf, mean=np.zeros((len(self.rate), columns)), covariance=np.eye(len(self.rate)))
+
+    def advance(self, state: State, time: np.ndarray, values: np.ndarray) -> tuple[State, np.ndarray, float]:
+        """State, innovations over their standard deviation [N, C], and the ln of the product of their variances.
 
         Args:
+            state: After the samples so far.
             time: Of the next samples [T] s.
             values: Columns [T, M, C].
         """
         seen = np.isfinite(values[..., 0])
         found = np.zeros((int(seen.sum()), values.shape[-1]))
+        mean, covariance = state.mean.copy(), state.covariance.copy()
         ln_det = _advance(
             np.ascontiguousarray(time, dtype=np.float64),
             np.ascontiguousarray(values, dtype=np.float64),
@@ -166,13 +186,12 @@ class Filter:
             self.rate,
             self.loading,
             self.variance,
-            self.last,
-            self.mean,
-            self.covariance,
+            state.time,
+            mean,
+            covariance,
             found,
         )
-        self.last = float(time[-1])
-        return found, ln_det
+        return State(time=float(time[-1]), mean=mean, covariance=covariance), found, ln_det
 
 
 @numba.njit(cache=True)

@@ -75,7 +75,7 @@ def lattice_components(nodes: int, points: int, elements: int, softens: bool = F
 COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
-    *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "history"),
+    *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
     *("faced", "ties", "pushes", "wall_chunks"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)

@@ -255,7 +255,7 @@ class TotalSegmentIntegrator:
             **dict(zip(names, values, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
-            **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "history": self.history},
+            **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "histories": self.history},
             **{"faced": int(self.lattice.faces is not None), "ties": self.ties, "wall_chunks": self.wall_chunks},
             "pushes": self.scene.forces - self.groups,
             **{name: int(value) for name, value in more.items()},
