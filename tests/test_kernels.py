@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from problems import rotations
 
 import torchsoro
-from torchsoro.simulation.kernels import contact, spline, stress, tensor
+from torchsoro.simulation.kernels import contact, spline, stress, tensor, total, total_adjoint
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -434,3 +434,12 @@ def test_adjoint_of_the_contact_response_equals_central_differences(stick, frict
     if hold:
         numeric = (power(1, hold=hold) - power(-1, hold=hold)) / (2 * e)
         torch.testing.assert_close(numeric, by[:, 1], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("features", [0, 127])
+@pytest.mark.parametrize("march", [total.total_march, total_adjoint.total_march_adjoint], ids=["forward", "adjoint"])
+def test_marches_of_a_gpu_are_understood_by_taichi_without_one(march, features, monkeypatch):
+    """They are translated, though no code of a GPU is generated."""
+    monkeypatch.setattr(ti.simt.block, "sync", lambda: None)
+    reals = [torch.zeros(1)] * (len(march._primal.arguments) - 7)
+    march._primal.ensure_compiled(ti.f32, 4, features, 0, 0, 0, torch.zeros(1, dtype=torch.int32), *reals)

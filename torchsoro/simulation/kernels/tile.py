@@ -61,6 +61,8 @@ KEPT = HEAD + 14
 class Block(NamedTuple):
     """What a block of threads works with, for functions that are told at compile time; see ``layout`` for the buffers.
 
+    Functions name what they use of it by ``ti.static`` of a tuple: outside of one it refuses shared memory.
+
     Attributes:
         gpu: Whether threads are those of a GPU, from ``q0`` to before ``q1``: one each; else a loop runs over all.
         features: What the kernel is compiled for.

@@ -133,7 +133,7 @@ def spring_stretch(block: ti.template(), d, b, p):
 @ti.func
 def external_force(block: ti.template(), q, t, b, p):
     """Shares of the group forces, and spring to an anchor [N] at point p; drag is with the nodes."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     points = product(points_per_axis(head))
     push = load_vector(block.fixed, STEP_SIZE, 0) * 0
     for g in range(head[GROUPS]):
@@ -183,7 +183,7 @@ def softened(block: ti.template(), x, at, b):
 @ti.func
 def stress_point(block: ti.template(), q, t, b, p):
     """Stress of point p in substep t, its history a substep on; hands over volume times stress, and external force."""
-    head, fixed, state = ti.static(block.head, block.fixed, block.state)
+    head, fixed, state = ti.static((block.head, block.fixed, block.state))
     zero = fixed[STEP_SIZE] * 0
     P = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     push = ti.Vector([zero, zero, zero])
@@ -250,7 +250,7 @@ def stress_point(block: ti.template(), q, t, b, p):
 @ti.func
 def point_pass(block: ti.template(), item, fresh, t):
     """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
-    gpu, head, ints = ti.static(block.gpu, block.head, block.ints)
+    gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
     cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     if fresh == 1:
@@ -298,7 +298,7 @@ def slow(block: ti.template(), b, i, nodes, mass, v):
 @ti.func
 def node_pass(block: ti.template(), item, t):
     """Move the 256 nodes of number ``item`` by substep t."""
-    head, ints, fixed, state, kept = ti.static(block.head, block.ints, block.fixed, block.state, block.kept)
+    head, ints, fixed, state, kept = ti.static((block.head, block.ints, block.fixed, block.state, block.kept))
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     slot = (t % head[KEPT_RING]) * head[BATCH] + b

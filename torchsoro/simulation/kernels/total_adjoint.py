@@ -103,7 +103,7 @@ from torchsoro.simulation.kernels.total_walls import (
 def node_adjoint(block: ti.template(), t, b, i):
     """Finish the gradient by the place of node i after t + 1 substeps, and go back to the force on it in substep t."""
     head, ints, fixed, state, bar, sums = ti.static(
-        block.head, block.ints, block.fixed, block.state, block.bar, block.sums
+        (block.head, block.ints, block.fixed, block.state, block.bar, block.sums)
     )
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     here = b * state_length(head) + i
@@ -168,7 +168,7 @@ def node_adjoint(block: ti.template(), t, b, i):
 @ti.func
 def chamber_adjoint(block: ti.template(), t, one, p_bar):
     """Gradients by the pressure, stiffness and volumes of a chamber in substep t."""
-    head, sums = ti.static(block.head, block.sums)
+    head, sums = ti.static((block.head, block.sums))
     volume_bar = chamber_volume_bar(block, p_bar, one)
     step = t * head[BATCH] * head[CHAMBERS] + one
     ratio = block.kept[head[VOLUMES] + step] / block.fixed[head[CHAMBER_NUMBERS] + one * CHAMBER + CHAMBER_VOLUME]
@@ -182,7 +182,7 @@ def chamber_adjoint(block: ti.template(), t, one, p_bar):
 @ti.func
 def tally(block: ti.template(), t, b, row):
     """One share of the sums over all nodes and points that gravity and forces of substep t need."""
-    head, fixed, sums = ti.static(block.head, block.fixed, block.sums)
+    head, fixed, sums = ti.static((block.head, block.fixed, block.sums))
     nodes, points, tallies = product(nodes_per_axis(head)), product(points_per_axis(head)), head[TALLIES]
     mine = (t * tallies + row) * head[BATCH] + b
     velocity, forces = b * state_length(head) + 3 * nodes, head[FORCES] + b * 3 * nodes
@@ -214,7 +214,7 @@ def tally(block: ti.template(), t, b, row):
 @ti.func
 def point_pass_adjoint(block: ti.template(), item, fresh, t):
     """Adjoint of ``total.point_pass``."""
-    gpu, head, ints = ti.static(block.gpu, block.head, block.ints)
+    gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
     cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
@@ -264,7 +264,7 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
 @ti.func
 def node_pass_adjoint(block: ti.template(), item, t):
     """Adjoint of ``total.node_pass``."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     nodes, chambers = product(nodes_per_axis(head)), head[CHAMBERS]
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     sum_chambers(block, b)

@@ -74,7 +74,7 @@ from torchsoro.simulation.kernels.total_walls import chamber_pressure
 @ti.func
 def maxwell_adjoint(block: ti.template(), at, here, b, p, points, S, Q_bar):
     """Through the Maxwell elements of a point, whose places in state and adjoint are given: the gradient by S."""
-    head, fixed, bar, sums = ti.static(block.head, block.fixed, block.bar, block.sums)
+    head, fixed, bar, sums = ti.static((block.head, block.fixed, block.bar, block.sums))
     elements = head[ELEMENTS]
     S_bar = S * 0
     for e in range(elements):
@@ -97,7 +97,7 @@ def maxwell_adjoint(block: ti.template(), at, here, b, p, points, S, Q_bar):
 @ti.func
 def external_adjoint(block: ti.template(), q, b, p):
     """Adjoint of ``total.external_force``, group forces excepted: by springs, anchors, and (returned) the place."""
-    head, sums = ti.static(block.head, block.sums)
+    head, sums = ti.static((block.head, block.sums))
     points = product(points_per_axis(head))
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
@@ -113,7 +113,7 @@ def external_adjoint(block: ti.template(), q, b, p):
 @ti.func
 def softened_adjoint(block: ti.template(), x, at, here, b, p, points, left_bar):
     """Adjoint of ``total.softened``: gradients by its numbers and, in place, by the largest x; returns that by x."""
-    head, fixed = ti.static(block.head, block.fixed)
+    head, fixed = ti.static((block.head, block.fixed))
     depth, reach = fixed[head[SOFTENING] + 2 * b], fixed[head[SOFTENING] + 2 * b + 1]
     x_bar, largest_bar, depth_bar, reach_bar = laws.softening_adjoint(
         x, block.state[at], depth, reach, left_bar, block.bar[here]
@@ -128,7 +128,7 @@ def softened_adjoint(block: ti.template(), x, at, here, b, p, points, left_bar):
 @ti.func
 def stress_point_adjoint(block: ti.template(), q, t, b, p):
     """Adjoint of ``total.stress_point``: hands over the gradients by F and by the place of point p."""
-    head, fixed, state, bar, sums = ti.static(block.head, block.fixed, block.state, block.bar, block.sums)
+    head, fixed, state, bar, sums = ti.static((block.head, block.fixed, block.state, block.bar, block.sums))
     zero = fixed[STEP_SIZE] * 0
     F_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     place_bar = ti.Vector([zero, zero, zero])
@@ -229,7 +229,7 @@ def stress_point_adjoint(block: ti.template(), q, t, b, p):
 @ti.func
 def rate_point_adjoint(block: ti.template(), q, b, p):
     """Hand over the gradient by the rate of F at point p, through viscosity."""
-    head, fixed = ti.static(block.head, block.fixed)
+    head, fixed = ti.static((block.head, block.fixed))
     zero = fixed[STEP_SIZE] * 0
     rate_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     if p >= 0:

@@ -79,7 +79,7 @@ def mean_of(block: ti.template(), a: ti.template(), at, tie, first):
 @ti.func
 def tie_pass(block: ti.template(), tie, t):
     """Force that a spring takes, number ``tie`` of all simulations."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     mean_of(block, block.state, ((t % head[RING]) * head[BATCH] + tie // head[TIES]) * state_length(head), tie, 0)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
@@ -92,7 +92,7 @@ def tie_pass(block: ti.template(), tie, t):
 @ti.func
 def tie_pass_adjoint(block: ti.template(), tie, t):
     """Adjoint of :func:`tie_pass`: the gradient by the mean displacement takes the place of the force."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     b, nodes = tie // head[TIES], product(nodes_per_axis(head))
     mean_of(block, block.back, head[FORCES] + b * 3 * nodes, tie, 0)
     mean_of(block, block.state, (t * head[BATCH] + b) * state_length(head), tie, 3)
@@ -111,7 +111,7 @@ def tie_pass_adjoint(block: ti.template(), tie, t):
 @ti.func
 def tied(block: ti.template(), b, i, nodes):
     """What the springs hand to node i: its shares of their forces, or of the gradients by their displacements."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     found = load_vector(block.fixed, 0, 1) * 0
     for k in range(head[TIES]):
         tie = b * head[TIES] + k
@@ -126,7 +126,7 @@ def tied(block: ti.template(), b, i, nodes):
 @ti.func
 def wall_point(block: ti.template(), w, at):
     """Place of a wall point, and its two tangents, from displacements that begin at a place of the states."""
-    head, fixed = ti.static(block.head, block.fixed)
+    head, fixed = ti.static((block.head, block.fixed))
     m = nodes_per_axis(head)
     number, kind = head[WALL_NUMBERS] + w * WALL, head[WALL_KIND] + w * WALL_INTEGERS
     corner, axis = at + block.ints[kind], block.ints[kind + 2]
@@ -179,7 +179,7 @@ def wall_total(block: ti.template(), b, chunk):
 @ti.func
 def wall_pass(block: ti.template(), item, t):
     """Area vectors and volumes of 256 wall points, number ``item`` of all simulations' chunks."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     b, chunk = item // head[WALL_CHUNKS], item % head[WALL_CHUNKS]
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     for each in range(block.q0, block.q1):
@@ -195,7 +195,7 @@ def wall_pass(block: ti.template(), item, t):
 @ti.func
 def wall_force(block: ti.template(), t, b, i):
     """Force of the pressure in hollow chambers on node i, against which it must be held."""
-    head, ints = ti.static(block.head, block.ints)
+    head, ints = ti.static((block.head, block.ints))
     found = load_vector(block.fixed, 0, 1) * 0
     for e in range(ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1]):
         w, n = ints[head[WALL_ENTRY] + e] // 27, ints[head[WALL_ENTRY] + e] % 27
@@ -209,7 +209,7 @@ def wall_force(block: ti.template(), t, b, i):
 @ti.func
 def wall_pass_adjoint(block: ti.template(), item, t):
     """Adjoint of :func:`wall_pass` and :func:`wall_force`, at a pressure that is known."""
-    head = ti.static(block.head)
+    (head,) = ti.static((block.head,))
     b, chunk = item // head[WALL_CHUNKS], item % head[WALL_CHUNKS]
     for each in range(block.q0, block.q1):
         q = thread(block, each)
@@ -235,7 +235,7 @@ def wall_pass_adjoint(block: ti.template(), item, t):
 @ti.func
 def wall_spread(block: ti.template(), b, i):
     """What the wall points around node i add to the gradient by its place."""
-    head, ints, scratch = ti.static(block.head, block.ints, block.scratch)
+    head, ints, scratch = ti.static((block.head, block.ints, block.scratch))
     found = load_vector(block.fixed, 0, 1) * 0
     for e in range(ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1]):
         w, n = ints[head[WALL_ENTRY] + e] // 27, ints[head[WALL_ENTRY] + e] % 27
