@@ -127,6 +127,38 @@ def plane_approach_adjoint(v, gap, dt, push, way_bar, gain_bar):
     return v_bar, gap_bar
 
 
+def plane_pressure(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push):
+    """What presses a node on a plane in a step, and what that leaves of its sliding; see :func:`plane_contact`.
+
+    Returns:
+        Velocity along the normal before; velocity along the plane, three numbers; the normal velocity with what
+        adhesion pulls from afar, and with the plane's push; the way over dt; by how much adhesion holds the node, and
+        holds it back; what presses it; its speed along the plane; the share of that which it keeps; 1 if it slides;
+        1 if it lands.
+    """
+    along = u0 * n0 + u1 * n1 + u2 * n2
+    t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
+    v, held = along, hold * 0
+    if gap < touch:
+        held = hold
+    elif gap < reach:
+        v = along - hold
+    way, gain, lands = plane_approach(v, gap, dt, push)
+    if push <= 0 and lands <= 0 and v <= 0:
+        held = held * 0
+    after = v + gain
+    back = min(max(after, after * 0), held)
+    pressed = gain + held - back
+    speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    rest, slides = v * 0 + 1, v * 0
+    if pressed > 0:
+        rest = v * 0
+        if stick == 0 and speed > friction * pressed:
+            rest = 1 - friction * pressed / speed
+            slides = v * 0 + 1
+    return along, t0, t1, t2, v, after, way, held, back, pressed, speed, rest, slides, lands
+
+
 def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push):
     """Velocity of a node after a step towards, on or off a plane, and what else it moves by in this step.
 
@@ -153,26 +185,9 @@ def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach,
     Returns:
         The velocity after, and what is added to it for this step's motion only, three numbers each [m/s].
     """
-    along = u0 * n0 + u1 * n1 + u2 * n2
-    t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
-    v, held = along, hold * 0
-    if gap < touch:
-        held = hold
-    elif gap < reach:
-        v = along - hold
-    way, gain, lands = plane_approach(v, gap, dt, push)
-    holds = push > 0 or lands > 0 or v > 0
-    if not holds:
-        held = held * 0
-    after = v + gain
-    back = min(max(after, after * 0), held)
-    pressed = gain + held - back
-    speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
-    rest = v * 0 + 1
-    if pressed > 0:
-        rest = v * 0
-        if stick == 0 and speed > friction * pressed:
-            rest = 1 - friction * pressed / speed
+    _, t0, t1, t2, v, after, way, _, back, _, speed, rest, _, lands = plane_pressure(
+        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push
+    )
     early = v * 0
     if lands > 0 and gap > 0:
         early = gap / (dt * max(-v, speed * (1 - rest) / STEEPEST)) * (1 - rest)
@@ -192,27 +207,9 @@ def plane_contact_adjoint(
     r0_bar, r1_bar, r2_bar, o0_bar, o1_bar, o2_bar,
 ):  # fmt: skip
     """Adjoint of :func:`plane_contact`: gradients by velocity (three), normal (three), gap, friction and hold."""
-    along = u0 * n0 + u1 * n1 + u2 * n2
-    t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
-    v, held = along, hold * 0
-    if gap < touch:
-        held = hold
-    elif gap < reach:
-        v = along - hold
-    way, gain, lands = plane_approach(v, gap, dt, push)
-    holds = push > 0 or lands > 0 or v > 0
-    if not holds:
-        held = held * 0
-    after = v + gain
-    back = min(max(after, after * 0), held)
-    pressed = gain + held - back
-    speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
-    rest = v * 0 + 1
-    slides = pressed > 0 and stick == 0 and speed > friction * pressed
-    if slides:
-        rest = 1 - friction * pressed / speed
-    elif pressed > 0:
-        rest = v * 0
+    along, t0, t1, t2, v, after, way, held, back, pressed, speed, rest, slides, lands = plane_pressure(
+        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push
+    )
     lost, pace, share = speed * (1 - rest), v * 0 + 1, v * 0
     if lands > 0 and gap > 0:
         pace = max(-v, lost / STEEPEST)
@@ -235,7 +232,7 @@ def plane_contact_adjoint(
             speed_bar = pace_bar * (1 - rest) / STEEPEST
             rest_bar -= pace_bar * speed / STEEPEST
     pressed_bar, friction_bar = v * 0, v * 0
-    if slides:
+    if slides > 0:
         loss_bar = -rest_bar / speed
         speed_bar += rest_bar * (1 - rest) / speed
         pressed_bar = loss_bar * friction
@@ -257,7 +254,7 @@ def plane_contact_adjoint(
     t2_bar = rest * r2_bar + early * o2_bar + turned * t2
     along_bar = v_bar - (t0_bar * n0 + t1_bar * n1 + t2_bar * n2)
     hold_bar = v * 0
-    if gap < touch and holds:
+    if gap < touch and (push > 0 or lands > 0 or v > 0):
         hold_bar = held_bar
     elif gap >= touch and gap < reach:
         hold_bar = -v_bar
