@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -133,16 +133,22 @@ def on(device, p):
     """Outputs of the kernels of a GPU on a device, and gradients of their sum."""
     torchsoro.init(device)
     s = p.scene
-    moved = {name: getattr(s, name).to(device) for name in ("kind", "share", "plane_kind", "probes")}
+    moved = {f.name: t.to(device) for f in fields(s) if isinstance(t := getattr(s, f.name), torch.Tensor)}
     leaves = {name: t.detach().to(device).requires_grad_() for name, t in p.tensors.items()}
     outputs = replace(p, scene=replace(s, **moved)).run(leaves)
     gradients = torch.autograd.grad(torch.stack([o.sum() for o in outputs]).sum(), list(leaves.values()))
     return [t.detach().cpu() for t in (*outputs, *gradients)]
 
 
-@pytest.mark.parametrize("lattice", [None, uneven(), wide()], ids=["uniform", "uneven", "wide"])
-def test_cuda_agrees_with_the_same_kernels_on_a_cpu_and_with_itself_bit_by_bit(cuda, lattice):
+@pytest.mark.parametrize(
+    ("lattice", "whole"),
+    [(None, False), (uneven(), False), (wide(), False), (hollow(), True)],
+    ids=["uniform", "uneven", "wide", "whole"],
+)
+def test_cuda_agrees_with_the_same_kernels_on_a_cpu_and_with_itself_bit_by_bit(cuda, lattice, whole):
     p = problem(formulation="total", lattice=lattice, batch=2, steps=12, samples=(0, 5, 12), lanes=False)
+    if whole:
+        p = completed(p)
     wanted, found, again = on("cpu", p), on(str(cuda), p), on(str(cuda), p)
     torchsoro.init("cpu")
     for a, b, c in zip(wanted, found, again, strict=True):

@@ -89,7 +89,8 @@ class Walls:
         """Volume of each chamber [..., hollow] m3, with displacements of the nodes [..., 3, nodes] m."""
         x, a, b = self._along(d)
         parts = (x * torch.linalg.cross(a, b)).sum(-1) * self.areas.to(d) / 3
-        return d.new_zeros(*d.shape[:-2], self.count).index_add(-1, self.chambers.to(d.device), parts)
+        mine = self.chambers.unsqueeze(1) == torch.arange(self.count)
+        return (parts.unsqueeze(-1) * mine.to(d)).sum(-2)  # in an order that CUDA keeps, unlike ``index_add``
 
     def enclosed_adjoint(self, d: Tensor, bar: Tensor) -> Tensor:
         """What each wall point adds to the gradient by its nodes [B, 3, W, 27], from that by :meth:`enclosed`."""
@@ -123,7 +124,7 @@ class Faces:
         """Area of the nodes on the face that faces planes with normals [..., 3] most [..., nodes] m2."""
         axis = normals.abs().argmax(-1)
         upper = normals.gather(-1, axis.unsqueeze(-1)).squeeze(-1) < 0
-        return self.ends[axis, upper.long()]
+        return self.ends.to(normals)[axis, upper.long()]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -283,7 +284,7 @@ class Lattice:
     def facing(self, normals: Tensor) -> Tensor:
         """Area of the nodes across the axis that planes with normals [..., 3] face most [..., nodes] m2."""
         if self.faces is not None:
-            return self.faces.facing(normals).to(normals)
+            return self.faces.facing(normals)
         return self.on("_areas", normals)[normals.abs().argmax(-1)]
 
     @cached_property
