@@ -132,7 +132,7 @@ def test_setup_values_out_of_range_are_refused_by_table_and_key(tmp_path, old, n
         ("time_s,tip_x_m,tip_z_m\n0,,\n0.02,,\n0.04,,\n", r"marker tip has no sample"),
         (
             "time_s,tip_x_m,tip_z_m\n0,40,20\n0.02,40,20\n0.04,40,20\n",
-            r"marker tip begins at .*: is it in millimetres\?",
+            r"markers begin 3\.16e\+04 mm .* if read as: lengths in millimetres; wanted places in metres",
         ),
         (
             "time_s,tip_x_m,tip_z_m\n0,1,2\n0.004,1,2\n0.008,1,2\n",
@@ -161,7 +161,7 @@ def test_simulated_csv_is_read_along_three_axes(tmp_path):
         ("0,0.04,0.01,0.02\n0.05,,0.01,0.02\n0.1,0.06,0.01,0.02", "an empty cell, wanted all places"),
         ("0,0.04,0.01,0.02\n0.03,0.04,0.01,0.02\n0.06,0.06,0.01,0.02", r"0 to 0\.06 s, wanted 0 to 0\.1 s"),
         ("0.02,0.04,0.01,0.02\n0.03,0.04,0.01,0.02\n0.1,0.06,0.01,0.02", r"0\.02 to 0\.1 s, wanted 0 to 0\.1 s"),
-        ("0,40,10,20\n0.05,40,10,20\n0.1,40,10,20", "is it in millimetres"),
+        ("0,40,10,20\n0.05,40,10,20\n0.1,40,10,20", "lengths in millimetres"),
     ],
 )
 def test_simulated_csv_with_gaps_or_too_short_is_refused(tmp_path, rows, message):
@@ -178,12 +178,12 @@ def test_samples_after_the_duration_are_left_out(tmp_path):
 
 
 def test_a_marker_far_from_its_stated_place_is_refused(tmp_path):
-    table = "time_s,tip_x_m,tip_z_m\n0,0.34,0.02\n0.02,0.34,0.02\n0.04,0.34,0.02\n"
-    with pytest.raises(ValueError, match=r"tip begins at \[0\.34, 0\.02\], .* in the frame of setup\.toml"):
+    table = "time_s,tip_x_m,tip_z_m\n0,0.14,0.02\n0.02,0.14,0.02\n0.04,0.14,0.02\n"
+    with pytest.raises(ValueError, match=r"tip begins at \[0\.14, 0\.02\], .* in the frame of setup\.toml"):
         read_experiment(experiment(tmp_path, markers=table))
     # Who is seen only later may have come far.
     read_experiment(
-        experiment(tmp_path, markers=table.replace("\n0,0.34,0.02", "\n0,,").replace("0.02,0.34", "0.03,0.34"))
+        experiment(tmp_path, markers=table.replace("\n0,0.14,0.02", "\n0,,").replace("0.02,0.14", "0.03,0.14"))
     )
 
 

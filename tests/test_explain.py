@@ -21,7 +21,7 @@ from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.model import predict_trial, read_model
 from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel
-from torchsoro.sim2real.inference.recording_faults import find_slips, reordered
+from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, finer
 from torchsoro.sim2real.inference.search import _simpler
 from torchsoro.sim2real.inference.verdict import judge
@@ -99,23 +99,6 @@ def test_a_marker_that_slips_is_found_and_a_motion_of_all_is_not(made):
     assert (slip.trial, slip.marker) == ("b", 1) and slip.start == pytest.approx(0.1, abs=0.01)
     swinging = [r + 1e-3 * np.sin(60 * t.recording.time)[:, None, None] for r, t in zip(still, trials, strict=True)]
     assert not find_slips(trials, noise_models, swinging)
-
-
-def test_confused_columns_are_put_right(made):
-    _, record = made
-    recorded = record(None)
-    swapped = dataclasses.replace(
-        recorded,
-        trials=tuple(
-            dataclasses.replace(t, recording=dataclasses.replace(t.recording, position=t.recording.position[:, ::-1]))
-            for t in recorded.trials
-        ),
-    )
-    right, told = reordered(swapped)
-    assert told == "columns of tip, side were confused"
-    np.testing.assert_array_equal(right.trials[0].recording.position, recorded.trials[0].recording.position)
-    same, told = reordered(recorded)
-    assert same is recorded and not told
 
 
 # Fits -------------------------------------------------------------------------------------------------------------

@@ -117,7 +117,7 @@ def test_a_good_experiment_is_accepted_with_byte_order_marks(folder):
         write(folder, name, b"\xef\xbb\xbf" + (folder / name).read_bytes())
     found = read_inputs(Options(experiment=folder, out=folder.parent / "out"))
     assert [t.name for t in found.trials] == ["a", "b"] and [t.name for t in found.kept] == ["c"]
-    assert found.fine.count > found.twin.count and not found.notes
+    assert found.fine.count > found.twin.count and not found.notes and not found.hints
 
 
 @pytest.mark.parametrize(
@@ -238,13 +238,14 @@ def test_binary_files_are_refused(folder):
         (markers().replace("tip_x_m", "end_x_m", 1), "wanted also tip_x_m"),
         (markers(TIME[::-1]), "time: 0.48 s in sample 2 after 0.49 s, wanted times that increase"),
         (markers(1000 * TIME), "times from 0 to 490 with 1 samples within the trial: are they milliseconds"),
+        (markers(np.arange(0.0, 500.0, 100.0)), "times from 0 to 400 with 1 samples .* are they milliseconds"),
         (markers(np.arange(50.0)), "times from 0 to 49 with 1 samples .* wanted seconds from release"),
         (markers(TIME / 60), "times from 0 to 0.00816.*, wanted seconds from release"),
         (markers(1e6 + TIME), r"times from 1e\+06 to 1e\+06, wanted seconds from release"),
-        (markers(scale=1000), "marker tip begins at .*: is it in millimetres"),
+        (markers(scale=1000), "read as: lengths in millimetres; wanted"),
         ("\n".join(",".join([*r.split(",")[:4], "", "", ""]) if k else r for k, r in enumerate(markers().split("\n"))
                    if r), "marker side has no sample"),
-        (markers().replace("\n0.25,", "\n0.25,1e9,0,0,0,0,0\n0.2501,", 1), "tip is at .* at 0.25 s, wanted within 8 m"),
+        (markers().replace("\n0.25,", "\n0.25,1e9,0,0,0,0,0\n0.2501,", 1), "tip is at .* at 0.25 s, .* 0.4 m"),
         (markers().replace("\n0.25,", "\n0.25,inf,0,0,0,0,0\n0.2501,", 1), "position: an infinite number"),
         (markers().replace("\n0.25,", "\nx0.25,"), "line 27: 'time_s' = 'x0.25', wanted a number"),
         ("", "0 lines, wanted names of columns"),

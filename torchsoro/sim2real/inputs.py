@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
+from torchsoro.sim2real.data.plausibility import plausible
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.noise import estimate_noise
-from torchsoro.sim2real.inference.recording_faults import reordered
 from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.twin.batch import SAMPLE, THREADS
@@ -34,13 +34,14 @@ class Inputs:
     """An experiment that can be explained.
 
     Attributes:
-        experiment: As read, columns of confused markers put right, recordings thinned where they have too many rows.
+        experiment: As read, recordings thinned where they have too many rows, what is certain put right.
         trials: To be explained, each with a recording.
         kept: With a recording, only to be predicted.
         twin: The body that is fitted.
         fine: Simulates one with smaller cells, which tells the other's error.
         effects: Considered; None for the whole library.
-        notes: What was changed, a line each.
+        notes: Recordings that were thinned, a line each.
+        hints: What is likely to be a mistake in the data, a line each, and what was put right of it.
     """
 
     experiment: Experiment
@@ -51,6 +52,7 @@ class Inputs:
     threads: int
     effects: list[Hypothesis] | None
     notes: tuple[str, ...]
+    hints: tuple[str, ...]
 
 
 def read_inputs(options: Options) -> Inputs:
@@ -68,14 +70,16 @@ def read_inputs(options: Options) -> Inputs:
     check_numbers(options)
     effects = named(options.effects)
     check_folder("out", Path(options.out), RESULTS)
-    experiment, confused = reordered(read_experiment(Path(options.experiment)))
+    experiment = read_experiment(Path(options.experiment))
     if empty := [f"trials/{t.name}" for t in experiment.trials if t.recording is None]:
         raise ValueError(f"{options.experiment}: {', '.join(empty)}: no markers.csv, wanted one in each trial")
     experiment, thinned = affordable(experiment)
+    experiment, findings = plausible(experiment)
+    hints = [str(f) for f in findings]
     trials = experiment.trials
     recordings = [t.recording for t in trials if t.recording is not None]
     _check_noise(experiment, recordings)
-    with named_in(experiment.folder):
+    with named_in(experiment.folder, hints):
         twin = _twin(options, experiment)
     scenarios = {}
     for room, group in (("trials", trials), ("heldout", experiment.heldout)):
@@ -94,7 +98,8 @@ def read_inputs(options: Options) -> Inputs:
         fine=fine,
         threads=options.threads or THREADS,
         effects=effects,
-        notes=tuple(filter(None, [confused, *thinned])),
+        notes=tuple(thinned),
+        hints=tuple(hints),
     )
 
 
@@ -191,9 +196,9 @@ def _twin(options: Options, experiment: Experiment) -> Twin:
 
 
 @contextlib.contextmanager
-def named_in(file: Path) -> Iterator[None]:
-    """Complaints begin with the file or folder that they are about."""
+def named_in(file: Path, hints: Sequence[str] = ()) -> Iterator[None]:
+    """Complaints begin with the file or folder that they are about, and end with hints, a line each."""
     try:
         yield
     except ValueError as error:
-        raise ValueError(f"{file}: {error}") from error
+        raise ValueError("\n".join([f"{file}: {error}", *(f"Hint: {hint}" for hint in hints)])) from error

@@ -124,7 +124,7 @@ def explain(options: Options) -> Explanation:
     inputs = read_inputs(options)
     progress = Progress()
     try:
-        for note in inputs.notes:
+        for note in (*inputs.notes, *(f"Hint: {hint}" for hint in inputs.hints)):
             progress.note(note)
         size = f"{inputs.twin.count} points in cells of {1e3 * inputs.twin.edge:.1f} mm"
         progress.note(f"{len(inputs.trials)} trials, each simulated with {size}")
@@ -185,5 +185,6 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         seconds=time.perf_counter() - begin,
         isolability=tells,
         following=tuple(following),
+        hints=inputs.hints,
     )
     return found, everything

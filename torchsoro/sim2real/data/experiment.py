@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ import numpy as np
 import torch
 
 from torchsoro.design.mesh import Surface, read_surface
+from torchsoro.sim2real.data.misreading import Reading, misreadings
 from torchsoro.sim2real.data.recording import Recording, brief, read_table
 from torchsoro.sim2real.data.schema import (
     LENGTH,
@@ -43,7 +45,13 @@ COVERED = 0.03  # of a trial's duration, that a recording must last; minutes in 
 FEW = 10  # samples within a trial, below which a recording that goes on for ten times as long has another unit of time
 FAR = 2.0  # edge lengths of the body, that a marker may be from its stated place at the beginning
 LOST = 100.0  # the same at any time: no thrown body flies further
+HELD = 5.0  # the same of a body that is clamped: none is stretched further
 PRESSURE = 10.0  # Young's moduli, that a pressure may be
+# Standard deviations of what is never exact, and decides nothing.
+PLACE = 0.0007  # m, of a marker's stated place
+CLOCK = 0.01  # s, of the moment of release
+TURN = 0.01  # of the frame [rad], or of its scale
+SCALE = 0.02  # of the scale of a video
 NOISE = 0.1  # of the body's longest edge, that the noise may be
 WHOLE = ("title", "body", "clamp", "marker", "recording")  # tables that are the same in all trials
 
@@ -205,7 +213,7 @@ def _simulated(path: Path, setup: Setup) -> Recording:
         raise ValueError(
             f"{path}: times from {found.time[0]:g} to {found.time[-1]:g} s, wanted 0 to {setup.duration:g} s"
         )
-    _check_places(found, dataclasses.replace(setup, axes=(0, 1, 2)), path)
+    _check_places(found, dataclasses.replace(setup, axes=(0, 1, 2)), path, names=True)
     return found
 
 
@@ -217,7 +225,7 @@ def _check_times(time: np.ndarray, duration: float, path: Path) -> None:
         f"wanted seconds from release, some of {SHORTEST:g} to {duration:g} s as duration = {duration:g} in setup.toml"
     )
     inside = int(np.count_nonzero(time <= duration))
-    if end > 10 * duration and 0 < inside < FEW <= len(time):
+    if end > 10 * duration and 0 < inside < min(FEW, len(time)):
         unit = "milliseconds" if end < 2000 * duration else "microseconds, or numbers of frames"
         raise ValueError(f"{seen} with {inside} samples within the trial: are they {unit}? {wanted}")
     if begin > duration or end < SHORTEST:
@@ -226,29 +234,61 @@ def _check_times(time: np.ndarray, duration: float, path: Path) -> None:
         raise ValueError(f"{seen}: are they minutes, or does the trial end earlier? {wanted}")
 
 
-def _check_places(recording: Recording, setup: Setup, path: Path) -> None:
+def _check_places(recording: Recording, setup: Setup, path: Path, *, names: bool = False) -> None:
+    """Places in the frame of the setup; with ``names``, also those of markers that were exchanged are refused."""
     reach = max(setup.size)
     for m, marker in enumerate(setup.markers):
-        there = recording.seen[:, m].all(-1)
-        if not there.any():
+        if not recording.seen[:, m].all(-1).any():
             raise ValueError(
                 f"{path}: marker {marker.name} has no sample, wanted some, or no such marker in setup.toml"
             )
+    away, readings = read_otherwise(recording, setup)
+    if readings and (names or not readings[0].names_only) and not readings[0].origin_only:
+        told = list(dict.fromkeys(r.says([m.name for m in setup.markers]) for r in readings))
+        raise ValueError(
+            f"{path}: markers begin {1e3 * away:.3g} mm (root mean square along an axis) from where setup.toml has "
+            f"them, and {1e3 * readings[0].away:.2g} mm if read as: {'; or '.join(told[:3])}; wanted places in metres "
+            "in the frame of setup.toml"
+        )
+    most = (HELD if setup.clamps else LOST) * reach
+    for m, marker in enumerate(setup.markers):
+        there = recording.seen[:, m].all(-1)
         stated, first = np.array(marker.at)[list(setup.axes)], int(there.argmax())
         seen = recording.position[first, m]
-        if np.abs(seen - stated).max() > (FAR if recording.time[first] < SHORTEST else LOST) * reach:
-            scaled = np.abs(seen).max() > 100 * reach > 100 * np.abs(seen / 1000 - stated).max()
+        if recording.time[first] < SHORTEST and np.abs(seen - stated).max() > FAR * reach:
             raise ValueError(
                 f"{path}: marker {marker.name} begins at {seen.tolist()}, wanted about {stated.tolist()} m: "
-                f"is it in {'millimetres' if scaled else 'metres, and in the frame of setup.toml'}?"
+                "is it in metres, and in the frame of setup.toml?"
             )
-        away = np.nan_to_num(np.abs(recording.position[:, m] - stated).max(-1))
-        if away.max() > LOST * reach:
-            at = int(away.argmax())
+        distance = np.nan_to_num(np.abs(recording.position[:, m] - stated).max(-1))
+        if distance.max() > most:
+            at = int(distance.argmax())
+            unit = " (is it in millimetres?)" if np.median(distance[there]) > reach / 10 else ""
             raise ValueError(
                 f"{path}: marker {marker.name} is at {recording.position[at, m].tolist()} m at "
-                f"{recording.time[at]:g} s, wanted within {LOST * reach:g} m, or an empty cell where it was lost"
+                f"{recording.time[at]:g} s{unit}, wanted within {most:g} m, or an empty cell where it was lost"
             )
+
+
+def read_otherwise(recording: Recording, setup: Setup) -> tuple[float, list[Reading]]:
+    """Ways to read a recording under which its markers are at release where the setup has them.
+
+    Returns:
+        How far they are from there as it stands [m], and the ways, best first; none if they are there, or under none.
+    """
+    near = np.flatnonzero(np.abs(recording.time) <= SHORTEST)
+    near = near[np.argsort(np.abs(recording.time[near]), kind="stable")]
+    if not len(near):
+        return 0.0, []
+    seen = recording.seen[near].all(-1)
+    first = np.where(seen.any(0)[:, None], recording.position[near[seen.argmax(0)], np.arange(seen.shape[1])], np.nan)
+    low, size = np.array(setup.origin), np.array(setup.size)
+    late = float(np.abs(recording.time[near[seen.argmax(0).max()]])) + CLOCK
+    speed = math.hypot(*setup.velocity) + math.hypot(*setup.angular_velocity) * max(setup.size) / 2
+    stated = np.array([m.at for m in setup.markers])
+    scale = (SCALE if setup.kind == "video" else TURN) * float(np.abs(stated).max())
+    tolerance = math.hypot(PLACE, scale, speed * late, math.hypot(*setup.gravity) * late**2 / 2, setup.noise or 0.0)
+    return misreadings(first, stated, axes=setup.axes, box=(low, low + size), tolerance=tolerance)
 
 
 def _folders(parent: Path) -> list[Path]:

@@ -1,14 +1,12 @@
-"""Faults of a recording that are found before and beside a fit: markers that slip, and columns that are confused."""
+"""Faults of a recording that are found beside a fit: markers that slip."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
-from torchsoro.sim2real.data.experiment import Experiment, Trial
+from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import MarkerSlip
 
@@ -52,34 +50,3 @@ def find_slips(
         for i, t in enumerate(trials)
         if gains[i, marker] > 30
     ]
-
-
-def reordered(experiment: Experiment) -> tuple[Experiment, str]:
-    """The experiment with the columns of confused markers put right, and a sentence that says which.
-
-    Only where recordings begin with the body as it is stated, and the stated order is far off.
-    """
-    setup = experiment.setup
-    recordings = [t.recording for t in experiment.trials if t.recording is not None]
-    stated = np.array([m.at for m in setup.markers])[:, list(setup.axes)]
-    first = [np.nanmean(r.position[:5], axis=0) for r in recordings if np.isfinite(r.position[:5]).any(0).all()]
-    if not first:
-        return experiment, ""
-    away = np.linalg.norm(stated[:, None] - np.mean(first, axis=0)[None], axis=-1)
-    _, order = linear_sum_assignment(away)
-    moved = np.flatnonzero(order != np.arange(len(order)))
-    if not len(moved) or away[moved, order[moved]].sum() > 0.4 * away[moved, moved].sum():
-        return experiment, ""
-
-    def right(trial: Trial) -> Trial:
-        if trial.recording is None:
-            return trial
-        return dataclasses.replace(
-            trial, recording=dataclasses.replace(trial.recording, position=trial.recording.position[:, order])
-        )
-
-    names = ", ".join(setup.markers[i].name for i in moved)
-    put = dataclasses.replace(
-        experiment, trials=tuple(map(right, experiment.trials)), heldout=tuple(map(right, experiment.heldout))
-    )
-    return put, f"columns of {names} were confused"

@@ -47,6 +47,7 @@ class Explanation:
         following: Trials that could be recorded next, best first, where effects are not told apart.
         mismatches: Of each trial, where and when the recording leaves the simulation.
         forces: That would explain the difference where no effect does.
+        hints: What is likely to be a mistake in the data, a line each.
     """
 
     problem: FitProblem
@@ -61,6 +62,7 @@ class Explanation:
     following: tuple[Proposal, ...] = ()
     mismatches: tuple[Mismatch, ...] = ()
     forces: ForceMap | None = None
+    hints: tuple[str, ...] = ()
 
     @property
     def best(self) -> Fit:
@@ -177,6 +179,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "force_map": None if e.forces is None else _needed(e.forces),
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
         "isolability": None if e.isolability is None else e.isolability.as_json(),
+        "hints": list(e.hints),
         "next": [{"record": p.words, "alike": p.cosine, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),

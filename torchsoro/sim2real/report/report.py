@@ -42,6 +42,9 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         file.write((json.dumps(data, indent=2) + "\n").encode())
     page = Document(e.problem.experiment.setup.title or "Explanation", verdict_sentence(e))
     page.points(evidence(e))
+    if e.hints:
+        page.section("Hints on the data")
+        page.points(e.hints)
     _effects(page, e)
     _trials(page, e, trials)
     _mismatches(page, e, trials)
