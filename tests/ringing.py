@@ -41,7 +41,7 @@ def effect(name):
 def two_trials(folder: Path) -> tuple[Experiment, Trial]:
     """A bar with a trial in which nothing was seen yet, and another in which it is thrown."""
     header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
-    blank = "\n".join(",".join([f"{0.005 * k}"] + ["0"] * 6) for k in range(40))
+    blank = "\n".join(f"{0.005 * k},0.06,0.01,0.02,0.04,0,0.01" for k in range(40))
     experiment(folder, SETUP, f"{header}\n{blank}\n")
     found = read_experiment(folder)
     thrown = dataclasses.replace(found.setup, velocity=(0.0, 0.1, 0.3))

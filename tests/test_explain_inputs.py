@@ -64,9 +64,9 @@ density_drag_kg_m3 = 600.0
 """
 
 
-def markers(time=TIME, scale: float = 1.0) -> str:
+def markers(time=TIME, scale: float = 1.0, seed: int = 0) -> str:
     """A table of two markers that swing."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     rows = ["time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")]
     for t, noise in zip(time, 1e-4 * rng.normal(size=(len(time), 6)), strict=True):
         swing = 0.002 * math.sin(20 * t)
@@ -85,10 +85,10 @@ def write(folder: Path, name: str, text: str | bytes) -> None:
 def whole(tmp_path_factory) -> Path:
     """A good experiment, beside a model.toml and a trial to predict."""
     place = tmp_path_factory.mktemp("inputs")
-    for trial in ("trials/a", "trials/b", "heldout/c", "new"):
+    for seed, trial in enumerate(("trials/a", "trials/b", "heldout/c", "new")):
         write(place / "experiment", f"{trial}/pressure.csv", "time_s,one_pa,two_pa\n0,0,0\n0.1,5000,0\n0.5,5000,0\n")
         if trial != "new":
-            write(place / "experiment", f"{trial}/markers.csv", markers())
+            write(place / "experiment", f"{trial}/markers.csv", markers(seed=seed))
     write(place / "experiment", "setup.toml", SETUP)
     write(place / "experiment", "new/trial.toml", "duration = 0.1\n")
     write(place / "experiment", "model.toml", SETUP + MODEL)

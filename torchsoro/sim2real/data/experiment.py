@@ -281,9 +281,11 @@ def read_otherwise(recording: Recording, setup: Setup) -> tuple[float, list[Read
     if not len(near):
         return 0.0, []
     seen = recording.seen[near].all(-1)
-    first = np.where(seen.any(0)[:, None], recording.position[near[seen.argmax(0)], np.arange(seen.shape[1])], np.nan)
+    earliest = near[seen.argmax(0)]  # of each marker
+    first = recording.position[earliest, np.arange(len(setup.markers))]
+    first[~seen.any(0)] = np.nan
     low, size = np.array(setup.origin), np.array(setup.size)
-    late = float(np.abs(recording.time[near[seen.argmax(0).max()]])) + CLOCK
+    late = float(np.abs(recording.time[earliest]).max()) + CLOCK
     speed = math.hypot(*setup.velocity) + math.hypot(*setup.angular_velocity) * max(setup.size) / 2
     stated = np.array([m.at for m in setup.markers])
     scale = (SCALE if setup.kind == "video" else TURN) * float(np.abs(stated).max())

@@ -49,9 +49,9 @@ def merged(findings: Sequence[Finding]) -> list[Finding]:
     """One finding of each kind, for all trials that it is in; numbers are those of the first."""
     found: dict[tuple[str, str], Finding] = {}
     for one in findings:
-        key = one.what, one.remedy
-        before = found.get(key)
-        found[key] = one if before is None else dataclasses.replace(before, where=(*before.where, *one.where))
+        first = found.setdefault((one.what, one.remedy), one)
+        where = tuple(dict.fromkeys((*first.where, *one.where)))
+        found[one.what, one.remedy] = dataclasses.replace(first, where=where)
     return list(found.values())
 
 
