@@ -236,4 +236,4 @@ def test_columns_keep_their_order_and_empty_cells_are_nan(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("a, b\n1,2\n3,\n")
     found = read_table(path)
-    assert list(found) == ["a", "b"] and found["a"] == [1.0, 3.0] and math.isnan(found["b"][1])
+    assert list(found) == ["a", "b"] and found["a"].tolist() == [1.0, 3.0] and math.isnan(found["b"][1])

@@ -6,6 +6,7 @@ import dataclasses
 import math
 import shutil
 import tempfile
+import tracemalloc
 from pathlib import Path
 
 import hypothesis
@@ -14,7 +15,8 @@ import pytest
 from hypothesis import strategies as st
 from setups import CLAMP, marker, material
 
-from torchsoro.sim2real import inputs, pipeline
+from torchsoro.sim2real import pipeline
+from torchsoro.sim2real.data.recording import read_table
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
@@ -272,19 +274,42 @@ def test_a_pressure_that_does_not_fit_is_refused(folder, table, message):
     refuse(folder, rf"trials/b/pressure\.csv: .*{message}")
 
 
-def test_two_hundred_thousand_rows_are_thinned_by_a_whole_factor_or_refused(folder):
-    dense = np.linspace(0.0, 0.5, 200_001)
-    write(folder, "trials/b/markers.csv", "time_s,tip_x_m,tip_y_m,tip_z_m,side_x_m,side_y_m,side_z_m\n" + "\n".join(
-        f"{t:.7f},0.08,0.01,0.02{k % 7},0.04,0,0.01{k % 5}" for k, t in enumerate(dense)))  # fmt: skip
+def test_two_hundred_thousand_rows_are_thinned_to_what_the_simulation_shows(folder):
+    part = [f"0.08,0.01,0.02{k},0.04,0,0.01{k % 5}\n" for k in range(7)]
+    with (folder / "trials/b/markers.csv").open("w") as file:
+        file.write("time_s,tip_x_m,tip_y_m,tip_z_m,side_x_m,side_y_m,side_z_m\n")
+        file.writelines(f"{2.5e-6 * k:.7f},{part[k % 7]}" for k in range(200_001))
     found = read_inputs(Options(experiment=folder, out=folder.parent / "out"))
     recording = found.trials[1].recording
-    assert recording is not None and 2000 < len(recording.time) <= inputs.ROWS and recording.time[0] == 0
+    assert recording is not None and len(recording.time) == 401 and recording.time[0] == 0
     (note,) = found.notes
-    assert note == f"trial b: every {math.ceil(200_001 / inputs.ROWS)}th of 200001 rows of markers.csv is used"
-    for path in folder.rglob("markers.csv"):  # at the rate of the simulation's own samples none can be spared
-        write(path.parent, path.name, markers(np.arange(0.0, 20.0, 0.003)))
+    assert note.startswith("trial b: of 200001 rows of markers.csv one in 500 is used, or one in 1.25 ms; ")
+
+
+def test_a_table_is_read_in_a_few_times_the_memory_of_its_numbers(tmp_path):
+    (tmp_path / "t.csv").write_text("a,b\n" + "".join(f"{k},\n" for k in range(60_000)))
+    tracemalloc.start()
+    found = read_table(tmp_path / "t.csv")
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert found["a"][-1] == 59_999 and np.isnan(found["b"]).all()
+    assert peak < 8 * 60_000 * 2 * 8
+
+
+def test_a_long_recording_is_thinned_further_where_rows_between_follow_from_those_kept(folder):
     write(folder, "setup.toml", SETUP.replace("duration = 0.5", "duration = 20.0"))
-    refuse(folder, r"trial a: markers\.csv has 6667 rows from 0 to 19\.998 s, wanted at most 4000: keep every 2th row")
+    for path in folder.rglob("markers.csv"):
+        write(path.parent, path.name, markers(np.arange(0.0, 20.0, 0.003), seed=len(path.parent.name)))
+    found = read_inputs(Options(experiment=folder, out=folder.parent / "out", budget=1e4))
+    assert [len(t.recording.time) for t in found.trials if t.recording is not None] == [3334, 3334]
+    assert found.notes[0].startswith("trial a: of 6667 rows of markers.csv one in 2 is used, or one in 6 ms; ")
+    for path in folder.rglob("markers.csv"):  # a swing in four rows
+        rows = [row.split(",") for row in path.read_text().splitlines()]
+        for row in rows[1:]:
+            row[3] = f"{0.02 + 0.002 * math.sin(500 * float(row[0])):.6f}"
+        write(path.parent, path.name, "\n".join(map(",".join, rows)))
+    refuse(folder, r"trial a: markers\.csv has 6667 rows from 0 to 19\.998 s, wanted at most 4000: of every 2 rows one "
+                   r"cannot stand for the others, which are .* mm off a smooth curve", budget=1e4)  # fmt: skip
 
 
 def test_noise_that_cannot_be_estimated_is_asked_for(folder):

@@ -89,7 +89,7 @@ def trial_of(tmp_path, tables="", pressure=""):
     chamber = '[[chamber]]\nname = "air"\nbox = [[0.01, 0.005, 0.005], [0.05, 0.015, 0.015]]\n' if pressure else ""
     setup = SETUP.replace("duration = 0.2", "duration = 1.0") + chamber + tables
     header = "time_s," + ",".join(f"{m}_{a}_m" for m in ("tip", "side") for a in "xyz")
-    experiment(tmp_path, setup, header + "\n" + "\n".join(f"{0.02 * k},0,0,0,0,0,0" for k in range(50)))
+    experiment(tmp_path, setup, header + "\n" + "\n".join(f"{0.02 * k},0.06,0.01,0.02,0.04,0,0.01" for k in range(50)))
     if pressure:
         (tmp_path / "trials" / "a" / "pressure.csv").write_text(f"time_s,air_pa\n{pressure}\n")
     return read_experiment(tmp_path).trials[0]

@@ -118,7 +118,7 @@ def table_of(path: Path) -> dict[str, np.ndarray]:
     """
     if not path.is_file():
         raise ValueError(f"recordings = {path.parent}: no {path.name}, wanted the folder that holds it")
-    return {key: np.array(column) for key, column in read_table(path).items()}
+    return read_table(path)
 
 
 def moved(table: dict[str, np.ndarray], markers: dict[str, tuple[float, ...]], still: slice, used: np.ndarray):

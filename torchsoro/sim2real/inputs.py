@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,14 +16,13 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.noise import estimate_noise
 from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer
+from torchsoro.sim2real.inference.thinning import thinned
 from torchsoro.sim2real.options import Options
-from torchsoro.sim2real.twin.batch import SAMPLE, THREADS
+from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.storage import check_folder
 
 RESULTS = ("report.html", "explanation.json", "model.toml")
-MEMORY = 4e9  # bytes, that the covariances of all recordings may take: rows squared for each marker and axis
-ROWS = 4000  # of a recording, whose covariance is factorized in seconds
 DEAR = 100.0  # budgets, that a twin with a given edge may take
 
 
@@ -73,7 +70,7 @@ def read_inputs(options: Options) -> Inputs:
     experiment = read_experiment(Path(options.experiment))
     if empty := [f"trials/{t.name}" for t in experiment.trials if t.recording is None]:
         raise ValueError(f"{options.experiment}: {', '.join(empty)}: no markers.csv, wanted one in each trial")
-    experiment, thinned = affordable(experiment)
+    experiment, notes = thinned(experiment)
     experiment, findings = plausible(experiment)
     hints = [str(f) for f in findings]
     trials = experiment.trials
@@ -98,7 +95,7 @@ def read_inputs(options: Options) -> Inputs:
         fine=fine,
         threads=options.threads or THREADS,
         effects=effects,
-        notes=tuple(thinned),
+        notes=tuple(notes),
         hints=tuple(hints),
     )
 
@@ -132,40 +129,6 @@ def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
         raise ValueError(f"effects = {', '.join(sorted(unknown))}: wanted names out of {', '.join(known)}")
     # Two effects may share a name, as friction of planes that are thought to stick and of others.
     return [effect for effect in library() if effect.name in names] or None
-
-
-def affordable(experiment: Experiment) -> tuple[Experiment, list[str]]:
-    """The experiment with recordings whose covariances fit into memory.
-
-    A recording with too many rows keeps every k-th if it then has a sample for each of the twin's.
-
-    Returns:
-        The experiment, and a line for each recording that was thinned.
-
-    Raises:
-        ValueError: for too many rows at a rate that is not far above the twin's.
-    """
-    channels = len(experiment.setup.markers) * len(experiment.setup.axes)
-    trials = sum(t.recording is not None for t in (*experiment.trials, *experiment.heldout))
-    most = min(ROWS, math.isqrt(int(MEMORY / (8 * channels * max(trials, 1)))))
-    notes = []
-
-    def thin(trial: Trial) -> Trial:
-        recording = trial.recording
-        if recording is None or len(recording.time) <= most:
-            return trial
-        rows, step = len(recording.time), math.ceil(len(recording.time) / most)
-        interval = float(np.median(np.diff(recording.time)))
-        if step * interval > SAMPLE:
-            raise ValueError(
-                f"{experiment.folder}: trial {trial.name}: markers.csv has {rows} rows from {recording.time[0]:g} to "
-                f"{recording.time[-1]:g} s, wanted at most {most}: keep every {step}th row, or a shorter duration"
-            )
-        notes.append(f"trial {trial.name}: every {step}th of {rows} rows of markers.csv is used")
-        return dataclasses.replace(trial, recording=recording.every(step))
-
-    trials_, heldout = (tuple(map(thin, group)) for group in (experiment.trials, experiment.heldout))
-    return dataclasses.replace(experiment, trials=trials_, heldout=heldout), notes
 
 
 def _check_noise(experiment: Experiment, recordings: list[Recording]) -> None:

@@ -306,8 +306,8 @@ def _pressure(path: Path, setup: Setup) -> Waveform:
     wanted = ["time_s", *(f"{name}_pa" for name in names)]
     if missing := [name for name in wanted if name not in columns]:
         raise ValueError(f"{path}: columns {brief(', '.join(columns), 300)}, wanted also {', '.join(missing)}")
-    time = torch.tensor(columns["time_s"], dtype=torch.float64)
-    values = torch.tensor([columns[f"{name}_pa"] for name in names], dtype=torch.float64)
+    time = torch.from_numpy(columns["time_s"].copy())
+    values = torch.from_numpy(np.stack([columns[f"{name}_pa"] for name in names]))
     try:
         wave = Waveform(time=time, pressure=values)
     except ValueError as error:

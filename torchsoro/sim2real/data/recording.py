@@ -15,6 +15,7 @@ import numpy as np
 from torchsoro.storage import atomic_write
 
 AXES = "xyz"
+PART = 10_000  # rows of a file, that are read at a time
 SHOWN = 60  # characters of a value in a message
 
 
@@ -106,9 +107,9 @@ class Recording:
         wanted = [[f"{name}_{AXES[a]}_m" for a in axes] for name in markers]
         if missing := [n for n in ("time_s", *itertools.chain(*wanted)) if n not in columns]:
             raise ValueError(f"{path}: columns {brief(', '.join(columns), 300)}, wanted also {', '.join(missing)}")
-        place = np.array([[columns[name] for name in row] for row in wanted]).transpose(2, 0, 1)
+        place = np.stack([columns[name] for row in wanted for name in row], -1).reshape(-1, len(markers), len(axes))
         try:
-            return cls(time=np.array(columns["time_s"]), position=place, axes=tuple(axes))
+            return cls(time=columns["time_s"].copy(), position=place, axes=tuple(axes))
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
@@ -125,36 +126,54 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
         file.write(text.getvalue().encode())
 
 
-def read_table(path: Path) -> dict[str, list[float]]:
-    """Columns of a CSV file by name; an empty cell is NaN.
+def read_table(path: Path) -> dict[str, np.ndarray]:
+    """Columns [T] of a CSV file by name; an empty cell is NaN.
+
+    The file is read a part at a time: a million rows take about three times the memory of their numbers.
 
     Raises:
         ValueError: if the file cannot be read, has no rows, a column twice, or a cell that is no number; with file and
             line.
     """
+    parts: list[np.ndarray] = []
     try:
-        rows = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = enumerate(csv.reader(file), start=1)
+            _, head = next(rows, (0, []))
+            names = [name.strip() for name in head]
+            if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
+                count = names.count(twice[0])
+                raise ValueError(f"column {brief(twice[0])} is there {count} times, wanted each once")
+            last = 0
+            while part := list(itertools.islice(rows, PART)):
+                last = part[-1][0]
+                parts.append(_numbers([(number, row) for number, row in part if row], names))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: {error}; wanted a table of numbers between commas") from error
-    if len(rows) < 2:
-        raise ValueError(f"{path}: {len(rows)} lines, wanted names of columns and numbers below")
-    names = [name.strip() for name in rows[0]]
-    if twice := [name for name in dict.fromkeys(names) if names.count(name) > 1]:
-        raise ValueError(f"{path}: column {brief(twice[0])} is there {names.count(twice[0])} times, wanted each once")
-    body = [(number, row) for number, row in enumerate(rows[1:], start=2) if row]
-    for number, row in body:
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    if not last:
+        raise ValueError(f"{path}: {int(bool(head))} lines, wanted names of columns and numbers below")
+    return dict(zip(names, np.concatenate(parts).T, strict=True))
+
+
+def _numbers(rows: Sequence[tuple[int, list[str]]], names: Sequence[str]) -> np.ndarray:
+    """Numbers [T, columns] of rows with their numbers in the file."""
+    for number, row in rows:
         if len(row) != len(names):
-            raise ValueError(f"{path}: line {number} has {len(row)} cells, wanted {len(names)} as in the first")
-    columns = zip(*(row for _, row in body), strict=True) if body else ([] for _ in names)
-    return {name: _numbers(cells, name, path, body) for name, cells in zip(names, columns, strict=True)}
+            raise ValueError(f"line {number} has {len(row)} cells, wanted {len(names)} as in the first")
+    try:
+        return np.array([[float(cell) if cell else math.nan for cell in row] for _, row in rows]).reshape(
+            len(rows), len(names)
+        )
+    except ValueError:
+        return np.array([[_number(c, number, n) for c, n in zip(row, names, strict=True)] for number, row in rows])
 
 
-def _numbers(cells: Sequence[str], name: str, path: Path, body: Sequence[tuple[int, list[str]]]) -> list[float]:
-    found = []
-    for k, cell in enumerate(cells):
-        try:
-            found.append(float(cell) if cell and not cell.isspace() else math.nan)
-        except ValueError:
-            where = f"{path}: line {body[k][0]}: {brief(name)} = {brief(cell)}"
-            raise ValueError(f"{where}, wanted a number or nothing") from None
-    return found
+def _number(cell: str, number: int, name: str) -> float:
+    if not cell or cell.isspace():
+        return math.nan
+    try:
+        return float(cell)
+    except ValueError:
+        raise ValueError(f"line {number}: {brief(name)} = {brief(cell)}, wanted a number or nothing") from None
