@@ -69,7 +69,11 @@ def elastic_energy(mesh, x):
 
 
 def test_the_judge_imports_nothing_of_the_package():
-    allowed = {path.stem for path in JUDGE.glob("*.py")} | {"numpy", "numba", "scipy", "tyro"} | sys.stdlib_module_names
+    allowed = (
+        {path.stem for path in JUDGE.glob("*.py")}
+        | {"numpy", "numba", "scipy", "tqdm", "tyro"}
+        | sys.stdlib_module_names
+    )
     for path in JUDGE.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
@@ -234,6 +238,38 @@ def test_a_setup_survives_toml_and_an_experiment_its_files(judge, tmp_path):
             back = judge.experiment.Trial.read(tmp_path / specimen.name / trial.name)
             assert back.tables == tomllib.loads(judge.experiment.toml(trial.tables))
             assert np.allclose(np.array(back.pressure), np.array(trial.pressure), rtol=1e-5)
+
+
+def test_batches_of_the_former_bodies_are_drawn_as_they_were(judge):
+    drawn = judge.seal.plans(3, 2, 1, 2, np.random.default_rng(5))
+    assert [(p.kind, p.specimen, p.effects, p.decoy) for p in drawn] == [
+        ("pair", "bar", ("initial_motion", "drag"), ""),
+        ("decoy", "finger", (), "scale"),
+        ("effect", "finger", ("density",), ""),
+        ("outside", "post", ("magnet",), ""),
+        ("null", "bar", (), ""),
+        ("outside", "bar", ("sloshing",), ""),
+        ("effect", "post", ("initial_motion",), ""),
+        ("effect", "pad", ("wall_offset",), ""),
+    ]
+
+
+def test_a_batch_of_some_bodies_holds_only_these_and_what_makes_sense_for_them(judge):
+    bodies = ("crawler", "block")
+    drawn = judge.seal.plans(20, 6, 4, 6, np.random.default_rng(1), bodies)
+    assert {p.specimen for p in drawn} == set(bodies)
+    for plan in drawn:
+        specimen = judge.specimens.SPECIMENS[plan.specimen]()
+        assert set(plan.effects) <= {*specimen.effects, *specimen.outside}
+
+
+def test_a_thrown_block_comes_to_rest_and_a_crawler_lifts_off_its_plate(judge):
+    t = np.linspace(0, 0.5, 101)
+    block = judge.believed.believed_motion("block", 0, judge.world.World(), 0.5)(t)
+    assert float(np.abs(np.diff(block[-10:], axis=0)).max()) < 1e-5
+    assert float(block[-1, 0, 0] - block[0, 0, 0]) > 0.015
+    crawler = judge.believed.believed_motion("crawler", 0, judge.world.World(), 0.7)(t)
+    assert float((crawler - crawler[0])[..., 2].max()) > 1e-3
 
 
 @pytest.fixture(scope="module")

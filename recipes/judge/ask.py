@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import tyro
+from tqdm import tqdm
 
 
 def _call(command: list[str], timeout: float) -> str:
@@ -71,7 +72,7 @@ def ask(
     answers: Path,
     tool: str = "python recipes/explain.py",
     extra: str = "",
-    processes: int = 1,
+    workers: int = 1,
     timeout: float = 3600,
 ) -> str:
     """Ask for what has no answer yet.
@@ -81,7 +82,7 @@ def ask(
         answers: Folder for the answers, one for each tool or baseline.
         tool: Command line.
         extra: Further arguments.
-        processes: Cases side by side.
+        workers: Cases side by side; with more than one, tell the tool to use one thread (``--extra``).
         timeout: For one command [s].
 
     Returns:
@@ -93,15 +94,17 @@ def ask(
     todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
     answers.mkdir(parents=True, exist_ok=True)
     print(f"{len(cases)} cases, {len(cases) - len(todo)} of them answered already", flush=True)
-    with concurrent.futures.ThreadPoolExecutor(processes) as pool:
+    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
         jobs = {
             pool.submit(answer, case, shlex.split(tool), answers, timeout, shlex.split(extra)): case.name
             for case in todo
         }
-        for job in concurrent.futures.as_completed(jobs):
-            found = job.result()
-            reason = f" ({found['error'][:200]})" if found["verdict"] == "failed" else ""
-            print(f"{jobs[job]}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}", flush=True)
+        with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
+            for job in concurrent.futures.as_completed(jobs):
+                found = job.result()
+                reason = f" ({found['error'][:200]})" if found["verdict"] == "failed" else ""
+                bar.write(f"{jobs[job]}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
+                bar.update()
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
         for path in sorted(answers.rglob("*"))

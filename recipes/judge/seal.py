@@ -18,6 +18,7 @@ import multiprocessing
 import os
 import secrets
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -30,10 +31,11 @@ from effects import LIBRARY, OUTSIDE, Effect, own_world
 from experiment import Trial, toml
 from lobatto import Floats
 from march import Broken, March, case_of
-from specimens import SPECIMENS, Specimen, mesh_for
+from specimens import FORMER, SPECIMENS, Specimen, mesh_for
 from visible import detectability
 from world import Line, World
 
+Body = Literal["bar", "finger", "pad", "slider", "post", "crawler", "block"]
 BATCHES = ("calibration", "test", "smoke")
 DRAWS = 60  # of a case, until a body bears what was drawn
 
@@ -57,17 +59,19 @@ class Plan:
     decoy: str = ""
 
 
-def plans(effects: int, nulls: int, pairs: int, outside: int, rng: np.random.Generator) -> list[Plan]:
-    """A shuffled list in which specimens and names come about equally often."""
+def plans(
+    effects: int, nulls: int, pairs: int, outside: int, rng: np.random.Generator, every: Sequence[str] = FORMER
+) -> list[Plan]:
+    """A shuffled list in which the specimens ``every`` and names come about equally often."""
     found: list[dict[str, Any]] = []
-    names = sorted(LIBRARY)
+    names = sorted(name for name in LIBRARY if any(name in SPECIMENS[s]().effects for s in every))
+    unknown = [name for name in OUTSIDE if any(name in SPECIMENS[s]().outside for s in every)]
     for i in range(effects):
         if i % len(names) == 0:
             rng.shuffle(names)
         name = names[i % len(names)]
-        able = [s for s in SPECIMENS if name in SPECIMENS[s]().effects]
+        able = [s for s in every if name in SPECIMENS[s]().effects]
         found.append({"kind": "effect", "specimen": str(rng.choice(able)), "effects": (name,)})
-    every = list(SPECIMENS)
     for i in range(nulls):
         kind = DECOYS[i // 2 % len(DECOYS)] if i % 2 else ""
         found.append({"kind": "decoy" if kind else "null", "specimen": every[i % len(every)], "decoy": kind})
@@ -78,8 +82,8 @@ def plans(effects: int, nulls: int, pairs: int, outside: int, rng: np.random.Gen
         both = sorted((str(first), str(second)), key=lambda name: name != "modulus")  # others are relative to it
         found.append({"kind": "pair", "specimen": specimen, "effects": tuple(both)})
     for i in range(outside):
-        name = list(OUTSIDE)[i % len(OUTSIDE)]
-        able = [s for s in SPECIMENS if name in SPECIMENS[s]().outside]
+        name = unknown[i % len(unknown)]
+        able = [s for s in every if name in SPECIMENS[s]().outside]
         found.append({"kind": "outside", "specimen": str(rng.choice(able)), "effects": (name,)})
     order = rng.permutation(len(found))
     return [Plan(name=f"case-{n:03d}", **found[i]) for n, i in enumerate(order)]
@@ -207,12 +211,15 @@ def _work(job: tuple[Plan, list[int], Path, float]) -> str:
     return f"{plan.name} done in {truth['seconds']:.0f} s"
 
 
-def _wanted(out: Path, batch: str, seed: int | None, counts: tuple[int, ...], finer: float) -> dict[str, Any]:
+def _wanted(
+    out: Path, batch: str, seed: int | None, counts: tuple[int, ...], finer: float, bodies: Sequence[str]
+) -> dict[str, Any]:
     """The settings of an interrupted batch, which must be these, or new ones."""
     path = out / "sealed" / "seed.json"
     if path.exists():
         before = json.loads(path.read_text())
-        now = {"batch": batch, "counts": list(counts), "finer": finer}
+        before.setdefault("bodies", list(FORMER))
+        now = {"batch": batch, "counts": list(counts), "finer": finer, "bodies": list(bodies)}
         differ = [k for k, v in now.items() if before[k] != v]
         if differ or (seed is not None and seed != before["seed"]):
             raise ValueError(f"out = {out}: holds a batch with other settings ({', '.join(differ) or 'seed'}); "
@@ -221,7 +228,7 @@ def _wanted(out: Path, batch: str, seed: int | None, counts: tuple[int, ...], fi
     if seed is None:
         raise ValueError("seed = None: wanted --seed NUMBER or --seed-from-os")
     path.parent.mkdir(parents=True, exist_ok=True)
-    now = {"batch": batch, "seed": seed, "counts": list(counts), "finer": finer}
+    now = {"batch": batch, "seed": seed, "counts": list(counts), "finer": finer, "bodies": list(bodies)}
     path.write_text(json.dumps(now))
     os.chmod(path, 0o600)
     return now
@@ -235,6 +242,7 @@ def seal(
     nulls: int = 60,
     pairs: int = 10,
     outside: int = 12,
+    bodies: tuple[Body, ...] = FORMER,
     seed: int | None = None,
     seed_from_os: bool = False,
     processes: int = 2,
@@ -250,6 +258,7 @@ def seal(
         nulls: Cases without; every second is a decoy.
         pairs: Cases with two effects.
         outside: Cases with an effect outside the library.
+        bodies: Specimens to draw from.
         seed: Of all draws.
         seed_from_os: Take the seed from the operating system; it is kept in the sealed file only.
         processes: That work side by side.
@@ -261,9 +270,9 @@ def seal(
     """
     counts = (effects, nulls, pairs, outside)
     fresh = secrets.randbits(63) if seed_from_os and not (out / "sealed" / "seed.json").exists() else seed
-    kept = _wanted(out, batch, fresh, counts, finer)
+    kept = _wanted(out, batch, fresh, counts, finer, bodies)
     entropy = [BATCHES.index(batch), kept["seed"]]
-    todo = plans(*counts, np.random.default_rng(entropy))
+    todo = plans(*counts, np.random.default_rng(entropy), bodies)
     jobs = [
         (plan, [*entropy, number], out, finer)
         for number, plan in enumerate(todo)

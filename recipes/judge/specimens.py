@@ -1,4 +1,4 @@
-"""Five bodies with what their experimenter believes, the same in every case: so tables made once serve all cases."""
+"""Bodies with what their experimenter believes, the same in every case: so tables made once serve all cases."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Specimen:
     """A body and what is done to it.
 
     Attributes:
-        name: "bar", "finger", "pad", "slider" or "post".
+        name: Key of ``SPECIMENS``.
         setup: Tables of setup.toml.
         trials: Given ones and, last, the one held out.
         rate: Of the camera [Hz].
@@ -255,7 +255,97 @@ def slider() -> Specimen:
     )
 
 
-SPECIMENS = {"bar": bar, "finger": finger, "pad": pad, "slider": slider, "post": post}
+@functools.cache
+def crawler() -> Specimen:
+    """A block with a chamber off its middle, which walks on a plate to which it is believed to stick."""
+    setup = _setup(
+        "pneumatic block that walks on a plate",
+        (0.064, 0.036, 0.036),
+        (0.0, 0.0, 0.0002),
+        material={"youngs_modulus": 140e3, "density": 1080.0, "prony": [[0.4, 0.004]]},
+        chamber=[{"name": "c1", "box": [[0.008, 0.008, 0.0082], [0.040, 0.028, 0.0202]], "air_stiffness": 0.0}],
+        plane=[{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": "stick"}],
+        markers=[
+            (0.032, 0.018, 0.0362), (0.060, 0.004, 0.0362), (0.060, 0.032, 0.0362), (0.004, 0.018, 0.0362),
+            (0.064, 0.018, 0.018), (0.052, 0.0, 0.010),
+        ],
+    )  # fmt: skip
+
+    def beats(period: float, *peaks: float) -> tuple[tuple[float, float], ...]:
+        stops = [(0.06 + period * (i + on / 2), (1 - on) * p) for i, p in enumerate(peaks) for on in (0, 1)]
+        return _pulses(1.0, *stops)
+
+    trials = (
+        Trial(name="a", pressure=beats(0.18, *(13e3,) * 5)),
+        Trial(name="b", pressure=beats(0.30, 16e3, 10e3, 16e3)),
+        Trial(name="c", pressure=beats(0.12, *(11e3,) * 7)),
+        Trial(name="d", held_out=True, pressure=beats(0.22, 15e3, 13e3, 11e3, 15e3)),
+    )
+    names = (
+        "viscoelastic",
+        "modulus",
+        "soft_side",
+        "density",
+        "attached_mass",
+        "tether",
+        "friction",
+        "gravity_tilt",
+        *AIR,
+    )
+    return Specimen(
+        name="crawler", setup=setup, trials=trials, rate=150, edge=0.0062, effects=names,
+        outside=("foam", "magnet", "gust", "sloshing"),
+    )  # fmt: skip
+
+
+@functools.cache
+def block() -> Specimen:
+    """A block that is thrown on a plate, lands on its base and comes to rest."""
+    setup = _setup(
+        "soft block, thrown",
+        (0.046, 0.038, 0.026),
+        (0.0, 0.0, 0.004),
+        duration=0.5,
+        material={"youngs_modulus": 220e3, "density": 1090.0, "prony": [[1.0, 0.004]]},
+        start={"velocity": [0.5, 0.0, 0.0]},
+        plane=[{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": 0.5}],
+        markers=[
+            (0.023, 0.019, 0.030), (0.043, 0.004, 0.030), (0.043, 0.034, 0.030), (0.003, 0.019, 0.030),
+            (0.046, 0.019, 0.014), (0.006, 0.0, 0.012),
+        ],
+    )  # fmt: skip
+    trials = (
+        _thrown("a", False, 0.5, 0, 0),
+        _thrown("b", False, 0.35, 0.3, 0.1),
+        _thrown("c", False, -0.6, 0, 0, spin=(0, 0, 3)),
+        _thrown("d", True, 0.45, -0.2, 0, spin=(0, 0, -2)),
+    )
+    names = (
+        "friction",
+        "friction",
+        "initial_motion",
+        "attached_mass",
+        "viscoelastic",
+        "gravity_tilt",
+        "adhesion",
+        "modulus",
+    )
+    return Specimen(
+        name="block", setup=setup, trials=trials, rate=200, edge=0.0066, effects=names,
+        outside=("foam", "magnet", "gust", "sloshing"),
+    )  # fmt: skip
+
+
+SPECIMENS = {
+    "bar": bar,
+    "finger": finger,
+    "pad": pad,
+    "slider": slider,
+    "post": post,
+    "crawler": crawler,
+    "block": block,
+}
+FORMER = ("bar", "finger", "pad", "slider", "post")  # of which the batches up to the tenth were drawn
 
 
 @functools.cache
