@@ -16,6 +16,7 @@ import torch
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.data.recording import write_table
+from torchsoro.sim2real.inference.believed_motion import against_belief
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
@@ -148,6 +149,9 @@ def explain(options: Options) -> Explanation:
 def _explained(inputs: Inputs, options: Options, progress: Progress, begin: float) -> tuple[Explanation, list[Trial]]:
     """The explanation, and the trials that it shows."""
     trials, kept = list(inputs.trials), list(inputs.kept)
+    told = against_belief(inputs.twin, trials, inputs.threads)
+    for finding in told:
+        progress.note(f"Hint: {finding}")
     progress.stage("comparing cell sizes")
     problem = correct(inputs, progress.tick)
     discretization = problem.discretization
@@ -185,6 +189,6 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         seconds=time.perf_counter() - begin,
         isolability=tells,
         following=tuple(following),
-        hints=inputs.hints,
+        hints=(*inputs.hints, *map(str, told)),
     )
     return found, everything

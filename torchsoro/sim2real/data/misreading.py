@@ -87,7 +87,7 @@ class Reading:
         if not any(self.signs):
             found.append("columns hold displacements, not places")
         elif not (self.axes == self.recorded and set(self.signs) == {1}):
-            found.append(self._directions())
+            found.append(directions(self.recorded, self.axes, self.signs, opposite=self.opposite))
         if self.factor != 1:
             found.append(UNITS[self.factor])
         if self.shift is not None:
@@ -96,16 +96,25 @@ class Reading:
             found.append(f"columns of {_and([names[k] for k in self._moved])} exchanged")
         return " and ".join(found)
 
-    def _directions(self) -> str:
-        mirrored = [AXES[a] for a, s in zip(self.axes, self.signs, strict=True) if s < 0]
-        where = " and counted from the opposite face of the body" if self.opposite else ""
-        if self.axes == self.recorded:
-            return f"{_and(mirrored)} mirrored{where}"
-        other = [AXES[a] for a, b in zip(self.axes, self.recorded, strict=True) if a != b]
-        if not mirrored and len(other) == 2 and sorted(self.axes) == sorted(self.recorded):
-            return f"{_and(sorted(other))} swapped"
-        held = [("-" if s < 0 else "") + AXES[a] for a, s in zip(self.axes, self.signs, strict=True)]
-        return f"columns {', '.join(AXES[a] for a in self.recorded)} hold {', '.join(held)}{where}"
+
+def directions(recorded: Sequence[int], axes: Sequence[int], signs: Sequence[int], *, opposite: bool = False) -> str:
+    """What columns of recorded axes hold instead, in words.
+
+    Args:
+        recorded: Axes that the columns are named after, 0 to 2.
+        axes: That they hold.
+        signs: Of them.
+        opposite: Whether a mirrored axis is counted from the opposite face of the body.
+    """
+    mirrored = [AXES[a] for a, s in zip(axes, signs, strict=True) if s < 0]
+    where = " and counted from the opposite face of the body" if opposite else ""
+    if list(axes) == list(recorded):
+        return f"{_and(mirrored)} mirrored{where}"
+    other = [AXES[a] for a, b in zip(axes, recorded, strict=True) if a != b]
+    if not mirrored and len(other) == 2 and sorted(axes) == sorted(recorded):
+        return f"{_and(sorted(other))} swapped"
+    held = [("-" if s < 0 else "") + AXES[a] for a, s in zip(axes, signs, strict=True)]
+    return f"columns {', '.join(AXES[a] for a in recorded)} hold {', '.join(held)}{where}"
 
 
 def _and(words: Sequence[str]) -> str:
