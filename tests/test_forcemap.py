@@ -14,6 +14,7 @@ from test_experiment import experiment
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.outer_effects import GravityTilt
+from torchsoro.sim2real.inference import histories
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.force_map import force_map, patches
 from torchsoro.sim2real.inference.heldout import predict
@@ -32,13 +33,16 @@ def made(tmp_path_factory):
     found, thrown = two_trials(tmp_path_factory.mktemp("bar"))
     twin = Twin(found.setup, edge=0.01, across=2)
 
-    def record(patch: int = 0, force=(0.0, 0.0, 0.0)) -> FitProblem:
+    def record(patch: int = 0, force=(0.0, 0.0, 0.0), rows: int = 40) -> FitProblem:
+        time = 0.005 * np.linspace(0, 39, rows)
         rng, trials = np.random.default_rng(1), []
         share = patches(twin, COUNT)[1][patch]
         pushed = torch.tensor(force, dtype=torch.float64)
         for trial in (found.trials[0], thrown):
+            still = Recording(time=time, position=np.zeros((rows, 2, 3)))
+            trial = dataclasses.replace(trial, recording=still)
             s = twin.scenario(trial)
-            if trial is thrown:
+            if trial.name == thrown.name:
                 forces = tuple(Force(share=share, value=f, start=t) for f, t in ((pushed, 0.06), (-pushed, 0.12)))
                 s = s.replace(loads=forces)
             observation = ObservationModel(found.setup, [trial])
@@ -46,7 +50,7 @@ def made(tmp_path_factory):
             errors[0], errors[6:] = 0.002, 2e-4
             seen = observation.observe(simulate(twin, [s])[0].alone(), 0, errors)
             place = seen + 5e-5 * rng.normal(size=seen.shape)
-            trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
+            trials.append(dataclasses.replace(trial, recording=Recording(time=time, position=place)))
         return FitProblem(dataclasses.replace(found, trials=tuple(trials)), twin)
 
     return record
@@ -70,6 +74,20 @@ def test_a_planted_force_is_found(made, patch, force):
     assert needed.force[axis] == pytest.approx(force[axis], rel=0.2)
     assert np.linalg.norm(needed.force - np.array(force)) < 0.25 * size
     assert found.share > 0.8 and found.simulated > 0.8
+
+
+def test_a_force_is_found_by_some_of_many_rows(made, monkeypatch):
+    problem = made(2, (0.0, 0.0, 0.05), rows=1300)
+    seen = []
+
+    def solved(problem, *given):
+        seen.extend(len(t.recording.time) for t in problem.trials)
+        return histories.solve(problem, *given)
+
+    monkeypatch.setattr("torchsoro.sim2real.inference.force_map.solve", solved)
+    found = force_map(problem, fitted(problem), count=COUNT)
+    assert seen and max(seen) == 434 and found.needed[0].trial == "b"
+    assert found.needed[0].force[2] == pytest.approx(0.05, rel=0.2)
 
 
 def test_no_force_is_needed_where_the_recording_agrees(made):

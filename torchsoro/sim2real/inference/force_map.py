@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis, Quantity
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.histories import Solution, chi2_of, simulate, solve
@@ -22,6 +23,7 @@ from torchsoro.simulation.loads import Force
 
 SMALL = 1e-3  # of the body's length, by which a force bends it for its response to be measured
 PASSES = 3  # of simulations at most: the response to forces is not quite linear
+ROWS = 500  # of a trial, that tell its forces at most: fifty for each of ten windows
 SHARES = np.array([1.0, 0.5, 0.25, 0.1])  # of a step that are tried
 ENOUGH = 0.05  # of the chi-squared, below which a pass is the last if it gains no more
 ROUGH = 0.7  # of what the linear response promises, below which a force is only a hint
@@ -186,6 +188,7 @@ def force_map(problem: FitProblem, fit: Fit, *, count: int = 4, windows: int = 1
     Raises:
         ValueError: if the fit's simulation, or that of a small force on it, breaks down.
     """
+    problem = problem.only([_sparse(t) for t in problem.trials])
     places, shares = patches(problem.twin, count)
     size = _small(problem.twin)
     steps = tuple(StepForce(share, k / windows, size) for share in shares for k in range(windows))
@@ -228,6 +231,14 @@ def force_map(problem: FitProblem, fit: Fit, *, count: int = 4, windows: int = 1
         share=1 - found.chi2 / before,
         simulated=1 - chi2 / before,
     )
+
+
+def _sparse(trial: Trial) -> Trial:
+    """With every k-th row of its recording, where those are many: forces take a number for each row and window."""
+    recording = trial.recording
+    if recording is None or len(recording.time) <= ROWS:
+        return trial
+    return dataclasses.replace(trial, recording=recording.every(math.ceil(len(recording.time) / ROWS)))
 
 
 def _small(twin: Twin) -> float:
