@@ -108,7 +108,7 @@ def test_times_of_a_film_at_another_speed_are_told_with_the_factor(swinging, rat
     assert f"times are {words} than seconds" in found
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e3, "kPa"), (1e5, "bar")])
+@pytest.mark.parametrize(("factor", "unit"), [(1e2, "mbar"), (1e3, "kPa"), (1e5, "bar")])
 def test_a_pressure_in_another_unit_is_told_by_name(tmp_path, factor, unit):
     twin, trial = made(tmp_path, SETUP.replace("duration = 0.5", "duration = 0.5\ngravity = [0, 0, 0]", 1) + CHAMBER,
                        pressure=4e3)  # fmt: skip

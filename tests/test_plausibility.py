@@ -278,6 +278,17 @@ def test_markers_that_are_all_on_clamped_parts_are_told(tmp_path):
     assert any("all markers are on clamped parts" in told for told in findings(tmp_path, swing()))
 
 
+def test_an_absolute_pressure_is_told(tmp_path):
+    (tmp_path / "setup.toml").write_text(
+        SETUP + '[[chamber]]\nname = "air"\nbox = [[0.01, 0.005, 0.005], [0.07, 0.015, 0.015]]\n'
+    )
+    write_table(tmp_path / "trials/a/markers.csv", swing().columns(NAMES))
+    for base, count in ((0.0, 0), (101e3, 1)):
+        (tmp_path / "trials/a/pressure.csv").write_text(f"time_s,air_pa\n0,{base}\n0.1,{base + 8e3}\n0.5,{base}\n")
+        found = plausible(read_experiment(tmp_path))[1]
+        assert [f.what for f in found] == ["the pressure is never below that of the atmosphere"] * count
+
+
 def test_a_finding_in_several_trials_is_told_once(folder):
     swapped = changed(swing(), lambda x: x[:, [1, 0, 2, 3]]), changed(swing(1), lambda x: x[:, [1, 0, 2, 3]])
     _, (found,) = plausible(write(folder, a=swapped[0], b=swapped[1], c=swing(2)))

@@ -20,6 +20,8 @@ from torchsoro.sim2real.data.samples import REPEATS, exchanges, put_back, repeat
 
 FEW = 5  # repeated rows, that are not yet strange
 COLLAPSE = 1.0  # weight of the body's longest edge over its modulus: what is softer cannot stand
+AIR = (8.5e4, 1.1e5)  # Pa, of the atmosphere
+STRONG = 0.2  # of the modulus: what begins under such a pressure is not undeformed
 SLOW = 2.0  # periods of the body between two samples, from which on no swing is seen
 
 
@@ -113,7 +115,7 @@ def of_trial(trial: Trial) -> tuple[Trial, list[Finding]]:
         recording = dataclasses.replace(recording, position=np.where(off[..., None], np.nan, recording.position))
         note("samples off the path for a single row", f"{', '.join(parts)}{more}", "they count as lost")
     found += _repeats(recording, trial.name, names)
-    found += _sampling(recording, trial)
+    found += _sampling(recording, trial) + _absolute(trial)
     return dataclasses.replace(trial, recording=recording), found
 
 
@@ -163,6 +165,23 @@ def _sampling(recording: Recording, trial: Trial) -> list[Finding]:
             what="samples are too far apart to show a motion of the body",
             evidence=f"{interval:g} s between two of them, and a period of about {period:.2g} s by size and modulus",
             remedy="are times and duration in seconds, and youngs_modulus in Pa?",
+        )
+    ]
+
+
+def _absolute(trial: Trial) -> list[Finding]:
+    """Whether pressures are absolute ones: never below that of the atmosphere."""
+    if trial.pressure is None:
+        return []
+    least = float(trial.pressure.pressure.min())
+    if not (AIR[0] < least < AIR[1] and least > STRONG * trial.setup.youngs_modulus):
+        return []
+    return [
+        Finding(
+            where=(trial.name,),
+            what="the pressure is never below that of the atmosphere",
+            evidence=f"{least / 1e3:.3g} kPa, and youngs_modulus is {trial.setup.youngs_modulus / 1e3:.3g} kPa",
+            remedy="is it gauge pressure, 0 for a chamber that is open to the air?",
         )
     ]
 

@@ -27,8 +27,8 @@ LAGS = 100  # moments of release, that are tried
 LATE = 5.0  # tolerances of a clock, from which on it does not begin at release
 OVERLAP = 0.5  # of the samples, that have to be of the motion
 RATES = (2.0, 3.0, 4.0, 5.0, 8.0, 10.0, 20.0, 30.0, 60.0, 1000.0)  # of clocks in other units, or of films slowed down
-WEAK = 1e-3  # of the modulus, below which no pressure moves a body much
-PRESSURES = {1e3: "kPa", 6894.76: "psi", 1e5: "bar"}
+WEAK = 1e-2  # of the modulus, below which a pressure hardly moves a body, and may be in another unit
+PRESSURES = {1e2: "mbar", 1e3: "kPa", 6894.76: "psi", 1e5: "bar", 1e6: "MPa"}
 
 
 @dataclass(frozen=True, kw_only=True)
