@@ -33,17 +33,19 @@ from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.histories import Lines, simulate
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects
 from torchsoro.sim2real.inference.model import write_model
-from torchsoro.sim2real.inference.verdict import Thresholds, judge
+from torchsoro.sim2real.inference.search import correlation
+from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options as ExplainOptions
 from torchsoro.sim2real.pipeline import correct, predict_markers
 from torchsoro.sim2real.report.explanation import effect_rows
 
 Baseline = Literal["modulus-and-damping", "all-parameters", "white-noise", "force-network", "sparse-regression"]
-Ablation = Literal["without-numerics", "without-heldout", "one-trial", "force-map"]
+Ablation = Literal["without-numerics", "one-trial", "force-map"]
 
 SIGNIFICANT = 3.0  # standard deviations from what is believed, beyond which a fitted parameter is named
 PATCHES, WINDOWS = 4, 10  # that the force network acts on, in each trial
+QUIET = 1.7  # chi-squared per sample without an effect, below which nothing is missing
 SLICES = 8  # of the body, on which the force map puts its forces
 HIDDEN, EPOCHS, DECAY = 16, 1500, 1e-3  # of the force network
 IMPROVEMENT = 0.85  # error on trials left out, over that without it, at which a network has found something
@@ -66,9 +68,8 @@ class Options:
     white-noise: as explain.py, but with independent noise and without the simulation's own error. force-network: a
     network of state and pressure, whose forces on the body explain the residual. sparse-regression: residual
     accelerations of the markers from a list of terms. without-numerics: explain.py with a twin that is corrected, but
-    whose error is not part of the band; without-heldout: that believes an effect whatever it predicts; one-trial: that
-    sees the first trial only. force-map: where free forces on the body would explain what is left, without any effect
-    whose form is known."""
+    is taken to be exact; one-trial: that sees the first trial only. force-map: where free forces on the body would
+    explain what is left, without any effect whose form is known."""
     predict: Path | None = None
     """A model.toml, to predict a trial with instead."""
     trial: Path | None = None
@@ -84,7 +85,7 @@ class Answer:
     """In the words of explanation.json.
 
     Attributes:
-        verdict: Of the four.
+        verdict: Of the five.
         effects: Rows.
         names: Effects that cannot be distinguished.
         heldout: Of trials that were left out, the error as believed and after [m].
@@ -133,7 +134,9 @@ def fit_parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
         start.append(begin)
     fit = fit_or_raise(problem, effects, np.concatenate(start), rounds=20)
     spread = math.sqrt(max(1.0, fit.chi2 / fit.samples))
-    rows = {r["name"]: r for r in effect_rows(fit, 1.0, problem)}
+    wide = spread**2 * correlation(fit)
+    widened = dataclasses.replace(fit, covariances=tuple(wide * c for c in fit.covariances))
+    rows = {r["name"]: r for r in effect_rows(widened, 1.0, problem)}
     sure = []
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         strengths = len(effect.quantities) if effect.joint else 1
@@ -150,16 +153,16 @@ def fit_parameters(problem: FitProblem, names: Sequence[str]) -> Answer:
     return Answer(verdict=kind, effects=[rows[n] for n in sure], names=sure, heldout=held, fit=fit)
 
 
-def full_search(problem: FitProblem, budget: float, **thresholds: float) -> Answer:
+def full_search(problem: FitProblem, budget: float) -> Answer:
     """The verdict of explain.py."""
-    verdict = judge(problem, thresholds=Thresholds(**thresholds), budget=budget, report=lambda line: None)
-    rows = effect_rows(verdict.chosen[0].fit, 1.0, verdict.problem) if verdict.chosen else []
+    verdict = judge(problem, budget=budget, report=lambda line: None)
+    rows = effect_rows(verdict.best, 1.0, verdict.problem)
     return Answer(
         verdict=verdict.kind,
         effects=rows,
         names=[c.fit.name for c in verdict.chosen],
         heldout=verdict.heldout,
-        fit=verdict.chosen[0].fit if verdict.chosen else verdict.null_model,
+        fit=verdict.best,
     )
 
 
@@ -167,7 +170,7 @@ def without_discretization_error(problem: FitProblem) -> FitProblem:
     """The same, as if the corrected twin made no error."""
     known = problem.discretization
     none = {name: np.zeros_like(n) for name, n in known.deviation.items()}
-    return problem.only(problem.trials, discretization=known.replace(deviation=none))
+    return problem.only(problem.trials, discretization=known.replace(deviation=none), fine=None)
 
 
 # A network of forces -----------------------------------------------------------------------------------------------
@@ -259,7 +262,7 @@ def force_network(problem: FitProblem) -> Answer:
 def largest_force(problem: FitProblem) -> Answer:
     """The place of the largest force that a force map needs, where something is missing."""
     null_model = fit_or_raise(problem)
-    if null_model.chi2 < Thresholds().quiet * null_model.samples:
+    if null_model.chi2 < QUIET * null_model.samples:
         return Answer(verdict="nothing_missing", fit=null_model)
     needed = force_map(problem, null_model, count=SLICES, windows=WINDOWS).needed
     rows = [{"name": "force", "parameters": {}, "location_m": n.place.tolist()} for n in needed[:1]]
@@ -381,7 +384,6 @@ def main(options: Options) -> Answer | None:
         "force-network": lambda: force_network(problem),
         "sparse-regression": lambda: sparse_regression(problem),
         "without-numerics": lambda: full_search(without_discretization_error(problem), seconds),
-        "without-heldout": lambda: full_search(problem, seconds, lost=math.inf, worse=math.inf),
         "one-trial": lambda: full_search(problem.only(problem.trials[:1]), seconds),
         "force-map": lambda: largest_force(problem),
     }[options.method]()

@@ -161,14 +161,15 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     verdict = judge(problem, inputs.effects, heldout=kept, budget=60 * options.budget, report=lambda line: None)
     progress.stage("predicting trials and writing the report")
     problem = verdict.problem
-    best = verdict.chosen[0].fit if verdict.chosen else verdict.null_model
+    best = verdict.best
     following = []
     if verdict.kind == "cannot_distinguish":
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
     everything, before, after = shown(problem, best, trials, kept, progress.note)
-    # Without the discrepancy of the best effect, by which the errors were inflated for the verdict.
-    deviation = discretization.deviation
+    # With the error that the simulation has as it is corrected, not that of the twin in the search.
+    own = verdict.posterior.near.numerics.amplitude.T
+    deviation = {t.name: own for t in problem.trials}
     known = problem.only(problem.trials, discretization=problem.discretization.replace(deviation=deviation))
     forces = None
     if verdict.kind == "unknown_physics":

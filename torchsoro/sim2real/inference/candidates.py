@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -11,16 +12,28 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
-from torchsoro.sim2real.inference.evidence import Data, Linearised, Model, Motions, TrialData, TwinError, infer
+from torchsoro.sim2real.inference.evidence import (
+    Data,
+    Linearised,
+    Model,
+    Motions,
+    Posterior,
+    TrialData,
+    TwinError,
+    infer,
+)
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
-from torchsoro.sim2real.inference.likelihood import Effects, Likelihood
+from torchsoro.sim2real.inference.laplace import Mode
+from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread
+from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
+LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
 WEAK = 0.1  # strength of a response, over that of the weakest probe point: it is linear there
 
 
@@ -82,54 +95,74 @@ def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def near(problem: FitProblem, fits: Sequence[Fit], middle: Twin, fine: Twin) -> list[Linearised | None]:
+def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
     """Fits as linearised models, with the error that finer twins leave; all simulated together.
+
+    Without a finer twin, or with trials that come with a simulation of their own, models are those of the problem
+    itself, with the error that it states.
 
     Args:
         problem: That was fitted.
         fits: Ends of searches.
-        middle: A twin with cells between those of the twin in use and of the finest.
-        fine: The finest twin.
 
     Returns:
         A model of each; None where a simulation breaks down.
     """
-    data, bare = data_of(problem), DiscretizationError(shift=tuple(problem.shift))
+    data = data_of(problem)
+    finer = None if problem.stated else problem.fine
+    bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
-    finer, between = (
-        problem.only(problem.trials, twin=e, discretization=DiscretizationError()) for e in (fine, middle)
-    )
-    planes = any(s.planes for s in problem.scenarios)
     steps = [np.where(f.point + STEP > coarse.bounds(f.effects)[1], -STEP, STEP) for f in fits]
     beside = coarse.simulate(
         [(f.effects, np.concatenate([f.point[None], f.point + np.diag(h)])) for f, h in zip(fits, steps, strict=True)]
     )
+    models: list[Linearised | None] = []
+    for f, h, motions in zip(fits, steps, beside, strict=True):
+        if not all(m.sound.all() for m in motions):
+            models.append(None)
+            continue
+        moving = ~held_of(problem, f.effects)
+        stated = np.mean([bare.of(t) ** 2 for t in problem.trials], 0).T
+        models.append(
+            Linearised(
+                model=model_of(problem, f.effects),
+                at=np.concatenate([f.point[moving], f.errors]),
+                residuals=_left(problem, [m.alone(0) for m in motions], f.errors),
+                slopes=_slopes(problem, motions, h, moving, f.errors),
+                numerics=TwinError(amplitude=np.sqrt(stated)),
+            )
+        )
+    return models if finer is None else _corrected(problem, data, fits, models, finer)
+
+
+def _corrected(
+    problem: FitProblem, data: Data, fits: Sequence[Fit], models: Sequence[Linearised | None], fine: Twin
+) -> list[Linearised | None]:
+    """Models with the residuals by finer twins, and the error of these."""
+    middle = between(problem.twin, fine)
+    by_fine, by_middle = (
+        problem.only(problem.trials, twin=twin, discretization=DiscretizationError()) for twin in (fine, middle)
+    )
+    planes = any(s.planes for s in problem.scenarios)
+    ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
+    closer = ask
     if planes:
         wall = WallOffset()
         gaps = GAPS[:, None] / wall.quantities[0].scale
-        ask = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
-    else:
-        ask = [(f.effects, f.point[None]) for f in fits]
-    best = finer.simulate(ask)
-    rest = between.simulate([(f.effects, f.point[None]) for f in fits])
-    ratio = middle.edge / fine.edge
+        closer = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
+    ratio = max((fine.count / middle.count) ** (1 / 3), LEAST_RATIO)
     found: list[Linearised | None] = []
-    for f, h, motions, sharp, dull in zip(fits, steps, beside, best, rest, strict=True):
-        if not all(m.sound.all() for m in (*motions, *sharp, *dull)):
+    for f, model, sharp, dull in zip(fits, models, by_fine.simulate(closer), by_middle.simulate(ask), strict=True):
+        if model is None or not all(m.sound.all() for m in (*sharp, *dull)):
             found.append(None)
             continue
-        moving = ~held_of(problem, f.effects)
         variants = [_left(problem, [m.alone(k) for m in sharp], f.errors) for k in range(len(sharp[0].position))]
         coarser = _left(problem, [m.alone() for m in dull], f.errors)
-        model = Linearised(
-            model=model_of(problem, f.effects),
-            at=np.concatenate([f.point[moving], f.errors]),
-            residuals=variants[0],
-            slopes=_slopes(problem, motions, h, moving, f.errors),
-            numerics=TwinError(amplitude=np.zeros_like(data.amplitude)),
-        )
-        model = by_spread(data, model, [*variants, coarser]) if planes else by_richardson(data, model, coarser, ratio)
-        found.append(model)
+        if planes:
+            found.append(by_spread(data, model, [*variants, coarser]))
+        else:
+            model = dataclasses.replace(model, residuals=variants[0])
+            found.append(by_richardson(data, model, coarser, ratio))
     return found
 
 
@@ -157,25 +190,34 @@ def _slopes(
     return tuple(found)
 
 
-def weigh(problem: FitProblem, fits: Sequence[Fit], middle: Twin, fine: Twin, names: int) -> Weighing:
-    """Posterior of all fits.
+def weigh(problem: FitProblem, fits: Sequence[Fit]) -> list[tuple[Fit, Posterior]]:
+    """Posteriors near fits, each with the fit; without those that break down.
 
     Args:
         problem: That was fitted.
-        fits: Ends of searches, one or more without an effect among them.
-        middle: See :func:`near`.
-        fine: See :func:`near`.
+        fits: Ends of searches.
+    """
+    data = data_of(problem)
+    models = zip(fits, near(problem, fits), strict=True)
+    return [(fit, infer(data, model)) for fit, model in models if model is not None]
+
+
+def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:
+    """Posteriors beside each other.
+
+    Args:
+        problem: That was fitted.
+        found: Of ends of searches, one or more without an effect among them.
         names: Number of single effects that can be named.
 
     Raises:
-        ValueError: if there is no fit without an effect whose simulation by finer twins is sound.
+        ValueError: if there is no model without an effect.
     """
-    data = data_of(problem)
-    found = [infer(data, one) for one in near(problem, fits, middle, fine) if one is not None]
     nothing = tuple(p for p in found if not p.near.model.effects)
     if not nothing:
-        raise ValueError("fits: none without an effect that finer twins can simulate, wanted one")
-    return Weighing(data=data, nothing=nothing, effects=tuple(p for p in found if p.near.model.effects), names=names)
+        raise ValueError(BREAKS)
+    effects = tuple(p for p in found if p.near.model.effects)
+    return Weighing(data=data_of(problem), nothing=nothing, effects=effects, names=names)
 
 
 def responses(problem: FitProblem, effects: Sequence[Hypothesis], still: Fit) -> Motions:
@@ -203,7 +245,41 @@ def responses(problem: FitProblem, effects: Sequence[Hypothesis], still: Fit) ->
         sound = np.all([m.sound for m in motions], axis=0)
         for k in (int(k) for k in np.flatnonzero(sound)):
             after = _left(problem, [m.alone(k) for m in motions], still.errors)
-            change = tuple(np.nan_to_num(a - b) for a, b in zip(before, after, strict=True))
+            change = tuple(np.nan_to_num(a - b)[..., None] for a, b in zip(before, after, strict=True))
             if any(c.any() for c in change):
                 columns.append(change)
-    return tuple(np.stack([c[i] for c in columns], -1) for i in range(len(before)))
+    return tuple(
+        np.stack([c[i] for c in columns], -1) if columns else b[..., None][..., :0] for i, b in enumerate(before)
+    )
+
+
+def at_mode(problem: Likelihood, fit: Fit, mode: Mode) -> Fit:
+    """A fit with its numbers where the posterior has its mode, and with the covariance there.
+
+    Args:
+        problem: That was fitted.
+        fit: Near which the model was linearised.
+        mode: Of its unknowns.
+    """
+    moving = np.flatnonzero(~held_of(problem, fit.effects))
+    count, known = len(moving), len(problem.common)
+    point = np.zeros_like(fit.point)
+    point[moving] = mode.at[:count]
+    scales = problem.scales(fit.effects)
+    covariance = np.zeros((len(point), len(point)))
+    covariance[np.ix_(moving, moving)] = mode.covariance[:count, :count]
+    covariance *= np.outer(scales, scales)
+    values, covariances, k = [], [], known
+    for effect in fit.effects:
+        own = slice(k, k + len(effect.quantities) + 3 * effect.local)
+        values.append((point * scales)[own])
+        covariances.append(covariance[own, own])
+        k = own.stop
+    return dataclasses.replace(
+        fit,
+        values=tuple(values),
+        covariances=tuple(covariances),
+        ln_factors=(point * scales)[:known],
+        errors=mode.at[count:],
+        point=point,
+    )

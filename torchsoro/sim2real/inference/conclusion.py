@@ -67,6 +67,7 @@ class Conclusion:
         kappa: To the power of whose inverse the likelihood was taken.
         limit: Change of the motion that would have been seen [m].
         matters: Change of the motion that has to be seen [m].
+        motion: Root mean square of the motion over markers and axes [m].
         predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
         remedies: For "cannot_tell": what would make it tellable.
     """
@@ -79,6 +80,7 @@ class Conclusion:
     kappa: float
     limit: float
     matters: float
+    motion: float
     predictive: tuple[float, float] = (0.0, math.inf)
     remedies: dict[str, float] = field(default_factory=dict)
 
@@ -248,6 +250,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         kappa=weighing.kappa,
         limit=limit,
         matters=matters,
+        motion=data.size,
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )

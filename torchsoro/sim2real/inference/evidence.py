@@ -232,6 +232,11 @@ class Posterior:
         """Of the unknowns, with that discrepancy."""
         return self.best.mode
 
+    @property
+    def unexplained(self) -> float:
+        """Share of the motion that the model leaves beyond noise and the twin's own error; 0 if it does not matter."""
+        return self.discrepancy.share if self.matters else 0.0
+
     @cached_property
     def left(self) -> Motions:
         """Residuals at the mode [T, M, A] m."""
@@ -405,3 +410,18 @@ def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarra
         return posterior(total(of), near.at, near.model.priors).ln_evidence if of else 0.0
 
     return np.array([ln_z(parts) - ln_z(parts[:i] + parts[i + 1 :]) for i in range(len(parts))])
+
+
+def without(data: Data, found: Posterior, number: int, kappa: float = 1.0) -> Mode:
+    """Mode of the unknowns of a model without one of the trials, with s and tau of all of them.
+
+    Args:
+        data: Recordings.
+        found: A model after all of them.
+        number: Of the trial that is left out.
+        kappa: See :func:`adjusted`.
+    """
+    near = found.near
+    parts = grams(data, near, found.discrepancy)
+    rest = total([tempered(g, kappa) for i, g in enumerate(parts) if i != number])
+    return posterior(rest, near.at, near.model.priors)

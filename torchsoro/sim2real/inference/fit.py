@@ -12,10 +12,11 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Answer, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood
 from torchsoro.sim2real.inference.probing import ranked_starts
-from torchsoro.sim2real.twin.batch import room
+from torchsoro.simulation.kernels.lanes import LANES
 
 # Damping of the step that leaves a trial out: an unknown that the other trials hardly determine stays as it was.
 LEAVE_OUT_DAMPING = 1e-3
+ROOM = 2 * LANES  # simulations up to which derivatives are taken along; the same on any machine, as results are
 WEAK = 0.2  # of a probe point's strength: the response is also taken there, where it is nearer to linear
 
 
@@ -134,12 +135,12 @@ class FitProblem(Likelihood):
         asked = {i: next(search) for i, search in enumerate(searches)}
         while asked:
             order = list(asked)
-            # Where there is room in a batch, derivatives take no longer than the step by itself.
+            # Where there is room in a batch, derivatives take hardly longer than the step by itself.
             wide = sum(1 + solvers[i].unknowns for i in order) * len(self.trials)
             answers = self.simulate([asked[i] for i in order])
             for i, motions in zip(order, answers, strict=True):
                 try:
-                    asked[i] = searches[i].send(Answer(motions=motions, eager=wide <= room(self.threads)))
+                    asked[i] = searches[i].send(Answer(motions=motions, eager=wide <= ROOM))
                 except StopIteration as end:
                     ends[i] = end.value
                     del asked[i]

@@ -72,3 +72,15 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
         if cost(fine, trials, 16 / trials * CORES) <= seconds:
             break
     return fine
+
+
+def between(twin: Twin, fine: Twin) -> Twin:
+    """A twin with cells between those of two others, by which the error of the finer one is told.
+
+    Args:
+        twin: The one in use.
+        fine: The finer one.
+    """
+    share = (1 + twin.edge / fine.edge) / 2
+    across = math.ceil(share * min(a.cells for a in twin.grid.axes))
+    return Twin(twin.setup, edge=twin.edge / share, walls=math.ceil(share * twin.walls), across=across)

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS
-from torchsoro.sim2real.inference.ranking import BELIEVED, FAINT, correlation, varied
+from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
 
+BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
+FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
 COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
 STARTS = 3  # searches of each effect, from probe points that differ
 EARLY_ABOVE = (
     3.0  # chi-squared per sample of the null model, above which searches begin with the first part of the trials
 )
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
-INFLATED = 1.5  # chi-squared per sample of the best effect, above which its residual is added to the discrepancy
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
 CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
 REFINED = 2  # rounds in which the best are corrected by the finer twin
@@ -30,6 +29,8 @@ BEHIND = 0.1  # share of the best search's gain, by which another may be behind 
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
+ENDS = 10  # that are weighed, at most
+APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
 
@@ -46,7 +47,8 @@ def search(
         report: Called with a line for each effect.
 
     Returns:
-        The problem with slips and corrections that were found, the fit without an effect, and those with, best first.
+        The problem with slips and corrections that were found, the fit without an effect, and distinct ends of
+        searches with effects: the best of each name first.
     """
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
@@ -85,14 +87,29 @@ def search(
         led += [f for f in tried if unconstrained and varied(f) > 0 and f not in led]
         tasks = [(f.effects, f.point) for f in led]
     tasks += unconstrained
-    best = _best([*problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS), *tried])
+    completed = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
+    best = _best([*completed, *tried])
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
     if best and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.chi2 - f.samples < TWICE * left]
         best = _best([*best, *pairs])
-    return problem, null_model, _simpler(problem, effects, best)
+    return problem, null_model, distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)])
+
+
+def distinct(fits: Iterable[Fit]) -> list[Fit]:
+    """The first of fits that differ, by effects or in where they ended."""
+    found: list[Fit] = []
+
+    def same(one: Fit, other: Fit) -> bool:
+        off = np.abs(one.point - other.point) if one.name == other.name else np.array(np.inf)
+        return bool((off < APART * np.maximum(np.abs(one.point), 1)).all())
+
+    for fit in fits:
+        if fit.effects and not any(same(fit, other) for other in found):
+            found.append(fit)
+    return found[:ENDS]
 
 
 def _refined(
@@ -149,33 +166,6 @@ def _probe_points(
         for effect, ranked in zip(effects, problem.probe(effects, base), strict=True):
             probe_points += [(chi2, effect, start) for chi2, start in ranked]
     return probe_points
-
-
-def inflate_discrepancy(
-    problem: FitProblem, null_model: Fit, fits: list[Fit], report: Callable[[str], None]
-) -> tuple[FitProblem, Fit, list[Fit]]:
-    """Inflate the discrepancy by the residual of the best effect where that is large, and fit all again.
-
-    Otherwise measurement errors would be fitted far beyond their priors to take up what the model lacks.
-    """
-    fits = fits[:COMPLETED]
-    own = problem.discretization
-    for _ in range(4):
-        if not fits or fits[0].chi2 < INFLATED * fits[0].samples:
-            break
-        left = {}
-        for trial, seen in zip(problem.trials, fits[0].seen, strict=True):
-            assert trial.recording is not None
-            off = np.sqrt(np.nanmean((trial.recording.position - seen) ** 2))
-            left[trial.name] = np.sqrt(own.of(trial) ** 2 + (1.2 * off) ** 2)
-        sizes = ", ".join(f"{1e3 * float(n.mean()):.2f} mm" for n in left.values())
-        report(f"discrepancy inflated by the residual of the best: {sizes}")
-        problem = problem.only(problem.trials, discretization=problem.discretization.replace(deviation=left))
-        tasks: list[Task] = [((), null_model.point), *((f.effects, f.point) for f in fits)]
-        again, *rest = problem.fit(tasks, rounds=ROUNDS)
-        null_model = again or null_model
-        fits = _best(rest)
-    return problem, null_model, fits
 
 
 def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most: int) -> list[Task]:
@@ -276,11 +266,16 @@ def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_m
     return [*first, *more][:most]
 
 
-def within(problem: FitProblem, null_model: Fit) -> float:
-    """Chi-squared without an effect, with modulus and pressure within what is credible."""
-    point = np.clip(null_model.point, -BELIEVED, BELIEVED)
-    if (point == null_model.point).all():
-        return null_model.chi2
-    motions = problem.simulate([((), point[None])])[0]
-    chi2 = problem.measure([m.alone() for m in motions], null_model.errors)[0]
-    return max(chi2, null_model.chi2) if math.isfinite(chi2) else null_model.chi2
+def varied(fit: Fit) -> float:
+    """Excess of ln of the modulus on a stiff side over its mean, by all effects of a fit."""
+    return sum(e.varies(v) for e, v in zip(fit.effects, fit.values, strict=True))
+
+
+def correlation(fit: Fit) -> float:
+    """Correlation length of the whitened residual, in samples, from its lag-one autocorrelation."""
+    above = below = 0.0
+    for r in fit.whitened:
+        above += float(r[1:] @ r[:-1])
+        below += float(r @ r)
+    rho = min(max(above / max(below, 1e-300), 0.0), 0.98)
+    return (1 + rho) / (1 - rho)

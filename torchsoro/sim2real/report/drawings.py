@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ PLACE, BODY = "#a3154a", "#52606d"
 EDGES = 400  # of a body, that are drawn at most
 LEAST_RANGE = 0.15  # of the widest panel's range, that any panel shows
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
+BARS = 10  # of probabilities, that are drawn at most
 BANDS = ("#e9eef4", "#f8f4ea")  # of phases, in turn
 
 
@@ -218,4 +219,18 @@ def draw_cosines(found: Isolability) -> Figure:
     panel.set_xticks(range(count), names, rotation=90, fontsize=8)
     panel.set_yticks(range(count), names, fontsize=8)
     figure.colorbar(image, ax=panel, shrink=0.8)
+    return figure
+
+
+def draw_probabilities(found: Mapping[str, float]) -> Figure:
+    """Bars of posterior probabilities by name, the most probable first."""
+    leading = sorted(found.items(), key=lambda item: -item[1])[:BARS]
+    figure = Figure(figsize=(6.5, 0.6 + 0.28 * len(leading)), layout="constrained")
+    panel: Axes = figure.subplots()
+    bars = panel.barh([name for name, _ in leading], [100 * p for _, p in leading], color=EXPLAINED)
+    panel.bar_label(bars, labels=[f"{100 * p:.3g} %" for _, p in leading], padding=3, fontsize=8)
+    panel.invert_yaxis()
+    panel.set_xlim(0, 115)
+    panel.set_xlabel("probability [%]", fontsize=8)
+    panel.tick_params(labelsize=8)
     return figure

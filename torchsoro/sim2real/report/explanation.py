@@ -18,7 +18,6 @@ from torchsoro.sim2real.inference.heldout import Prediction
 from torchsoro.sim2real.inference.isolability import Isolability
 from torchsoro.sim2real.inference.next_experiment import Proposal
 from torchsoro.sim2real.inference.phases import Mismatch
-from torchsoro.sim2real.inference.ranking import correlation
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import Verdict
 
@@ -26,7 +25,6 @@ LEVEL = 0.9  # probability that an interval is to hold the truth
 # Standard deviation of a place by the form of the model, over the body's size; as Hypothesis.model_form_deviation of a
 # parameter.
 PLACE_DEVIATION = 0.07
-BROKEN = 1e3  # held-out error ratio of a simulation that breaks down, as JSON knows no infinity
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,29 +65,34 @@ class Explanation:
     @property
     def best(self) -> Fit:
         """The fit that is shown: of the best effect, or the null model."""
-        return self.verdict.chosen[0].fit if self.verdict.chosen else self.verdict.null_model
+        return self.verdict.best
+
+    @property
+    def own_error(self) -> float:
+        """Root mean square over markers and axes of the simulation's own error, as it is corrected [m]."""
+        return float(np.sqrt((self.verdict.posterior.near.numerics.amplitude**2).mean()))
 
 
 def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, Any]]:
     """The effects of a fit, as in explanation.json.
 
-    Intervals come from the covariance of the fit, widened by the scatter and the correlation of its residuals and by
-    the model-form standard deviation, through the slopes of the reported quantities. Of a quantity that is the
-    exponential of an unknown the interval is symmetric in its logarithm; any other ends where its quantity does.
+    Intervals come from the covariance of the fit, widened by the model-form standard deviation, through the slopes of
+    the reported quantities. Of a quantity that is the exponential of an unknown the interval is symmetric in its
+    logarithm; any other ends where its quantity does.
 
     Args:
         fit: Of one effect or several.
-        weight: Of the fit among those that are not told apart, 0 to 1.
+        weight: Posterior probability, 0 to 1.
         problem: That was fitted.
     """
     wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
-    spread, size = max(1.0, fit.chi2 / fit.samples) * correlation(fit), np.array(problem.twin.setup.size)
+    size = np.array(problem.twin.setup.size)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
         scenario = next(s for s in problem.scenarios if effect.applies(s, problem.twin))
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
         own = np.where(logarithm, 1.0, values[:count])
-        whole = spread * covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)
+        whole = covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)
         steps = 1e-4 * np.array([q.scale for q in effect.quantities])
         reported = effect.reported(values[:count], scenario)
         ahead = [effect.reported(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
@@ -100,9 +103,7 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
             low, high = _interval(effect, name, value, half)
             parameters[name] = {"value": value, "low": low, "high": high, "unit": unit}
         place = effect.place(values, problem.twin)
-        within = wide * np.sqrt(
-            spread * np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2
-        )
+        within = wide * np.sqrt(np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2)
         rows.append(
             {
                 "name": effect.name,
@@ -129,9 +130,7 @@ def _interval(effect: Hypothesis, name: str, value: float, half: float) -> tuple
 
 def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
     """The content of explanation.json."""
-    v, problem = e.verdict, e.problem
-    scores = np.array([c.score for c in v.chosen])
-    weights = np.exp(scores - scores.max()) / np.exp(scores - scores.max()).sum() if len(scores) else scores
+    v, problem, c = e.verdict, e.problem, e.verdict.conclusion
     names = [m.name for m in problem.experiment.setup.markers]
 
     def errors(predictions: Sequence[Prediction]) -> dict[str, Any]:
@@ -139,34 +138,37 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
 
     return {
         "verdict": v.kind,
-        "effects": effect_rows(v.chosen[0].fit, float(weights[0]), problem) if v.chosen else [],
-        "set": [c.fit.name for c in v.chosen],
+        "effects": effect_rows(v.chosen[0].fit, v.chosen[0].probability, problem) if v.chosen else [],
+        "set": list(c.chosen),
+        "probabilities": c.probabilities,
         "ranking": [
             {
-                "name": c.fit.name,
-                "score": c.score,
-                "explained": c.explained,
-                "misfit": c.fit.chi2,
-                "samples": c.fit.samples,
-                "unknowns": c.fit.unknowns,
-                "gain": c.gain,
-                "alike": correlation(c.fit),
-                "heldout_over_nothing": None if math.isnan(c.heldout_ratio) else min(c.heldout_ratio, BROKEN),
-                "effects": effect_rows(c.fit, 0.0, problem),
+                "name": x.fit.name,
+                "probability": x.probability,
+                "ln_evidence": x.posterior.ln_evidence,
+                "change_m": x.size,
+                "unexplained_m": x.posterior.unexplained * c.motion,
+                "unknowns": x.fit.unknowns,
+                "effects": effect_rows(x.fit, x.probability, problem),
             }
-            for c in v.ranking
+            for x in v.ranking
         ],
+        "visible": {
+            "limit_m": c.limit if math.isfinite(c.limit) else None,
+            "matters_m": c.matters,
+            "remedies": c.remedies,
+        },
+        "predictive": {
+            "gain": c.predictive[0],
+            "standard_error": c.predictive[1] if math.isfinite(c.predictive[1]) else None,
+        },
         "noise": {
             "standard_deviation_m": problem.noise,
-            "numerics_m": {t.name: float(np.sqrt((problem.discretization.of(t) ** 2).mean())) for t in problem.trials},
+            "simulation_m": e.own_error,
+            "evidence_divided_by": c.kappa,
+            "motion_m": c.motion,
             "edges_m": list(e.discretization.edges),
             "cells_through_thinnest_wall": list(e.discretization.walls),
-            "excess": v.excess,
-            "nothing": {
-                "misfit": v.null_model.chi2,
-                "samples": v.null_model.samples,
-                "alike": correlation(v.null_model),
-            },
         },
         "nuisance": {
             "ln_modulus": float(e.best.ln_factors[0]),

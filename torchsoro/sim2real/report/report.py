@@ -14,9 +14,16 @@ from torchsoro.output.document import Document
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.cosines import SCORE
 from torchsoro.sim2real.inference.isolability import SAME, Isolability
-from torchsoro.sim2real.report.drawings import draw_body, draw_cosines, draw_forces, draw_mismatch, draw_trial
+from torchsoro.sim2real.report.drawings import (
+    draw_body,
+    draw_cosines,
+    draw_forces,
+    draw_mismatch,
+    draw_probabilities,
+    draw_trial,
+)
 from torchsoro.sim2real.report.explanation import Explanation, as_json, effect_rows
-from torchsoro.sim2real.report.sentences import candidate_words, evidence, verdict_sentence
+from torchsoro.sim2real.report.sentences import candidate_words, evidence, told, verdict_sentence
 from torchsoro.sim2real.report.words import (
     effect_words,
     error_number,
@@ -132,26 +139,32 @@ def _mismatches(page: Document, e: Explanation, trials: Sequence[Trial]) -> None
 
 
 def _considered(page: Document, e: Explanation) -> None:
-    """All effects that were fitted."""
+    """Posterior probabilities, and all that was weighed."""
+    c = e.verdict.conclusion
+    page.section("What was considered")
+    page.figure(
+        draw_probabilities({told(name): p for name, p in c.probabilities.items()}),
+        "Posterior probability of what is missing: of nothing, of what is none of the known effects, and of each "
+        "effect that was weighed.",
+    )
     rows = [
         {
-            "effect": effect_words(c.fit.name),
-            "changes": " and ".join(effect.affected_quantity for effect in c.fit.effects),
-            "score": round(c.score, 1),
-            "explains [%]": round(100 * c.explained, 1),
-            "chi² / samples": c.fit.chi2 / c.fit.samples,
-            "held-out error": "breaks down" if math.isinf(c.heldout_ratio) else c.heldout_ratio,
-            "fitted": candidate_words(c, e.problem, every=True).partition(": ")[2],
+            "effect": effect_words(x.fit.name),
+            "changes": " and ".join(effect.affected_quantity for effect in x.fit.effects),
+            "probability [%]": 100 * x.probability,
+            "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
+            "changes the motion by [mm]": 1e3 * x.size,
+            "leaves [mm]": 1e3 * x.posterior.unexplained * c.motion,
+            "fitted": candidate_words(x, e.problem, every=True).partition(": ")[2],
         }
-        for c in e.verdict.ranking
+        for x in e.verdict.ranking
     ]
     if rows:
-        page.section("What was considered")
         page.table(
             rows,
-            "Score: gain in log-likelihood over the setup without an effect, scaled by the scatter of the residuals, "
-            "less a penalty for each parameter. Held-out error: on trials left out of the fit, over that without an "
-            "effect; an effect with a value near 1, or far above another's, is not chosen.",
+            "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the motion "
+            "beyond noise and the simulation's own error; an effect that leaves more than its law may be wrong by is "
+            "counted as none of the known ones, and one that changes the motion by less than matters as nothing.",
         )
 
 
@@ -181,10 +194,10 @@ def _accuracy(page: Document, e: Explanation, data: Mapping[str, Any]) -> None:
     """Noise, the simulation's own error, and measurement errors."""
     page.section("Accuracy")
     noise, cells = data["noise"], e.discretization
-    own = ", ".join(f"{1e3 * value:.3f} mm in trial {name}" for name, value in noise["numerics_m"].items())
+    edges = " and ".join(f"{1e3 * edge:.2f}" for edge in cells.edges)
     page.text(
         f"Noise of the recordings: {1e3 * noise['standard_deviation_m']:.3f} mm (standard deviation). Error of the "
-        f"simulation itself: {own}, from cells of {' and '.join(f'{1e3 * s:.2f}' for s in cells.edges)} mm, "
+        f"simulation itself: {1e3 * noise['simulation_m']:.3f} mm, from cells of {edges} mm, "
         f"{' and '.join(map(str, cells.walls))} of them through the thinnest wall."
     )
     names, common = e.problem.observation.names, [tolerance for _, tolerance in e.problem.common]

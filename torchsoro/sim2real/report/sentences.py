@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import math
 
+from torchsoro.sim2real.inference.conclusion import NOTHING, UNKNOWN
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
-from torchsoro.sim2real.inference.ranking import Candidate
+from torchsoro.sim2real.inference.verdict import Candidate
 from torchsoro.sim2real.report import words
 from torchsoro.sim2real.report.explanation import Explanation, effect_rows
 
+REMEDIES = {
+    "noise": "markers with {:g} times less noise",
+    "twin": "a simulation with an own error {:g} times smaller",
+    "trials": "{:g} times as many trials",
+    "motion": "a motion {:g} times as large",
+}
 BELIEVED = 3.0  # prior standard deviations, beyond which the fitted value of a measurement error is not credible
 
 
@@ -23,6 +30,8 @@ def verdict_sentence(e: Explanation) -> str:
         )
     if v.kind == "unknown_physics":
         return "Something is missing from the setup that is none of the known effects."
+    if v.kind == "cannot_tell":
+        return "It cannot be told from these recordings whether something is missing from the setup."
     parts = "; ".join(candidate_words(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish":
         return f"The difference is explained by one of these, and the recordings cannot tell by which: {parts}."
@@ -32,7 +41,7 @@ def verdict_sentence(e: Explanation) -> str:
 def evidence(e: Explanation) -> list[str]:
     """What the verdict rests on, and what remains open, a sentence each."""
     v = e.verdict
-    found = [_departure(e)]
+    found = [_departure(e), _probable(e), _visible(e)]
     if v.heldout:
         held = list(v.heldout.values())
         before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
@@ -42,23 +51,10 @@ def evidence(e: Explanation) -> list[str]:
             f"as stated is {1e3 * before:.2f} mm."
         )
     if v.kind == "unknown_physics":
-        if v.ranking:
-            best = v.ranking[0]
-            found.append(
-                f"The best of the known effects, {words.effect_words(best.fit.name)}, explains "
-                f"{100 * best.explained:.0f} % of the difference."
-            )
         if e.forces:
             found.append(str(e.forces))
     if v.kind == "cannot_distinguish":
         found.append(advice(e.following))
-    second = next((c for c in v.ranking if c is not v.chosen[0]), None) if v.kind == "explained" else None
-    if second is not None:
-        found.append(
-            f"Next best is {words.effect_words(second.fit.name)}, which explains "
-            f"{100 * max(second.explained, 0):.0f} % of the difference, against {100 * v.chosen[0].explained:.0f} %, "
-            f"and whose chi-squared is {second.fit.chi2 / v.chosen[0].fit.chi2:.3g} times as large."
-        )
     if v.chosen:
         found.append(_incredible_errors(e))
     return [sentence for sentence in found if sentence]
@@ -67,6 +63,49 @@ def evidence(e: Explanation) -> list[str]:
 def lead(e: Explanation) -> str:
     """The verdict and what it rests on, as one paragraph."""
     return " ".join([verdict_sentence(e), *evidence(e)])
+
+
+def told(name: str) -> str:
+    """A candidate's name in words."""
+    return {NOTHING: "nothing", UNKNOWN: "none of the known effects"}.get(name) or words.effect_words(name)
+
+
+def probability(value: float) -> str:
+    """In percent; of what is nearly sure or nearly excluded, on which side of that it is."""
+    if value > 0.999:
+        return "above 99.9 %"
+    return f"{100 * value:.1f} %" if value >= 0.001 else "below 0.1 %"
+
+
+def _probable(e: Explanation) -> str:
+    """Posterior probabilities of the set, and what the best leaves."""
+    c = e.verdict.conclusion
+    leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.chosen))]
+    sentence = "Probabilities of what is missing: " + ", ".join(f"{told(n)} {probability(p)}" for n, p in leading) + "."
+    left = e.verdict.posterior.unexplained
+    if left:
+        sentence += f" {100 * left:.0f} % of the motion are left unexplained."
+    return sentence
+
+
+def _visible(e: Explanation) -> str:
+    """Which changes would have been seen, where nothing is named; and what would make smaller ones visible."""
+    v, c = e.verdict, e.verdict.conclusion
+    if v.kind not in ("nothing_missing", "cannot_tell"):
+        return ""
+    if c.limit <= c.matters:
+        return (
+            f"An effect that changes the motion by {1e3 * c.limit:.2g} mm would have been seen; "
+            f"{1e3 * c.matters:.2g} mm matter."
+        )
+    sentence = (
+        f"An effect would have been seen only if it changed the motion by {1e3 * c.limit:.2g} mm, "
+        f"while {1e3 * c.matters:.2g} mm matter."
+    )
+    if c.remedies:
+        ways = " or ".join(REMEDIES[name].format(factor) for name, factor in c.remedies.items())
+        sentence += f" It could be told with {ways}."
+    return sentence
 
 
 def _departure(e: Explanation) -> str:
@@ -90,12 +129,7 @@ def _incredible_errors(e: Explanation) -> str:
             )
     if not large:
         return ""
-    sentence = f"More is missing than this, since measurement errors are fitted beyond belief: {', '.join(large)}."
-    if e.verdict.excess > 1:
-        sentence += (
-            f" Chi-squared is still {e.verdict.excess:.2g} times the number of samples; where and when is drawn below."
-        )
-    return sentence
+    return f"More is missing than this, since measurement errors are fitted beyond belief: {', '.join(large)}."
 
 
 def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = False) -> str:

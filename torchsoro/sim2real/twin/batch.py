@@ -42,11 +42,6 @@ def safety(grid: Grid) -> float:
     return CUT if grid.cut else SAFETY
 
 
-def room(threads: int) -> int:
-    """Number of variations that take as long as one."""
-    return LANES * threads
-
-
 def simulate(
     twin: Twin, scenarios: Sequence[Scenario], *, threads: int = THREADS, even: bool = False, safe: float | None = None
 ) -> list[MarkerTrajectory]:
