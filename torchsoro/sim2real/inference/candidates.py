@@ -248,9 +248,8 @@ def responses(problem: FitProblem, effects: Sequence[Hypothesis], still: Fit) ->
             change = tuple(np.nan_to_num(a - b)[..., None] for a, b in zip(before, after, strict=True))
             if any(c.any() for c in change):
                 columns.append(change)
-    return tuple(
-        np.stack([c[i] for c in columns], -1) if columns else b[..., None][..., :0] for i, b in enumerate(before)
-    )
+    none = tuple(b[..., None][..., :0] for b in before)
+    return tuple(np.concatenate(same, -1) for same in zip(none, *columns, strict=True))
 
 
 def at_mode(problem: Likelihood, fit: Fit, mode: Mode) -> Fit:
