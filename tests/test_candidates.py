@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 from ringing import bar, effect
 
-from torchsoro.sim2real.inference.candidates import data_of, model_of, responses, weigh
+from torchsoro.sim2real.inference.candidates import at_mode, data_of, model_of, near, responses, weigh, weighing_of
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.visible import limit
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -21,13 +23,13 @@ NAMES = ("density",)
 def weighed(tmp_path_factory):
     """A bar that is a half heavier than believed, and one that is as believed."""
     twin, record = bar(tmp_path_factory.mktemp("bar"))
-    middle, fine = (Twin(twin.setup, edge=e, across=n) for e, n in ((0.0075, 3), (0.006, 4)))
+    fine = Twin(twin.setup, edge=0.006, across=4)
     found = {}
     for name, values in (("density", (math.log(1.5),)), (None, ())):
-        problem = FitProblem(record(name, values, by=fine), twin)
+        problem = FitProblem(record(name, values, by=fine), twin, fine=fine)
         tasks = [((), None), *(((effect(n),), None) for n in NAMES)]
         fits = [f for f in problem.fit(tasks, rounds=5) if f is not None]
-        found[name] = problem, fits, weigh(problem, fits, middle, fine, names=20)
+        found[name] = problem, fits, weighing_of(problem, [p for _, p in weigh(problem, fits)], names=20)
     return found
 
 
@@ -69,3 +71,30 @@ def test_priors_are_those_of_quantities(weighed):
     shape = model_of(problem, (effect("viscoelastic"),)).priors[2]
     assert math.isinf(shape.scale)
     assert (shape.low, shape.high) == (-9.0, 1.5)
+
+
+def test_a_model_without_a_finer_twin_has_the_error_that_its_problem_states(weighed):
+    problem, fits, _ = weighed[None]
+    alone = problem.only(problem.trials, fine=None)
+    (model,) = near(alone, fits[:1])
+    stated = np.mean([alone.discretization.of(t) ** 2 for t in alone.trials], 0).T
+    assert model.numerics.amplitude == pytest.approx(np.sqrt(stated))
+    assert not model.numerics.draws
+
+
+def test_a_fit_at_a_mode_has_its_numbers_and_deviations_in_si_units(weighed):
+    problem, fits, weighing = weighed["density"]
+    fit, found = next(f for f in fits if f.effects), weighing.groups["density"][0]
+    moved = at_mode(problem, fit, found.mode)
+    scales = problem.scales(fit.effects)
+    assert moved.values[0] == pytest.approx(found.mode.at[1:2] * scales[1])
+    assert moved.ln_factors == pytest.approx(found.mode.at[:1] * scales[0])
+    assert moved.covariances[0][0, 0] == pytest.approx(found.mode.covariance[1, 1] * scales[1] ** 2)
+    assert moved.errors == pytest.approx(found.mode.at[2:])
+
+
+def test_a_twin_between_two_has_cells_between_theirs(weighed):
+    problem = weighed[None][0]
+    middle = between(problem.twin, problem.fine)
+    assert problem.fine.edge < middle.edge < problem.twin.edge
+    assert problem.twin.count < middle.count < problem.fine.count

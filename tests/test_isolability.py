@@ -19,9 +19,8 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.likelihood import Tolerances
 from torchsoro.sim2real.inference.next_experiment import REPEAT, Proposal, advice, next_experiment
-from torchsoro.sim2real.inference.ranking import Candidate
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.inference.verdict import Verdict
+from torchsoro.sim2real.inference.verdict import weighed
 from torchsoro.sim2real.report.drawings import draw_cosines
 from torchsoro.sim2real.report.explanation import Explanation, as_json
 from torchsoro.sim2real.report.sentences import evidence
@@ -251,10 +250,8 @@ def test_a_known_pull_tells_density_from_modulus(problem):
 
 def test_the_lead_names_the_next_experiment_where_effects_are_not_told_apart(problem, screened):
     density, null_model = problem.fit([((effect("density"),), None), ((), None)], rounds=1)
-    chosen = Candidate(fit=density, score=50.0, gain=50.0, explained=1.0)
-    verdict = Verdict(
-        kind="cannot_distinguish", problem=problem, null_model=null_model, ranking=(chosen,), chosen=(chosen,) * 2
-    )
+    verdict = weighed(problem, [effect("density")], null_model, [density], report=lambda line: None)
+    verdict = dataclasses.replace(verdict, kind="cannot_distinguish", chosen=verdict.ranking * 2)
     found = Explanation(
         problem=problem,
         discretization=DiscretizationError(edges=(0.01,), walls=(2,)),

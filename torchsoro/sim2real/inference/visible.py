@@ -66,11 +66,13 @@ def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, name
 
     Returns:
         Factors, for "noise" (quieter markers), "twin" (a smaller error of the twin), "trials" (more of them), and
-        "motion" (a larger one, as of a larger load).
+        "motion" (a larger one, as of a larger load); none where such a change is visible as it is.
     """
     wanted = max(MATTERS * data.size, VISIBLE * data.noise)
     found: dict[str, float] = {}
     now = limit(data, null, responses, kappa, names)
+    if now <= wanted:
+        return {}
     for factor in FACTORS:
         numerics = dataclasses.replace(null.near.numerics, amplitude=null.near.numerics.amplitude / factor)
         finer = dataclasses.replace(null, near=dataclasses.replace(null.near, numerics=numerics))
