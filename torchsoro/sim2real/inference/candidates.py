@@ -33,6 +33,7 @@ from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
+FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
 WEAK = 0.1  # strength of a response, over that of the weakest probe point: it is linear there
 
@@ -65,7 +66,7 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
             priors.append(Prior(math.inf, low=low[k], high=high[k]))
     moving = [p for p, h in zip(priors, held, strict=True) if not h]
     beliefs = int((~held[: len(problem.common)]).sum())
-    faults = [Prior(float(d), freedom=FREEDOM) for d in problem.observation.deviations]
+    faults = [Prior(d, freedom=FREEDOM, low=-FAR * d, high=FAR * d) for d in map(float, problem.observation.deviations)]
     return Model(
         effects=tuple(e.name for e in effects),
         priors=(*moving, *faults),

@@ -40,6 +40,11 @@ class Candidate:
     probability: float
     size: float
 
+    @property
+    def name(self) -> str:
+        """Of its effects, in the order of the alphabet."""
+        return self.posterior.near.model.name
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Verdict:
@@ -138,7 +143,7 @@ def weighed(
         )
         for c in found.candidates
     ]
-    by_name = {c.fit.name: c for c in ranking}
+    by_name = {c.name: c for c in ranking}
     for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1]):
         report(f"{name}: probability {probability:.3g}" + (f", {tell(by_name[name].fit)}" if name in by_name else ""))
     verdict = Verdict(

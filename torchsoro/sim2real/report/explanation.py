@@ -143,7 +143,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "probabilities": c.probabilities,
         "ranking": [
             {
-                "name": x.fit.name,
+                "name": x.name,
                 "probability": x.probability,
                 "ln_evidence": x.posterior.ln_evidence,
                 "change_m": x.size,

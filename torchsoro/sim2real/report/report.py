@@ -149,7 +149,7 @@ def _considered(page: Document, e: Explanation) -> None:
     )
     rows = [
         {
-            "effect": effect_words(x.fit.name),
+            "effect": effect_words(x.name),
             "changes": " and ".join(effect.affected_quantity for effect in x.fit.effects),
             "probability [%]": 100 * x.probability,
             "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
