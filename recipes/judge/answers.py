@@ -31,6 +31,8 @@ class Scored:
         place_error: The same of the nearest place that is told, whatever it is a place of.
         parameter_errors: Relative errors of the numbers that truth and answer share.
         covered: Whether the interval of each holds the truth.
+        likely: What the answer holds for most probable, "nothing" and "unknown" among it; empty without probabilities.
+        probability: Of that.
         told_ratio: Held-out error after over before, as the answer states it.
         sealed_ratio: The same for the sealed trial, if the answer predicted it.
         seconds: That the answer took.
@@ -49,6 +51,8 @@ class Scored:
     place_error: float | None = None
     parameter_errors: tuple[float, ...] = ()
     covered: tuple[bool, ...] = ()
+    likely: str = ""
+    probability: float = 0.0
     told_ratio: float | None = None
     sealed_ratio: float | None = None
     seconds: float = 0.0
@@ -151,6 +155,8 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
                 if isinstance(number, Mapping) and number.get("low") is not None and number.get("high") is not None:
                     covered.append(bool(number["low"] <= real <= number["high"]))
     cost = answer.get("cost") or {}
+    probabilities = answer.get("probabilities") or {"": 0.0}
+    likely = max(probabilities, key=lambda name: probabilities[name])
     return Scored(
         **common,
         verdict=verdict,
@@ -161,6 +167,8 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
         place_error=min((math.dist(p, s) for p in places for s in sites), default=None),
         parameter_errors=tuple(errors),
         covered=tuple(covered),
+        likely=ours(likely),
+        probability=float(probabilities[likely]),
         told_ratio=_told(answer),
         sealed_ratio=_sealed(truth, folder / truth["case"], batch),
         seconds=float(answer.get("judge_seconds", cost.get("seconds", 0.0)) or 0.0),

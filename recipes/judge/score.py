@@ -26,6 +26,8 @@ from scipy.stats import beta
 
 NAMED = ("explained",)
 SETS = ("explained", "cannot_distinguish")
+SILENT = ("nothing_missing", "cannot_tell")
+MUTE = ("failed", "missing")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,10 +88,15 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
     told = [c.told_ratio for c in strong if c.verdict in SETS and c.told_ratio is not None]
     sealed = [c.sealed_ratio for c in strong if c.verdict in SETS and c.sealed_ratio is not None]
     sizes = [len(c.set) for c in spoke]
+    sure = [c for c in cases if c.likely]
+
+    def alarm(c: Scored) -> bool:
+        return c.verdict not in SILENT
+
     return {
-        "false alarms, nulls and decoys (<= 10 %)": str(rate(quiet, lambda c: c.verdict != "nothing_missing")),
-        "  nulls alone": str(rate([c for c in quiet if c.kind == "null"], lambda c: c.verdict != "nothing_missing")),
-        "  decoys alone": str(rate([c for c in quiet if c.kind == "decoy"], lambda c: c.verdict != "nothing_missing")),
+        "false alarms, nulls and decoys (<= 10 %)": str(rate(quiet, alarm)),
+        "  nulls alone": str(rate([c for c in quiet if c.kind == "null"], alarm)),
+        "  decoys alone": str(rate([c for c in quiet if c.kind == "decoy"], alarm)),
         "right name when it commits, strong (>= 80 %)": str(rate(committed, lambda c: c.names == c.truth)),
         "commits to one name, strong (>= 50 %)": str(Rate(hits=len(committed), of=len(strong))),
         "truth inside the reported set (>= 90 %)": str(rate(spoke, lambda c: c.truth[0] in c.set)),
@@ -110,11 +117,21 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
         "pairs: one name right": str(rate(pairs, lambda c: any(n in c.names for n in c.truth))),
         "  both right": str(rate(pairs, lambda c: set(c.truth) <= set(c.names))),
         "fainter than the threshold: nothing, or the truth": str(
-            rate(faint, lambda c: c.verdict == "nothing_missing" or c.truth[0] in c.set)
+            rate(faint, lambda c: c.verdict in SILENT or c.truth[0] in c.set)
         ),
-        "failed to answer": str(rate(cases, lambda c: c.verdict in ("failed", "missing"))),
+        "cannot tell": str(rate(cases, lambda c: c.verdict == "cannot_tell")),
+        "most probable, as told, is the truth": str(rate(sure, lambda c: c.likely in truths(c))),
+        "  mean probability that is told of it": f"{np.mean([c.probability for c in sure]):.2f}" if sure else "no case",
+        "failed to answer": str(rate(cases, lambda c: c.verdict in MUTE)),
         "seconds for an answer": _median([c.seconds for c in cases if c.seconds]),
     }
+
+
+def truths(c: Scored) -> tuple[str, ...]:
+    """Names of the truth in the words of probabilities."""
+    if c.kind == "outside":
+        return ("unknown",)
+    return (" + ".join(sorted(c.truth)),) if c.truth else ("nothing",)
 
 
 def over_strength(cases: Sequence[Scored]) -> list[str]:
@@ -125,7 +142,7 @@ def over_strength(cases: Sequence[Scored]) -> list[str]:
     for low, high in itertools.pairwise(edges):
         here = [c for c in single if low <= c.strength < high]
         if here:
-            seen = rate(here, lambda c: c.verdict not in ("nothing_missing", "failed", "missing"))
+            seen = rate(here, lambda c: c.verdict not in (*SILENT, *MUTE))
             named = rate(here, lambda c: c.verdict in NAMED and c.names == c.truth)
             inside = rate(here, lambda c: c.truth[0] in c.set)
             lines.append(f"{low:>5g} to {high:<5g} seen {seen}   named {named}   in the set {inside}")
@@ -135,7 +152,7 @@ def over_strength(cases: Sequence[Scored]) -> list[str]:
 def half_seen(cases: Sequence[Scored]) -> float:
     """Strength at which half of the single effects are seen, from a logistic curve; not a number without enough."""
     single = [c for c in cases if c.kind == "effect" and c.strength > 0]
-    y = np.array([c.verdict not in ("nothing_missing", "failed", "missing") for c in single], float)
+    y = np.array([c.verdict not in (*SILENT, *MUTE) for c in single], float)
     if len(y) < 10 or y.min() == y.max():
         return math.nan
     x = np.log([c.strength for c in single])
