@@ -70,7 +70,8 @@ def test_a_fitted_resin_bounces_the_less_the_more_elements_it_has(monkeypatch, t
 @pytest.mark.filterwarnings("default")
 def test_an_effect_of_ones_own_is_found_among_those_of_the_package(monkeypatch, tmp_path):
     said = (
-        "print(first.ranking[0].fit.name, first.ranking[0].score, second.kind, second.chosen[0].score, fit.name, value)"
+        "one, other = (v.ranking[0] for v in (first, second))\n"
+        "print(one.name, one.posterior.ln_evidence, second.kind, other.posterior.ln_evidence, fit.name, value)"
     )
     notebook = executed("03_explain_a_recording.ipynb", said, monkeypatch, tmp_path)
     nearest, score, kind, higher, name, value = notebook.cells[-1].outputs[-1].text.split()
