@@ -378,6 +378,20 @@ def test_variations_in_a_batch_equal_single_simulations(trial):
             np.testing.assert_allclose(part.position[18 + row], part.position[row], atol=1e-6)
 
 
+def test_pressures_of_many_variations_are_those_of_their_own_lanes(trial):
+    """Stiffer ones take shorter steps, so that lanes are in another order than variations, and in two groups."""
+    t = hollow(trial, duration=0.02)
+    twin = Twin(t.setup, edge=EDGE)
+    gain, modulus = (next(e for e in library() if e.name == name) for name in ("pressure_loss", "modulus"))
+    values = torch.linspace(-0.5, 0.5, 18, dtype=torch.float64)[:, None]
+    found = simulate(twin, [modulus(gain(twin.scenario(t), values, twin), values, twin)])[0]
+    for k in (0, 9, 17):
+        row = values[k : k + 1]
+        alone = simulate(twin, [modulus(gain(twin.scenario(t), row, twin), row, twin)])[0]
+        assert np.ptp(alone.position) > 1e-3
+        np.testing.assert_allclose(found.position[k], alone.position[0], atol=2e-6)
+
+
 def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
     twin = Twin(trial.setup, edge=EDGE)
     s = twin.scenario(trial)

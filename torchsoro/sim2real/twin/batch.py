@@ -198,8 +198,12 @@ class _Group:
         """Supply [K, chambers, steps + 1], or what is the same for all."""
         supplies = {i: self.scenarios[i].pressure for i, _ in self.lanes}
         first = supplies[self.lanes[0][0]]
-        if first is None or all(p is first for p in supplies.values()):
-            return first
+        if first is None:
+            return None
+        if all(p is first for p in supplies.values()):
+            own = first.pressure
+            which = [b if len(own) > 1 else 0 for _, b in self.lanes]
+            return first if own.ndim < 3 else Waveform(time=first.time, pressure=own[which])
         time = torch.arange(round(samples * SAMPLE / dt) + 1, dtype=torch.float64) * dt
         seen = {i: torch.atleast_2d(p.at(time.to(p.time))) for i, p in supplies.items() if p is not None}
         rows = [seen[i][b if len(seen[i]) > 1 else 0] if seen[i].ndim > 2 else seen[i] for i, b in self.lanes]
