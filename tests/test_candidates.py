@@ -68,6 +68,9 @@ def test_priors_are_those_of_quantities(weighed):
     assert mass.own == (1, 2, 3, 4)
     assert model_of(problem, (effect("tether"),)).simpler == ("attached_mass",)
     assert model_of(problem, (effect("modulus"),)).own == (0,)  # the belief is held
+    assert model_of(problem, (effect("modulus"),)).released == (0,)
+    assert model_of(problem, (effect("density"), effect("modulus"))).released == (1,)
+    assert model_of(problem, (effect("density"),)).released == ()
     shape = model_of(problem, (effect("viscoelastic"),)).priors[2]
     assert math.isinf(shape.scale)
     assert (shape.low, shape.high) == (-9.0, 1.5)

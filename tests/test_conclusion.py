@@ -75,6 +75,16 @@ def test_a_difference_that_a_measurement_error_makes_is_no_error_of_the_twin():
         assert kept == pytest.approx(whole)
 
 
+def test_a_modulus_takes_up_the_same_error_of_the_twin_as_a_belief_and_as_an_effect():
+    data, _, drag = recorded(0.0, 3)
+    difference = tuple(0.2 * J[..., 0] for J in drag.slopes)
+    belief, effect = (
+        dataclasses.replace(drag, model=dataclasses.replace(drag.model, own=own, released=own)) for own in ((), (0,))
+    )
+    for one, other in zip(cleared(data, belief, difference), cleared(data, effect, difference), strict=True):
+        assert one == pytest.approx(other)
+
+
 # Conclusions ---------------------------------------------------------------------------------------------------------
 
 

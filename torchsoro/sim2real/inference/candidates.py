@@ -57,7 +57,10 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
     held = held_of(problem, effects)
     priors = [Prior(TOLERANCE) for _ in problem.common]
     low, high = problem.bounds(effects)
+    released: list[int] = []
     for effect in effects:
+        if any(isinstance(effect, type(one)) for one, _ in problem.common):
+            released += range(len(priors), len(priors) + len(effect.quantities))
         for i, q in enumerate(effect.quantities):
             shape = i > 0 and q.least < 0 and not effect.joint
             width = math.inf if shape else STRENGTH
@@ -73,6 +76,7 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
         own=tuple(range(beliefs, len(moving))),
         simpler=simpler_of(problem, effects),
         beliefs=beliefs,
+        released=tuple(k - (len(held) - len(moving)) for k in released),
     )
 
 

@@ -162,8 +162,9 @@ class Weighing:
         for name, modes in groups.items():
             pair = -math.log(self.names) if len(modes[0].near.model.effects) > 1 else 0.0
             ln_p[name] = share + pair + float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
-        whole = float(np.logaddexp.reduce(list(ln_p.values())))
-        probabilities = {name: math.exp(value - whole) for name, value in ln_p.items()}
+        most = max(ln_p.values())
+        whole = sum(math.exp(value - most) for value in ln_p.values())
+        probabilities = {name: math.exp(value - most) / whole for name, value in ln_p.items()}
         found = [
             Candidate(
                 modes=tuple(modes),

@@ -129,6 +129,7 @@ class Model:
         own: Numbers of the unknowns that belong to the effects.
         simpler: Names of which this one is an extension, as a tether is of a mass, or a pair of its members.
         beliefs: Number of the first unknowns, which are beliefs over their tolerances.
+        released: Numbers of the unknowns of effects that are beliefs without their tolerances.
     """
 
     effects: tuple[str, ...]
@@ -136,6 +137,7 @@ class Model:
     own: tuple[int, ...] = ()
     simpler: tuple[str, ...] = ()
     beliefs: int = 0
+    released: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:

@@ -84,7 +84,9 @@ def by_spread(data: Data, near: Linearised, variants: Sequence[Motions]) -> Line
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
     """What is left of differences between motions once beliefs and measurement errors are fitted to them."""
-    free = [k for k in range(len(near.at)) if k not in near.model.own]
+    # A modulus takes up the same whether it is a belief or an effect.
+    kept = set(near.model.own) - set(near.model.released)
+    free = [k for k in range(len(near.at)) if k not in kept]
     model = Model(effects=(), priors=tuple(near.model.priors[k] for k in free))
     still = Linearised(
         model=model,
