@@ -10,6 +10,7 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from setups import CLAMP, marker, material
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
@@ -106,6 +107,18 @@ def test_a_body_that_bounces_at_a_coarse_rate_gives_no_finding(folder):
         return x
 
     assert not findings(folder, Recording(time=time, position=drop(swing().position)))
+
+
+@hypothesis.settings(max_examples=25, deadline=None)
+@hypothesis.given(seed=st.integers(0, 10**6), turn=st.tuples(*[st.floats(-0.35, 0.35)] * 3))
+def test_a_body_that_begins_tilted_gives_no_finding(folder, seed, turn):
+    middle = np.array([0.04, 0.01, 0.012])
+    tilt = Rotation.from_rotvec(turn)
+
+    def turned(x):
+        return tilt.apply((x - middle).reshape(-1, 3)).reshape(x.shape) + middle
+
+    assert not findings(folder, changed(swing(seed), turned))
 
 
 # The frame ----------------------------------------------------------------------------------------------------------
