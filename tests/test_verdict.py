@@ -15,7 +15,8 @@ from torchsoro.sim2real.inference.search import ENDS, _unconstrained, distinct
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
 from torchsoro.sim2real.report.explanation import Explanation, as_json
-from torchsoro.sim2real.report.sentences import evidence, probability, verdict_sentence
+from torchsoro.sim2real.report.sentences import evidence, verdict_sentence
+from torchsoro.sim2real.report.words import probability
 
 
 def quiet(line: str) -> None:

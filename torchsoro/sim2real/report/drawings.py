@@ -15,6 +15,7 @@ from torchsoro.sim2real.inference.force_map import ForceMap
 from torchsoro.sim2real.inference.heldout import Prediction
 from torchsoro.sim2real.inference.isolability import Isolability
 from torchsoro.sim2real.inference.phases import DEPARTURE, Mismatch, together
+from torchsoro.sim2real.report.words import probability
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
 PLACE, BODY = "#a3154a", "#52606d"
@@ -228,9 +229,9 @@ def draw_probabilities(found: Mapping[str, float]) -> Figure:
     figure = Figure(figsize=(6.5, 0.6 + 0.28 * len(leading)), layout="constrained")
     panel: Axes = figure.subplots()
     bars = panel.barh([name for name, _ in leading], [100 * p for _, p in leading], color=EXPLAINED)
-    panel.bar_label(bars, labels=[f"{100 * p:.3g} %" for _, p in leading], padding=3, fontsize=8)
+    panel.bar_label(bars, labels=[probability(p) for _, p in leading], padding=3, fontsize=8)
     panel.invert_yaxis()
-    panel.set_xlim(0, 115)
+    panel.set_xlim(0, 125)
     panel.set_xlabel("probability [%]", fontsize=8)
     panel.tick_params(labelsize=8)
     return figure

@@ -70,18 +70,12 @@ def told(name: str) -> str:
     return {NOTHING: "nothing", UNKNOWN: "none of the known effects"}.get(name) or words.effect_words(name)
 
 
-def probability(value: float) -> str:
-    """In percent; of what is nearly sure or nearly excluded, on which side of that it is."""
-    if value > 0.999:
-        return "above 99.9 %"
-    return f"{100 * value:.1f} %" if value >= 0.001 else "below 0.1 %"
-
-
 def _probable(e: Explanation) -> str:
     """Posterior probabilities of the set, and what the best leaves."""
     c = e.verdict.conclusion
     leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.chosen))]
-    sentence = "Probabilities of what is missing: " + ", ".join(f"{told(n)} {probability(p)}" for n, p in leading) + "."
+    shares = ", ".join(f"{told(name)} {words.probability(p)}" for name, p in leading)
+    sentence = f"Probabilities of what is missing: {shares}."
     left = e.verdict.posterior.unexplained
     if left:
         sentence += f" {100 * left:.0f} % of the motion are left unexplained."

@@ -172,3 +172,10 @@ def error_words(name: str) -> tuple[str, str]:
 def error_number(value: float, unit: str) -> str:
     """A measurement error with its unit; a relative one in percent."""
     return f"{digits(100 * value)} %" if unit == "%" else with_unit(value, unit)
+
+
+def probability(value: float) -> str:
+    """In percent; of what is nearly sure or nearly excluded, on which side of that it is."""
+    if value > 0.999:
+        return "above 99.9 %"
+    return f"{100 * value:.1f} %" if value >= 0.001 else "below 0.1 %"
