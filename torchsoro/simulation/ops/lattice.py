@@ -124,7 +124,7 @@ class Faces:
         """Area of the nodes on the face that faces planes with normals [..., 3] most [..., nodes] m2."""
         axis = normals.abs().argmax(-1)
         upper = normals.gather(-1, axis.unsqueeze(-1)).squeeze(-1) < 0
-        return self.ends.to(normals)[axis, upper.long()]
+        return self.ends.to(normals.device)[axis, upper.long()]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -284,7 +284,7 @@ class Lattice:
     def facing(self, normals: Tensor) -> Tensor:
         """Area of the nodes across the axis that planes with normals [..., 3] face most [..., nodes] m2."""
         if self.faces is not None:
-            return self.faces.facing(normals)
+            return self.faces.facing(normals).to(normals)
         return self.on("_areas", normals)[normals.abs().argmax(-1)]
 
     @cached_property
