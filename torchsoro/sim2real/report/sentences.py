@@ -51,7 +51,7 @@ def evidence(e: Explanation) -> list[str]:
             f"as stated is {1e3 * before:.2f} mm."
         )
     if v.kind == "unknown_physics":
-        if v.ranking and v.ranking[0].posterior.ln_evidence > v.conclusion.nothing.ln_evidence:
+        if v.ranking and v.ranking[0].posterior.unexplained < v.posterior.unexplained:
             left = 1e3 * v.ranking[0].posterior.unexplained * v.conclusion.motion
             closest = candidate_words(v.ranking[0], e.problem)
             found.append(f"Closest of the known effects: {closest}; it leaves {left:.2g} mm unexplained.")
