@@ -163,7 +163,7 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     problem = verdict.problem
     best = verdict.best
     following = []
-    if verdict.kind == "cannot_distinguish":
+    if len(verdict.chosen) > 1:  # beside one name the set may hold what is unknown
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
     everything, before, after = shown(problem, best, trials, kept, progress.note)

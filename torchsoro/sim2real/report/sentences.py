@@ -33,6 +33,8 @@ def verdict_sentence(e: Explanation) -> str:
     if v.kind == "cannot_tell":
         return "It cannot be told from these recordings whether something is missing from the setup."
     parts = "; ".join(candidate_words(c, e.problem) for c in v.chosen)
+    if v.kind == "cannot_distinguish" and len(v.chosen) == 1:
+        return f"The difference is explained by {parts}; or by none of the known effects: the recordings cannot tell."
     if v.kind == "cannot_distinguish":
         return f"The difference is explained by one of these, and the recordings cannot tell by which: {parts}."
     return f"The difference is explained by {parts}."
