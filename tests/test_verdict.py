@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.search import ENDS, _unconstrained, distinct
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
+from torchsoro.sim2real.report import sentences
 from torchsoro.sim2real.report.explanation import Explanation, as_json
 from torchsoro.sim2real.report.sentences import evidence, verdict_sentence
 from torchsoro.sim2real.report.words import probability
@@ -122,3 +124,11 @@ def test_probabilities_are_told_in_percent_and_never_as_certain():
         "42.0 %",
         "below 0.1 %",
     ]
+
+
+def test_a_set_of_one_name_and_what_is_unknown_says_so(monkeypatch):
+    monkeypatch.setattr(sentences, "candidate_words", lambda candidate, problem: candidate)
+    both = SimpleNamespace(verdict=SimpleNamespace(kind="cannot_distinguish", chosen=("a lag", "a leak")), problem=None)
+    one = SimpleNamespace(verdict=SimpleNamespace(kind="cannot_distinguish", chosen=("a lag",)), problem=None)
+    assert "a lag; a leak" in sentences.verdict_sentence(both)
+    assert "none of the known effects" in sentences.verdict_sentence(one)
