@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from threadpoolctl import threadpool_limits
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.data.recording import write_table
@@ -108,6 +109,7 @@ def shown(
     return asked, before, after
 
 
+@threadpool_limits.wrap(limits=1)  # products of small matrices: threads would wait for each other, and round otherwise
 def explain(options: Options) -> Explanation:
     """Explain an experiment, and write report.html, explanation.json and model.toml.
 
