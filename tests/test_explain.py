@@ -26,6 +26,7 @@ from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, fi
 from torchsoro.sim2real.inference.search import _simpler
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
+from torchsoro.sim2real.report.words import digits
 from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
@@ -334,6 +335,19 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
         r'<p class="lead">The difference is explained by drag [^:]*: [^:]* \d+ kg/m³ \(90 %: \d+ to \d+ kg/m³', page
     )
     assert page.count("data:image/png") == 6
+    # The first screen has the numbers of the JSON.
+    better, worst = answer["improvement"], answer["worst"]
+    large = [f"{digits(1e3 * better[key])} mm" for key in ("believed_m", "explained_m", "floor_m")]
+    assert re.findall(r"<b>([^<]*)</b>", page) == large and not better["heldout"]
+    assert better["explained_m"] < 0.5 * better["believed_m"]
+    noise = answer["noise"]
+    floor = np.sqrt(3) * np.hypot(noise["standard_deviation_m"], noise["simulation_m"])
+    assert better["floor_m"] == pytest.approx(floor)
+    for key in ("believed_m", "explained_m"):
+        squares = [error["all"] ** 2 for error in answer[f"error_{'after' if key[0] == 'e' else 'before'}"].values()]
+        assert better[key] == pytest.approx(np.sqrt(np.mean(squares)))
+    shown = next(t.recording for t in recorded.trials if t.name == worst["trial"])
+    assert worst["time_s"] in shown.time and worst["believed_m"] > max(answer["error_before"][worst["trial"]].values())
     folder = tmp_path / "new"
     folder.mkdir()
     (folder / "trial.toml").write_text("duration = 0.05\n[start]\nvelocity = [0.0, 0.0, 0.2]\n")

@@ -27,7 +27,6 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}  # [m]; a f
 SAMPLES = 400  # points of a surface at which its thickness is measured
 THIN = 0.1  # share of them that may be thinner than a lattice spacing: at sharp edges every body is
 BESIDE = 0.75  # beyond the wall's thickness [spacings], so that a layer covers edges and corners, too
-SHARP = 0.5  # rad between two triangles, from which on their edge is drawn
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -67,12 +66,6 @@ class Surface:
                 if 0 < share < 1 and area[mine].sum() > WIDE * np.prod(self.size) / length:
                     found[axis].append(float(at[mine].mean()))
         return found
-
-    @functools.cached_property
-    def edges(self) -> np.ndarray:
-        """Sharp edges, for pictures [E, 2, 3] m."""
-        sharp = self.mesh.face_adjacency_angles > SHARP
-        return np.asarray(self.mesh.vertices)[self.mesh.face_adjacency_edges[sharp]]
 
     def filled(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Which points of a lattice lie inside, bool [X, Y, Z]: those with an odd number of surfaces below them.

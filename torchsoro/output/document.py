@@ -10,10 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+from jinja2.utils import htmlsafe_json_dumps
+from markupsafe import Markup
 from matplotlib.figure import Figure
+from PIL import Image
 
+from torchsoro.output.slider import SCRIPT
 from torchsoro.storage import atomic_write
 
+TONES = ("first", "second", "third")  # colours of numbers and bars
+DPI = 130  # of a figure's picture
+COLORS = 64  # of a figure's picture, which makes its file a third as large
 LONG = 40  # characters of a cell, above which its column is kept wide enough for whole phrases
 
 _TEMPLATES = jinja2.Environment(
@@ -36,6 +43,7 @@ class Document:
     def __init__(self, title: str, lead: str) -> None:
         self._title, self._lead = title, lead
         self._parts: list[dict[str, Any]] = []
+        self._script = ""
 
     def section(self, heading: str) -> None:
         """Begin a section."""
@@ -49,6 +57,32 @@ class Document:
         """A list of sentences; nothing if there is none."""
         if lines:
             self._add("points", lines=list(lines))
+
+    def numbers(self, rows: Sequence[tuple[str, str]]) -> None:
+        """Large numbers beside each other, up to three: each as it is written, and what it is of."""
+        cells = [{"value": value, "name": name, "tone": tone} for (value, name), tone in zip(rows, TONES, strict=False)]
+        self._add("numbers", rows=cells)
+
+    def bars(self, rows: Sequence[tuple[str, float, str, int]], caption: str, *, longest: float = 0.0) -> None:
+        """Bars below each other; two such blocks that follow each other stand side by side.
+
+        Args:
+            rows: Name (none if it is that of the bar above), length, the same as it is written, and number of the
+                colour, 0 to 2.
+            caption: Above.
+            longest: Length of the whole width; that of the longest bar if 0.
+
+        Raises:
+            ValueError: without rows.
+        """
+        if not rows:
+            raise ValueError("rows: wanted at least one")
+        whole = longest or max(length for _, length, _, _ in rows) or 1.0
+        cells = [
+            {"name": name, "value": value, "tone": TONES[tone], "length": f"{max(100 * length / whole, 0.4):.1f}"}
+            for name, length, value, tone in rows
+        ]
+        self._add("bars", rows=cells, caption=caption)
 
     def code(self, lines: str) -> None:
         """Lines as they are, such as a command or a file."""
@@ -76,17 +110,31 @@ class Document:
     def figure(self, figure: Figure, caption: str, *, folded: str = "") -> None:
         """A Matplotlib figure, as a picture inside the page; ``folded`` as in :meth:`table`."""
         stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=150)
-        self.picture(stream.getvalue(), caption, folded=folded)
+        figure.savefig(stream, format="png", dpi=DPI)
+        small = io.BytesIO()
+        Image.open(stream).convert("RGB").quantize(COLORS, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
+        self.picture(small.getvalue(), caption, folded=folded)
 
     def picture(self, png: bytes, caption: str, *, folded: str = "") -> None:
         """A PNG, inside the page; ``folded`` as in :meth:`table`."""
         self._add("picture", data=base64.b64encode(png).decode("ascii"), caption=caption, folded=folded)
 
+    def slider(self, about: Mapping[str, Any], caption: str) -> None:
+        """What moves, with a slider over time; nothing is seen of it where scripts do not run, or on paper.
+
+        Args:
+            about: Of :func:`torchsoro.output.slider.packed`.
+            caption: Below.
+        """
+        self._script = SCRIPT.read_text(encoding="utf-8")
+        self._add("slider", about=htmlsafe_json_dumps(about, separators=(",", ":")), caption=caption)
+
     def save(self, path: Path) -> Path:
         """Write the page; it is there whole or not at all."""
         template = _TEMPLATES.get_template("document.html")
-        page = template.render(title=self._title, lead=self._lead, parts=self._parts, long=LONG)
+        page = template.render(
+            title=self._title, lead=self._lead, parts=self._parts, long=LONG, script=Markup(self._script)
+        )
         with atomic_write(path) as file:
             file.write(page.encode())
         return path

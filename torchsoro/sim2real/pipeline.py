@@ -30,7 +30,9 @@ from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.inputs import Inputs, check_numbers, read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
+from torchsoro.sim2real.report.body import body_motion
 from torchsoro.sim2real.report.explanation import Explanation
+from torchsoro.sim2real.report.improvement import worst_of
 from torchsoro.sim2real.report.report import write
 from torchsoro.sim2real.report.sentences import lead
 from torchsoro.sim2real.twin.batch import THREADS
@@ -179,13 +181,17 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
             forces = force_map(known, best)
         except ValueError as error:  # the verdict is worth its report without it
             progress.note(f"The report shows no map of forces: {error}")
+    drawn = at_clocks_of(problem, best, everything, before, after)
+    # The report shows the trial that is the furthest off.
+    k = int(np.argmax([p.total for p in before]))
+    worst = worst_of(k, everything[k], drawn[k], after[k].seen)
     found = Explanation(
         problem=problem,
         discretization=discretization,
         verdict=verdict,
         before=before,
         after=after,
-        drawn=tuple(at_clocks_of(problem, best, everything, before, after)),
+        drawn=tuple(drawn),
         heldout=tuple(t.name for t in kept),
         mismatches=tuple(mismatches(known, verdict.null_model, everything, after)),
         forces=forces,
@@ -193,5 +199,7 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         isolability=tells,
         following=tuple(following),
         hints=(*inputs.hints, *map(str, told)),
+        worst=worst,
+        body=body_motion(problem, best, everything[k], after[k].clock, worst),
     )
     return found, everything

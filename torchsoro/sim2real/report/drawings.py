@@ -1,32 +1,68 @@
-"""Pictures of an explanation: markers over time, mismatch over time and on the body, forces that would be needed."""
+"""Pictures of an explanation: markers over time, mismatch over time, the body, forces that would be needed."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.inference.force_map import ForceMap
-from torchsoro.sim2real.inference.heldout import Prediction
 from torchsoro.sim2real.inference.isolability import Isolability
 from torchsoro.sim2real.inference.phases import DEPARTURE, Mismatch, together
-from torchsoro.sim2real.report.words import probability
+from torchsoro.sim2real.report.body import BodyMotion
+from torchsoro.sim2real.report.improvement import Worst
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
-PLACE, BODY = "#a3154a", "#52606d"
-EDGES = 400  # of a body, that are drawn at most
+PLACE = "#a3154a"
+CLOSE = 0.15  # of a body's picture, up to which a distance in it is shown closer
 LEAST_RANGE = 0.15  # of the widest panel's range, that any panel shows
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
-BARS = 10  # of probabilities, that are drawn at most
 BANDS = ("#e9eef4", "#f8f4ea")  # of phases, in turn
 
 
-def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray) -> Figure:
+def _course(panel: Axes, time: np.ndarray, curves: np.ndarray, said: str) -> None:
+    """A coordinate as recorded, as believed and as explained [3, T] mm; ``said`` names the last."""
+    panel.plot(time, curves[1], "-", lw=1.2, color=NOMINAL, label="believed")
+    panel.plot(time, curves[2], "-", lw=1.6, color=EXPLAINED, label=said)
+    panel.plot(time, curves[0], ".", ms=2.5, color=RECORDED, label="recorded")
+
+
+def draw_worst(trial: Trial, believed: np.ndarray, explained: np.ndarray, worst: Worst, said: str) -> Figure:
+    """The coordinates of the marker that is the furthest off, with two simulations [T, M, A] m."""
+    recording = trial.recording
+    assert recording is not None
+    figure = Figure(figsize=(9, 2.5), layout="constrained")
+    count = len(recording.axes)
+    panels: Any = figure.subplots(1, count, squeeze=False)
+    curves = 1e3 * np.stack([recording.position, believed, explained])[:, :, worst.marker]
+    half = 0.54 * float(np.nanmax(np.nanmax(curves, (0, 1)) - np.nanmin(curves, (0, 1))))
+    for a, panel in enumerate(panels[0]):
+        _course(panel, recording.time, curves[..., a], said)
+        middle = float(np.nanmin(curves[..., a]) + np.nanmax(curves[..., a])) / 2
+        panel.set_ylim(middle - half, middle + half)  # all at one scale
+        panel.axvline(worst.time, color=PLACE, lw=1.0, ls="--", label="furthest off")
+        panel.set_title(f"{trial.setup.markers[worst.marker].name}, {'xyz'[recording.axes[a]]} [mm]", fontsize=9)
+        panel.set_xlabel("time [s]", fontsize=8)
+        panel.tick_params(labelsize=8)
+    figure.legend(
+        *panels[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8, frameon=False
+    )
+    return figure
+
+
+def _legend(figure: Figure, panel: Axes) -> None:
+    """Names of a panel's lines above all panels."""
+    names = panel.get_legend_handles_labels()
+    figure.legend(*names, loc="outside upper center", ncols=5, fontsize=8, frameon=False)
+
+
+def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray, said: str) -> Figure:
     """Each marker's recorded coordinates over time, with two simulations [T, M, A] m.
 
     No panel shows less than a share of the widest one's range, so that noise does not look like motion.
@@ -45,9 +81,7 @@ def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray) -> Fig
     half = 0.54 * np.maximum(top - low, LEAST_RANGE * float((top - low).max()))
     for m, a in np.ndindex(count, len(axes)):
         panel: Axes = panels[m, a]
-        panel.plot(recording.time, curves[1, :, m, a], "-", lw=1.2, color=NOMINAL, label="believed")
-        panel.plot(recording.time, curves[2, :, m, a], "-", lw=1.6, color=EXPLAINED, label="explained")
-        panel.plot(recording.time, curves[0, :, m, a], ".", ms=2.5, color=RECORDED, label="recorded")
+        _course(panel, recording.time, curves[:, :, m, a], said)
         middle = (low[m, a] + top[m, a]) / 2
         panel.set_ylim(middle - half[m, a], middle + half[m, a])
         panel.locator_params(axis="y", nbins=4)
@@ -62,8 +96,8 @@ def draw_trial(trial: Trial, believed: np.ndarray, explained: np.ndarray) -> Fig
     return figure
 
 
-def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after: str) -> Figure:
-    """Distance of each trial's simulations over time, phases as bands; ``after`` names the second line."""
+def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], said: str) -> Figure:
+    """Distance of each trial's simulations over time, phases as bands; ``said`` names the second line."""
     figure = Figure(figsize=(9, 0.4 + 2.1 * len(mismatches)), layout="constrained")
     panels: Any = figure.subplots(len(mismatches), 1, squeeze=False)
     for panel, m, trial in zip(panels[:, 0], mismatches, trials, strict=True):
@@ -82,7 +116,7 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after
                     color="0.35",
                     rotation=0 if wide > 0.014 * len(p.name) / 2 else 90,
                 )
-        for values, color, label in ((m.before, NOMINAL, "believed"), (m.after, EXPLAINED, after)):
+        for values, color, label in ((m.before, NOMINAL, "believed"), (m.after, EXPLAINED, said)):
             panel.plot(m.time, np.maximum(together(values), 0.1), color=color, lw=1.2, label=label)
         panel.axhline(DEPARTURE, color="0.5", lw=0.8, ls=":")
         if m.start is not None:
@@ -106,66 +140,93 @@ def draw_mismatch(mismatches: Sequence[Mismatch], trials: Sequence[Trial], after
 
 
 def draw_body(
+    body: BodyMotion,
     setup: Setup,
-    before: Sequence[Prediction],
-    after: Sequence[Prediction],
     places: Sequence[tuple[str, np.ndarray]],
     forces: ForceMap | None,
     said: str,
 ) -> Figure:
-    """Markers on the body in space, coloured by their distance from the recording, with places of effects and forces.
+    """The body when the recording is the furthest from what was believed, seen from a side, and the marker that is.
 
-    ``said`` is what the second picture shows.
+    Args:
+        body: Its motion.
+        setup: Of the trial.
+        places: Of effects, with their names.
+        forces: That would be needed.
+        said: What the second simulation is.
     """
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    at, low, size = (1e3 * np.array(v) for v in ([m.at for m in setup.markers], setup.origin, setup.size))
-    values = [1e3 * np.sqrt(np.mean([p.error**2 for p in all_], axis=0)) for all_ in (before, after)]
-    most = max(float(values[0].max()), float(values[1].max()), 1e-6)
-    panels, points = [], None
-    for k, title in enumerate(("believed", said)):
-        panel: Any = figure.add_subplot(1, 2, k + 1, projection="3d")
-        panels.append(panel)
-        panel.patch.set_visible(False)  # which would cover the other's label
-        for edge in _outline(setup):
-            panel.plot(*(1e3 * edge.T), color=BODY, lw=1.3)
-        for box in setup.clamps:
-            one, other = (np.clip(1e3 * np.array(corner), low, low + size) for corner in box)
-            ends = itertools.product(*zip(one, other, strict=True))
-            panel.scatter(*np.array(list(ends)).T, marker="s", s=14, color="0.3", depthshade=False)
-        points = panel.scatter(
-            *at.T, c=values[k], s=60, cmap="viridis_r", vmin=0, vmax=most, edgecolors="0.2", lw=0.6, depthshade=False
-        )
-        if len(at) <= 12:
-            for marker, place in zip(setup.markers, at, strict=True):
-                panel.text(*(place + 0.03 * size.max()), marker.name, fontsize=7)
-        panel.set_title(title, fontsize=9)
-        # A thin body would be a line at its true proportions.
-        panel.set_box_aspect(np.maximum(size, 0.25 * size.max()), zoom=0.85)  # its labels lie outside
-        panel.set(xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]")
-        panel.tick_params(labelsize=6)
-        panel.locator_params(nbins=4)
+    one, other = view = side_view(body, setup)
+    k, m = body.worst, body.marker
+    recorded, (believed, explained) = body.recorded[k], body.markers[:, k]
+    size = np.ptp(1e3 * np.concatenate([body.believed[k], body.explained[k]])[:, view], axis=0)
+    apart = 1e3 * float(np.linalg.norm((recorded[m] - believed[m])[list(view)]))
+    count = 1 if apart > CLOSE * size.max() else 2  # what is far off needs no closer look
+    high = np.clip(9 / (1.6 * (count - 1) + 1) * size[1] / size[0], 1.6, 4.2) + 1.0
+    figure = Figure(figsize=(9, high), layout="constrained")
+    panels: Any = figure.subplots(1, count, squeeze=False, width_ratios=(1.7, 1)[:count])
+    whole, close = panels[0, 0], panels[0, -1]
+    for panel in panels[0]:
+        for surface, color in ((body.believed, NOMINAL), (body.explained, EXPLAINED)):
+            polygons = 1e3 * surface[k][:, view][body.faces]
+            panel.add_collection(PolyCollection(polygons, facecolors=color, edgecolors="none", alpha=0.1))
+            panel.add_collection(PolyCollection(polygons, facecolors="none", edgecolors=color, lw=0.4, alpha=0.35))
+        for there, color, label in ((believed, NOMINAL, "believed"), (explained, EXPLAINED, said)):
+            ends = 1e3 * np.stack([recorded, there], 1)[..., view]
+            panel.add_collection(LineCollection(list(ends), colors=color, lw=1.0))
+            panel.plot(*(1e3 * there[:, view].T), "o", ms=5, mfc="white", mec=color, mew=1.4, label=label)
+        panel.plot(*(1e3 * recorded[:, view].T), "o", ms=4, color=RECORDED, label="recorded")
+        panel.set_aspect("equal")
+        panel.set_xlabel(f"{'xyz'[one]} [mm]", fontsize=8)
+        panel.tick_params(labelsize=8)
+    whole.autoscale_view()
+    whole.set_ylabel(f"{'xyz'[other]} [mm]", fontsize=8)
+    _surroundings(whole, setup, view)
     for name, place in places:
-        panels[1].scatter(*(1e3 * place), marker="x", s=90, color=PLACE, lw=2.5, depthshade=False, label=name)
+        whole.plot(*(1e3 * place[list(view)]), "x", ms=9, mew=2.4, color=PLACE, label=name)
     needed = [] if forces is None else forces.needed
     for n in needed[:3]:
-        arrow = 0.35 * size.max() * n.force / np.linalg.norm(needed[0].force)
-        label = f"{np.linalg.norm(n.force):.2g} N, trial {n.trial}"
-        panels[0].quiver(*(1e3 * n.place), *arrow, color=PLACE, lw=2, label=label)
-    for panel, shown in zip(panels, (needed, places), strict=True):
-        if shown:
-            panel.legend(fontsize=7, loc="upper left")
-    assert points is not None
-    figure.colorbar(points, ax=panels, shrink=0.7, label="distance [mm]")
+        arrow = 0.3 * max(setup.size) * n.force / np.linalg.norm(needed[0].force)
+        ends = 1e3 * np.stack([n.place, n.place + arrow])[:, view]
+        whole.annotate("", ends[1], ends[0], arrowprops={"arrowstyle": "-|>", "color": PLACE, "lw": 2})
+        whole.annotate(f"{np.linalg.norm(n.force):.2g} N, trial {n.trial}", ends[1], fontsize=7, color=PLACE)
+    whole.set_title(f"trial {body.trial} at {body.time[k]:.3g} s", fontsize=9)
+    if count > 1:
+        middle, half = 1e3 * (recorded[m] + believed[m])[list(view)] / 2, max(0.9 * apart, 0.02 * size.max())
+        close.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+        close.set_title(f"marker {setup.markers[m].name}", fontsize=9)
+    _legend(figure, whole)
     return figure
 
 
-def _outline(setup: Setup) -> np.ndarray:
-    """Edges of the body, or of its box where it has too many [E, 2, 3] m."""
-    if setup.surface is not None and len(setup.surface.edges) <= EDGES:
-        return setup.surface.edges
-    pairs = itertools.combinations(itertools.product((0, 1), repeat=3), 2)
-    ends = [pair for pair in pairs if np.abs(np.subtract(*pair)).sum() == 1]
-    return np.array(setup.origin) + np.array(setup.size) * np.array(ends)
+def side_view(body: BodyMotion, setup: Setup) -> tuple[int, int]:
+    """The axes across and up of a picture: without the one along which the worst marker is hardly off.
+
+    Of several, the one along which the body is shortest is left out, but none that planes are normal to.
+    """
+    off = np.abs(body.recorded - body.markers[0])[body.worst, body.marker]
+    off[[axis not in setup.axes for axis in range(3)]] = 0.0
+    size = np.array(setup.size)
+    for plane in setup.planes:
+        size[int(np.argmax(np.abs(plane.normal)))] = np.inf
+    hardly = off < max(0.3 * off.max(), 1.0001 * off.min(), 1e-12)
+    left = min(np.flatnonzero(hardly), key=lambda axis: size[axis])
+    one, other = (axis for axis in range(3) if axis != left)
+    return one, other
+
+
+def _surroundings(panel: Axes, setup: Setup, view: tuple[int, int]) -> None:
+    """Clamps and planes, as far as the panel reaches."""
+    across, up = panel.get_xlim(), panel.get_ylim()
+    low, size = np.array(setup.origin), np.array(setup.size)
+    for box in setup.clamps:
+        begin, end = (1e3 * np.clip(corner, low - 0.02 * size, low + 1.02 * size)[list(view)] for corner in box)
+        panel.add_patch(Rectangle(tuple(begin), *(end - begin), fc="0.75", ec="0.3", hatch="////", lw=0.8))
+    for plane in setup.planes:
+        normal = np.array(plane.normal)[list(view)]
+        if np.linalg.norm(normal) > 0.99 * np.linalg.norm(plane.normal):
+            x, y = (1e3 * plane.point[axis] for axis in view)
+            panel.axline((x, y), (x - normal[1], y + normal[0]), color="0.3", lw=1.5)
+    panel.set(xlim=across, ylim=up)
 
 
 def draw_forces(forces: ForceMap, setup: Setup) -> Figure:
@@ -220,18 +281,4 @@ def draw_cosines(found: Isolability) -> Figure:
     panel.set_xticks(range(count), names, rotation=90, fontsize=8)
     panel.set_yticks(range(count), names, fontsize=8)
     figure.colorbar(image, ax=panel, shrink=0.8)
-    return figure
-
-
-def draw_probabilities(found: Mapping[str, float]) -> Figure:
-    """Bars of posterior probabilities by name, the most probable first."""
-    leading = sorted(found.items(), key=lambda item: -item[1])[:BARS]
-    figure = Figure(figsize=(6.5, 0.6 + 0.28 * len(leading)), layout="constrained")
-    panel: Axes = figure.subplots()
-    bars = panel.barh([name for name, _ in leading], [100 * p for _, p in leading], color=EXPLAINED)
-    panel.bar_label(bars, labels=[probability(p) for _, p in leading], padding=3, fontsize=8)
-    panel.invert_yaxis()
-    panel.set_xlim(0, 125)
-    panel.set_xlabel("probability [%]", fontsize=8)
-    panel.tick_params(labelsize=8)
     return figure

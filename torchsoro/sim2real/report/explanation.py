@@ -9,7 +9,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import norm, truncnorm
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
@@ -20,6 +20,9 @@ from torchsoro.sim2real.inference.next_experiment import Proposal
 from torchsoro.sim2real.inference.phases import Mismatch
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import Verdict
+from torchsoro.sim2real.report.body import BodyMotion
+from torchsoro.sim2real.report.improvement import Improvement, Worst
+from torchsoro.sim2real.twin.scenario import Scenario
 
 LEVEL = 0.9  # probability that an interval is to hold the truth
 # Standard deviation of a place by the form of the model, over the body's size; as Hypothesis.model_form_deviation of a
@@ -46,6 +49,8 @@ class Explanation:
         mismatches: Of each trial, where and when the recording leaves the simulation.
         forces: That would explain the difference where no effect does.
         hints: What is likely to be a mistake in the data, a line each.
+        worst: Where and when a recording is the furthest from what was believed.
+        body: The body in that trial.
     """
 
     problem: FitProblem
@@ -61,6 +66,8 @@ class Explanation:
     mismatches: tuple[Mismatch, ...] = ()
     forces: ForceMap | None = None
     hints: tuple[str, ...] = ()
+    worst: Worst | None = None
+    body: BodyMotion | None = None
 
     @property
     def best(self) -> Fit:
@@ -69,8 +76,19 @@ class Explanation:
 
     @property
     def own_error(self) -> float:
-        """Root mean square over markers and axes of the simulation's own error, as it is corrected [m]."""
+        """Root mean square over markers and axes of the simulation's error that its correction leaves [m]."""
         return float(np.sqrt((self.verdict.posterior.near.numerics.amplitude**2).mean()))
+
+    @property
+    def improvement(self) -> Improvement | None:
+        """On trials that were left out, or where there is none on those of the fit; None without any."""
+        fitted = {b.trial: (b.total, a.total) for b, a in zip(self.before, self.after, strict=True)}
+        trials = self.verdict.heldout or fitted
+        if not trials:
+            return None
+        axes = len(self.problem.experiment.setup.axes)
+        floor = math.sqrt(axes) * math.hypot(self.problem.noise, self.own_error)
+        return Improvement(trials=trials, heldout=bool(self.verdict.heldout), floor=floor)
 
 
 def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, Any]]:
@@ -78,7 +96,8 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
 
     Intervals come from the covariance of the fit, widened by the model-form standard deviation, through the slopes of
     the reported quantities. Of a quantity that is the exponential of an unknown the interval is symmetric in its
-    logarithm; any other ends where its quantity does.
+    logarithm; any other holds the middle 90 % of a normal distribution, or of its part that is
+    possible.
 
     Args:
         fit: Of one effect or several.
@@ -99,8 +118,12 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
         parameters = {}
         for name, (value, unit) in reported.items():
             slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
-            half = wide * math.sqrt(max(float(slope @ whole @ slope), 0.0))
-            low, high = _interval(effect, name, value, half)
+            deviation = math.sqrt(max(float(slope @ whole @ slope), 0.0))
+            if name in effect.ratios and value > 0:
+                ratio = math.exp(min(wide * deviation / value, 50.0))
+                low, high = value / ratio, value * ratio
+            else:
+                low, high = _possible(value, deviation, _limits(effect, name, scenario))
             parameters[name] = {"value": value, "low": low, "high": high, "unit": unit}
         place = effect.place(values, problem.twin)
         within = wide * np.sqrt(np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2)
@@ -117,15 +140,29 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
     return rows
 
 
-def _interval(effect: Hypothesis, name: str, value: float, half: float) -> tuple[float, float]:
-    """The interval of a reported quantity, within what is possible."""
-    if name in effect.ratios and value > 0:
-        ratio = math.exp(min(half / value, 50.0))
-        return value / ratio, value * ratio
-    least = max([q.least * q.scale for q in effect.quantities if q.name == name], default=-math.inf)
-    if name in effect.nonnegative:
-        least = max(least, 0.0)
-    return max(value - half, least), value + half
+def _limits(effect: Hypothesis, name: str, scenario: Scenario) -> tuple[float, float]:
+    """Between which a reported quantity can be."""
+    ranges = {q.name: (q.least * q.scale, q.most * q.scale) for q in effect.quantities}
+    if len(ranges) == 1:  # of which what is reported is a monotone function
+        ((low, high),) = ranges.values()
+        one, other = (effect.reported(np.array([end]), scenario)[name][0] for end in (low, high))
+        return min(one, other), max(one, other)
+    low, high = ranges.get(name, (-math.inf, math.inf))
+    return max(low, 0.0) if name in effect.nonnegative else low, min(high, 1.0) if name == "fraction" else high
+
+
+def _possible(value: float, deviation: float, limits: tuple[float, float]) -> tuple[float, float]:
+    """The middle 90 % of a normal distribution, of its part within limits where it reaches beyond them."""
+    wide = float(norm.ppf((1 + LEVEL) / 2)) * deviation
+    if limits[0] <= value - wide and value + wide <= limits[1]:
+        return value - wide, value + wide
+    least, most = ((limit - value) / deviation for limit in limits)
+    low, high = truncnorm.ppf([(1 - LEVEL) / 2, (1 + LEVEL) / 2], least, most)
+    if low >= 0:  # the value is so near to a limit that the interval begins there
+        low, high = least, truncnorm.ppf(LEVEL, least, most)
+    elif high <= 0:
+        low, high = truncnorm.ppf(1 - LEVEL, least, most), most
+    return max(value + deviation * float(low), limits[0]), min(value + deviation * float(high), limits[1])
 
 
 def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -177,6 +214,8 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         },
         "error_before": errors(e.before),
         "error_after": errors(e.after),
+        "improvement": None if e.improvement is None else _improved(e.improvement),
+        "worst": None if e.worst is None else _apart(e.worst, e),
         "mismatch": {m.trial: _parted(m) for m in e.mismatches},
         "force_map": None if e.forces is None else _needed(e.forces),
         "heldout": [{"trial": name, "before": b, "after": a} for name, (b, a) in v.heldout.items()],
@@ -186,6 +225,28 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
         "version": version("torchsoro"),
         "settings": dict(settings),
+    }
+
+
+def _improved(found: Improvement) -> dict[str, Any]:
+    """The numbers of the first screen, as in explanation.json."""
+    return {
+        "heldout": found.heldout,
+        "trials": list(found.trials),
+        "believed_m": found.believed,
+        "explained_m": found.explained,
+        "floor_m": found.floor,
+    }
+
+
+def _apart(worst: Worst, e: Explanation) -> dict[str, Any]:
+    """Where and when a recording is the furthest from what was believed, as in explanation.json."""
+    return {
+        "trial": e.before[worst.trial].trial,
+        "marker": e.problem.experiment.setup.markers[worst.marker].name,
+        "time_s": worst.time,
+        "believed_m": worst.believed,
+        "explained_m": worst.explained,
     }
 
 

@@ -11,28 +11,42 @@ from typing import Any
 import numpy as np
 
 from torchsoro.output.document import Document
+from torchsoro.output.slider import Moving, packed
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.cosines import SCORE
 from torchsoro.sim2real.inference.isolability import SAME, Isolability
 from torchsoro.sim2real.report.drawings import (
+    EXPLAINED,
+    NOMINAL,
+    RECORDED,
     draw_body,
     draw_cosines,
     draw_forces,
     draw_mismatch,
-    draw_probabilities,
     draw_trial,
+    draw_worst,
+    side_view,
 )
 from torchsoro.sim2real.report.explanation import Explanation, as_json, effect_rows
 from torchsoro.sim2real.report.sentences import candidate_words, evidence, told, verdict_sentence
 from torchsoro.sim2real.report.words import (
+    digits,
     effect_words,
     error_number,
     error_words,
     interval,
+    millimetres,
+    probability,
     quantity_words,
     with_unit,
 )
 from torchsoro.storage import atomic_write
+
+BARS = 8  # on the first screen, at most
+LEAST_BARS, FAINT = 3, 0.01  # shown always; of the others, those that are at least as probable
+FAR = 0.03  # of the body's longest edge, from which on its motion is shown
+MARKERS = 6  # whose errors are in the table of trials, at most
+TRIALS = 6  # whose markers are all drawn, those that are the furthest off
 
 
 def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[str, Any]) -> None:
@@ -48,13 +62,15 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     with atomic_write(out / "explanation.json") as file:
         file.write((json.dumps(data, indent=2) + "\n").encode())
     page = Document(e.problem.experiment.setup.title or "Explanation", verdict_sentence(e))
+    _at_first(page, e, trials)
     page.points(evidence(e))
     if e.hints:
         page.section("Hints on the data")
         page.points(e.hints)
     _effects(page, e)
-    _trials(page, e, trials)
+    _body(page, e, trials)
     _mismatches(page, e, trials)
+    _trials(page, e, trials)
     if e.forces is not None:
         page.section("The force that would be needed")
         page.text(f"{e.forces} A force stands in for what is missing; it does not say what that is.")
@@ -70,6 +86,81 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
     page.save(out / "report.html")
 
 
+def _said(e: Explanation) -> str:
+    """What the second simulation is."""
+    return "explained" if e.verdict.chosen else "fitted without an effect"
+
+
+def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
+    """The first screen: three errors, probabilities, trials that were left out, and the worst marker over time."""
+    found, said = e.improvement, _said(e)
+    if found is not None:
+        kind = f"{'held-out' if found.heldout else 'fitted'} trials"
+        page.numbers(
+            [
+                (millimetres(found.believed), f"error as believed, {kind}"),
+                (millimetres(found.explained), f"error as {said}, {kind}"),
+                (millimetres(found.floor), "expected of noise and the simulation's own error, as corrected"),
+            ]
+        )
+    leading = sorted(e.verdict.conclusion.probabilities.items(), key=lambda item: -item[1])
+    shown = [(told(name), p) for k, (name, p) in enumerate(leading) if k < LEAST_BARS or p > FAINT][:BARS]
+    page.bars([(name, p, probability(p), 1) for name, p in shown], "Probability of what is missing", longest=1.0)
+    if found is not None:
+        worst = sorted(found.trials.items(), key=lambda item: -item[1][0])[:BARS]
+        rows = []
+        for name, (before, after) in worst:
+            rows += [
+                (f"trial {name}", before, f"{millimetres(before)} believed", 0),
+                ("", after, f"{millimetres(after)} {said.split()[0]}", 1),
+            ]
+        rows.append(("expected of noise and the simulation's own error", found.floor, millimetres(found.floor), 2))
+        page.bars(rows, f"Error of {kind}, root mean square over markers and time")
+    if e.worst is not None:
+        w = e.worst
+        trial, believed, explained = trials[w.trial], e.drawn[w.trial], e.after[w.trial].seen
+        page.figure(
+            draw_worst(trial, believed, explained, w, said),
+            f"Marker {trial.setup.markers[w.marker].name} in trial {trial.name}{_heldout(e, trial)}. Recording and "
+            f"belief are the furthest apart at {with_unit(w.time, 's')} (dashed): by {millimetres(w.believed)}; as "
+            f"{said}, they are {millimetres(w.explained)} apart.",
+        )
+
+
+def _heldout(e: Explanation, trial: Trial) -> str:
+    return ", not used for the fit" if trial.name in e.heldout else ""
+
+
+def _body(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
+    """The whole body at the worst moment, and over time where it moves far."""
+    body, said = e.body, _said(e)
+    if body is None or e.worst is None:
+        return
+    page.section("The body")
+    setup = trials[e.worst.trial].setup
+    places = [
+        (effect_words(row["name"]), np.array(row["location_m"]))
+        for c in e.verdict.chosen
+        for row in effect_rows(c.fit, 0.0, e.problem)
+        if row["location_m"] is not None
+    ]
+    page.figure(
+        draw_body(body, setup, places, e.forces, said),
+        f"The body where recording and belief are the furthest apart, to scale: as believed, and as {said}. Lines join "
+        "each recorded marker to where the simulations have it.",
+    )
+    if body.travel > FAR * max(setup.size):
+        one, other = side_view(body, setup)
+        azimuth = {(0, 2): -90.0, (1, 2): 0.0}.get((one, other), -60.0)
+        surfaces = (("believed", NOMINAL, body.believed), (said, EXPLAINED, body.explained))
+        moving = [Moving(name=name, color=color, places=places, faces=body.faces) for name, color, places in surfaces]
+        moving.append(Moving(name="recorded markers", color=RECORDED, places=body.recorded))
+        page.slider(
+            packed(body.time, moving, begin=body.worst, azimuth=azimuth),
+            f"Trial {body.trial}{_heldout(e, trials[e.worst.trial])}, over time; drag to turn.",
+        )
+
+
 def _effects(page: Document, e: Explanation) -> None:
     """Quantities of the effects that were chosen."""
     rows = [
@@ -77,7 +168,7 @@ def _effects(page: Document, e: Explanation) -> None:
             "effect": effect_words(row["name"]),
             "quantity": quantity_words(row["name"], name),
             "value": with_unit(p["value"], p["unit"], name),
-            "90 % interval": interval(p["low"], p["high"], p["unit"], name),
+            "90 % interval": interval(p["value"], p["low"], p["high"], p["unit"], name),
         }
         for c in e.verdict.chosen
         for row in effect_rows(c.fit, 0.0, e.problem)
@@ -89,77 +180,68 @@ def _effects(page: Document, e: Explanation) -> None:
 
 
 def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
-    """Markers over time; the trial that is the furthest off is open."""
-    page.section("Recorded, believed, explained")
+    """All markers over time, of the trials that are the furthest off, and the errors of all."""
+    said = _said(e)
+    page.section("All markers")
     page.text(
-        "Believed is the simulation of the setup as stated; explained is the same with "
-        + ("the effect above." if e.verdict.chosen else "modulus, pressure and measurement errors fitted.")
+        "Believed is the simulation of the setup as stated; "
+        + ("explained is the same with the effect above, " if e.verdict.chosen else "the other is the same, ")
+        + "with modulus, pressure and measurement errors fitted."
     )
-    worst = max(e.before, key=lambda p: p.total).trial
-    drawn = e.drawn or tuple(p.seen for p in e.before)
-    for trial, before, after in zip(trials, drawn, e.after, strict=True):
-        heldout = ", not used for the fit" if trial.name in e.heldout else ""
-        caption = f"Trial {trial.name}{heldout}: coordinates of the markers."
-        folded = "" if trial.name == worst else f"Trial {trial.name}{heldout}"
-        page.figure(draw_trial(trial, before, after.seen), caption, folded=folded)
     page.table(
         [
             {
                 "trial": b.trial,
-                "as believed [mm]": 1e3 * b.total,
-                "as explained [mm]": 1e3 * a.total,
+                "as believed [mm]": float(digits(1e3 * b.total)),
+                f"as {said} [mm]": float(digits(1e3 * a.total)),
                 "used for the fit": b.trial not in e.heldout,
+                **{
+                    f"{m.name} [mm]": f"{1e3 * one:.2g} → {1e3 * other:.2g}"
+                    for m, one, other in zip(trial.setup.markers[:MARKERS], b.error, a.error, strict=False)
+                },
             }
-            for b, a in zip(e.before, e.after, strict=True)
+            for trial, b, a in zip(trials, e.before, e.after, strict=True)
         ],
-        "Distance between recording and simulation, root mean square over markers and time.",
+        "Distance between recording and simulation, root mean square over time and all markers, and of each marker.",
     )
+    off = sorted(range(len(trials)), key=lambda k: -e.before[k].total)
+    for k in sorted(off[:TRIALS]):
+        believed = e.drawn[k] if e.drawn else e.before[k].seen
+        name = f"Trial {trials[k].name}{_heldout(e, trials[k])}"
+        picture = draw_trial(trials[k], believed, e.after[k].seen, said)
+        page.figure(picture, f"{name}: coordinates of the markers.", folded=name)
 
 
 def _mismatches(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     """Where and when recordings leave the simulation."""
     page.section("Where and when")
     page.points([str(m) for m in e.mismatches])
-    after = "explained" if e.verdict.chosen else "fitted without an effect"
+    off = {p.trial: p.total for p in e.before}
+    shown = sorted(range(len(trials)), key=lambda k: -off[trials[k].name])[:TRIALS]
     page.figure(
-        draw_mismatch(e.mismatches, trials, after),
+        draw_mismatch([e.mismatches[k] for k in sorted(shown)], [trials[k] for k in sorted(shown)], _said(e)),
         "Distance between recording and simulation over time, in standard deviations of noise and of the simulation's "
-        "own error, over the phases of each trial. Dotted: three standard deviations. Grey: supplied pressure.",
-    )
-    places = [
-        (effect_words(row["name"]), np.array(row["location_m"]))
-        for c in e.verdict.chosen
-        for row in effect_rows(c.fit, 0.0, e.problem)
-        if row["location_m"] is not None
-    ]
-    page.figure(
-        draw_body(e.problem.experiment.setup, e.before, e.after, places, e.forces, after),
-        "Distance between recording and simulation at each marker, root mean square over all trials.",
+        "own error, as corrected, over the phases of each trial. Dotted: three standard deviations. Grey: supplied "
+        "pressure.",
     )
 
 
 def _considered(page: Document, e: Explanation) -> None:
-    """Posterior probabilities, and all that was weighed."""
+    """All that was weighed."""
     c = e.verdict.conclusion
-    page.section("What was considered")
-    page.figure(
-        draw_probabilities({told(name): p for name, p in c.probabilities.items()}),
-        "Posterior probability of what is missing: of nothing, of what is none of the known effects, and of each "
-        "effect that was weighed.",
-    )
     rows = [
         {
             "effect": effect_words(x.name),
-            "changes": " and ".join(effect.affected_quantity for effect in x.fit.effects),
-            "probability [%]": 100 * x.probability,
+            "probability": probability(x.probability),
             "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
-            "changes the motion by [mm]": 1e3 * x.size,
-            "leaves [mm]": 1e3 * x.posterior.unexplained * c.motion,
+            "changes the motion by [mm]": float(digits(1e3 * x.size)),
+            "leaves [mm]": float(digits(1e3 * x.posterior.unexplained * c.motion)),
             "fitted": candidate_words(x, e.problem, every=True).partition(": ")[2],
         }
         for x in e.verdict.ranking
     ]
     if rows:
+        page.section("What was considered")
         page.table(
             rows,
             "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the motion "
@@ -196,9 +278,9 @@ def _accuracy(page: Document, e: Explanation, data: Mapping[str, Any]) -> None:
     noise, cells = data["noise"], e.discretization
     edges = " and ".join(f"{1e3 * edge:.2f}" for edge in cells.edges)
     page.text(
-        f"Noise of the recordings: {1e3 * noise['standard_deviation_m']:.3f} mm (standard deviation). Error of the "
-        f"simulation itself: {1e3 * noise['simulation_m']:.3f} mm, from cells of {edges} mm, "
-        f"{' and '.join(map(str, cells.walls))} of them through the thinnest wall."
+        f"Standard deviations along an axis: of the recordings' noise {millimetres(noise['standard_deviation_m'])}; of "
+        f"the simulation's own error {millimetres(noise['simulation_m'])}, which is what its correction by finer cells "
+        f"leaves. Cells of {edges} mm, {' and '.join(map(str, cells.walls))} of them through the thinnest wall."
     )
     names, common = e.problem.observation.names, [tolerance for _, tolerance in e.problem.common]
     deviations = dict(zip(["ln_modulus", "ln_pressure"], common, strict=False))

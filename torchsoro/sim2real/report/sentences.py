@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 from torchsoro.sim2real.inference.conclusion import NOTHING, UNKNOWN
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
@@ -44,13 +42,11 @@ def evidence(e: Explanation) -> list[str]:
     """What the verdict rests on, and what remains open, a sentence each."""
     v = e.verdict
     found = [_departure(e), _probable(e), _visible(e)]
-    if v.heldout:
-        held = list(v.heldout.values())
-        before, after = (math.sqrt(sum(x * x for x in column) / len(held)) for column in zip(*held, strict=True))
-        trials = f"trial{'s' if len(held) > 1 else ''} {', '.join(v.heldout)}"
+    if v.heldout and e.improvement:
+        trials = f"trial{'s' if len(v.heldout) > 1 else ''} {', '.join(v.heldout)}"
         found.append(
-            f"On {trials}, left out of the fit, the error of the prediction is {1e3 * after:.2f} mm; that of the setup "
-            f"as stated is {1e3 * before:.2f} mm."
+            f"On {trials}, left out of the fit, the error of the prediction is {1e3 * e.improvement.explained:.2f} mm; "
+            f"that of the setup as stated is {1e3 * e.improvement.believed:.2f} mm."
         )
     if v.kind == "unknown_physics":
         if v.ranking and v.ranking[0].posterior.unexplained < v.posterior.unexplained:
@@ -139,7 +135,7 @@ def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = 
         main = words.MAIN.get(row["name"], ())
         numbers = [
             f"{words.quantity_words(row['name'], name)} {words.with_unit(p['value'], p['unit'], name)} "
-            f"(90 %: {words.interval(p['low'], p['high'], p['unit'], name)})"
+            f"(90 %: {words.interval(p['value'], p['low'], p['high'], p['unit'], name)})"
             for name, p in row["parameters"].items()
             if every or not main or name in main
         ]

@@ -88,13 +88,16 @@ PERCENT = {"fraction", "depth", "share"}  # quantities of unit 1 that people sta
 
 # Units people use: factor on the SI value, and name; the first row whose upper limit is above the value.
 _UNITS = {
-    "m": ((math.inf, 1e3, "mm"),),
+    "m": ((1e-4, 1e6, "µm"), (math.inf, 1e3, "mm")),
     "s": ((1.0, 1e3, "ms"), (math.inf, 1.0, "s")),
     "m/s": ((0.1, 1e3, "mm/s"), (math.inf, 1.0, "m/s")),
     "kg": ((1.0, 1e3, "g"), (math.inf, 1.0, "kg")),
     "Pa": ((1e3, 1.0, "Pa"), (1e6, 1e-3, "kPa"), (math.inf, 1e-6, "MPa")),
     "rad": ((math.inf, math.degrees(1.0), "°"),),
     "rad/s": ((math.inf, math.degrees(1.0), "°/s"),),
+    "N/m": ((1e3, 1.0, "N/m"), (math.inf, 1e-3, "kN/m")),
+    "N s/m": ((1.0, 1e3, "mN s/m"), (math.inf, 1.0, "N s/m")),
+    "Pa s": ((1.0, 1e3, "mPa s"), (1e3, 1.0, "Pa s"), (math.inf, 1e-3, "kPa s")),
     "J/m2": ((1.0, 1e3, "mJ/m²"), (math.inf, 1.0, "J/m²")),
     "kg/m3": ((math.inf, 1.0, "kg/m³"),),
     "1": ((math.inf, 1.0, ""),),
@@ -147,9 +150,10 @@ def with_unit(value: float, unit: str, name: str = "") -> str:
     return number + ("" if suffix in ("", "°", "°/s") else " ") + suffix
 
 
-def interval(low: float, high: float, unit: str, name: str = "") -> str:
-    """An interval with its unit."""
-    (_, one, other), suffix = in_units((max(abs(low), abs(high)), low, high), unit, name)
+def interval(value: float, low: float, high: float, unit: str, name: str = "") -> str:
+    """An interval in the unit that suits its value, or its larger end where that is zero."""
+    suited = value if value or unit.startswith("ln ") else max(low, high, key=abs)
+    (_, one, other), suffix = in_units((suited, low, high), unit, name)
     return f"{one} to {other}" + ("" if suffix in ("", "°", "°/s") else " ") + suffix
 
 
@@ -172,6 +176,11 @@ def error_words(name: str) -> tuple[str, str]:
 def error_number(value: float, unit: str) -> str:
     """A measurement error with its unit; a relative one in percent."""
     return f"{digits(100 * value)} %" if unit == "%" else with_unit(value, unit)
+
+
+def millimetres(value: float) -> str:
+    """A length in mm however small it is, so that several can be compared."""
+    return f"{digits(1e3 * value)} mm"
 
 
 def probability(value: float) -> str:

@@ -1,0 +1,145 @@
+"""Where the whole body is in a trial, as believed and as explained, beside the recorded markers."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from torchsoro.sim2real.data.experiment import Trial
+from torchsoro.sim2real.data.schema import Marker
+from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.observation import ObservationModel
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
+from torchsoro.sim2real.report.improvement import Worst
+from torchsoro.sim2real.twin.grid import BODY
+from torchsoro.sim2real.twin.twin import Twin
+
+FRAMES = 60  # of a motion, that are kept
+FACES = 600  # of a surface, up to which it is divided
+VERTICES = 2000  # of a mesh, up to which it is drawn itself
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class BodyMotion:
+    """Surfaces and markers of a trial; places are in the frame of the recording.
+
+    Attributes:
+        trial: Its name.
+        time: Of the frames by the recording's clock [F] s.
+        worst: Number of the frame in which the recording is the furthest from what was believed.
+        marker: Number of the marker that is.
+        faces: Vertices of the surface's polygons [Q, 3 or 4].
+        believed: The surface [F, V, 3] m.
+        explained: The same [F, V, 3] m.
+        markers: As believed and as explained [2, F, M, 3] m.
+        recorded: Markers [F, M, 3] m; along an axis that was not recorded, as explained.
+    """
+
+    trial: str
+    time: np.ndarray
+    worst: int
+    marker: int
+    faces: np.ndarray
+    believed: np.ndarray
+    explained: np.ndarray
+    markers: np.ndarray
+    recorded: np.ndarray
+
+    @property
+    def travel(self) -> float:
+        """How far a place of the surface gets from where it begins, at most [m]."""
+        return max(float(np.linalg.norm(x - x[0], axis=-1).max()) for x in (self.believed, self.explained))
+
+
+def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst: Worst) -> BodyMotion | None:
+    """The body in a trial, by the finest twin at hand, as it would be seen with the measurement errors of a fit.
+
+    Args:
+        problem: The fit's.
+        fit: What explains the difference.
+        trial: With a recording; one of the problem or another.
+        clock: Offset of the recording's clock, as explained [s].
+        worst: Of this trial.
+
+    Returns:
+        The motion; None where a simulation breaks down.
+    """
+    recording = trial.recording
+    assert recording is not None
+    twin = problem.fine or problem.twin
+    places, faces = surface(twin)
+    count, markers = len(places), twin.setup.markers
+    points = [Marker(name=f"p{k}", at=(float(x), float(y), float(z))) for k, (x, y, z) in enumerate(places)]
+    setup = dataclasses.replace(twin.setup, markers=(*points, *markers), axes=(0, 1, 2))
+    # What the finer twin would add is in its own motion.
+    none = DiscretizationError(shift=() if problem.fine else problem.discretization.shift)
+    there = problem.only([trial], twin=dataclasses.replace(twin, setup=setup), discretization=none, slips=())
+    still = np.zeros((1, len(problem.common)))
+    motions = [m.alone() for (m,) in there.simulate([((), still), (fit.effects, fit.point[None])])]
+    if not all(m.sound.all() for m in motions):
+        return None
+    kept = np.unique(np.append(np.linspace(0, len(recording.time) - 1, FRAMES).round().astype(int), worst.sample))
+    seen = dataclasses.replace(recording, time=recording.time[kept], position=recording.position[kept])
+    observation = ObservationModel(setup, [dataclasses.replace(trial, recording=seen)], problem.priors)
+    known = fit.errors[len(problem.trials) :]
+    # Of the clock's rate, scale and frame; of places, only markers have one.
+    errors = np.concatenate([[clock], known[:5], np.zeros(3 * count), known[5 : 5 + 3 * len(markers)]])
+    believed, explained = (observation.observe(m, 0, errors) for m in motions)
+    recorded = explained[:, count:].copy()
+    recorded[..., list(problem.experiment.setup.axes)] = seen.position
+    return BodyMotion(
+        trial=trial.name,
+        time=seen.time,
+        worst=int(np.searchsorted(kept, worst.sample)),
+        marker=worst.marker,
+        faces=faces,
+        believed=believed[:, :count],
+        explained=explained[:, :count],
+        markers=np.stack([believed[:, count:], explained[:, count:]]),
+        recorded=recorded,
+    )
+
+
+def surface(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
+    """The outside of a body at rest: its mesh if that is small, else sides of its cells, divided to be about even.
+
+    Returns:
+        Vertices [V, 3] m, and polygons [Q, 3 or 4].
+    """
+    mesh = None if twin.setup.surface is None else twin.setup.surface.mesh
+    if mesh is not None and len(mesh.vertices) <= VERTICES:
+        return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    # Chambers are inside.
+    solid = np.pad(twin.grid.hole >= BODY, 1)
+    planes = [axis.planes for axis in twin.grid.axes]
+    rows = []
+    for axis in range(3):
+        one, two = (axis + 1) % 3, (axis + 2) % 3
+        for side in (-1, 1):
+            inner = np.argwhere(solid & ~np.roll(solid, -side, axis)) - 1
+            # Counter-clockwise as seen from outside.
+            for a, b in ((0, 0), (1, 0), (1, 1), (0, 1))[::side]:
+                corner = inner.copy()
+                corner[:, axis] += side > 0
+                corner[:, one] += a
+                corner[:, two] += b
+                rows.append(corner)
+    sides = np.concatenate([np.stack(rows[4 * k : 4 * k + 4], 1) for k in range(6)])
+    corners, index = np.unique(sides.reshape(-1, 3), axis=0, return_inverse=True)
+    vertices = np.stack([planes[a][corners[:, a]] for a in range(3)], -1)
+    faces = index.reshape(-1, 4)
+    while 4 * len(faces) <= FACES:
+        vertices, faces = _divided(vertices, faces)
+    return vertices, faces
+
+
+def _divided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each quadrilateral as four."""
+    quads = vertices[faces]
+    after = np.roll(quads, -1, 1)
+    ends, middle = (quads + after) / 2, quads.mean(1, keepdims=True).repeat(4, 1)
+    parts = np.stack([quads, ends, middle, np.roll(ends, 1, 1)], 2).reshape(-1, 3)
+    found, index = np.unique(parts.round(9), axis=0, return_inverse=True)
+    return found, index.reshape(-1, 4)
