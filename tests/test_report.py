@@ -12,6 +12,7 @@ import torch
 from ringing import effect
 
 from torchsoro.output.slider import Moving, packed, unpacked
+from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict
@@ -71,6 +72,18 @@ def test_the_body_is_drawn_where_its_markers_are(dragged, shown):
         assert np.abs(simulated[:, tip.argmin()] - markers[:, 0]).max() < 2e-3
     moved = np.linalg.norm(body.explained[body.worst] - body.believed[body.worst], axis=1)
     assert moved[tip.argmin()] == pytest.approx(worst.believed, rel=0.2)
+
+
+def test_planes_are_drawn_where_they_are_as_far_as_the_body_gets(shown):
+    body = shown[-1]
+    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 2.0), friction="stick")
+    slope = PlaneTable(point=(0.0, 0.0, 0.0), normal=(1.0, 0.0, 1.0), friction="stick")
+    corners = body.planes(dataclasses.replace(shown[0].setup, planes=(ground, slope)))
+    assert corners.shape == (len(body.time), 4, 3) and (corners[..., 2] == -0.005).all()
+    whole = np.concatenate([body.believed, body.explained])[..., :2]
+    np.testing.assert_array_equal(corners[..., :2].min((0, 1)), whole.min((0, 1)))
+    np.testing.assert_array_equal(corners[..., :2].max((0, 1)), whole.max((0, 1)))
+    assert not body.planes(dataclasses.replace(shown[0].setup, planes=())).size
 
 
 def test_the_surface_is_closed_and_has_the_area_of_the_body(made):

@@ -8,7 +8,8 @@ async function slider(box, about) {
   for (let i = frame; i < steps.length; i++) steps[i] += steps[i - frame]; // stored as differences between frames
   const state = { frame: about.begin, azimuth: about.azimuth, elevation: 12, hidden: new Set(), clock: null };
   const middle = about.low.map((low, k) => (low + about.high[k]) / 2);
-  const extent = Math.hypot(...about.low.map((low, k) => about.high[k] - low));
+  const [wide, deep, tall] = about.low.map((low, k) => about.high[k] - low);
+  const flat = Math.hypot(wide, deep), extent = Math.hypot(flat, tall);
 
   function seen(vertex) { // right, up, towards the viewer [mm]; null where a sample was lost
     const at = state.frame * frame + 3 * vertex;
@@ -22,7 +23,8 @@ async function slider(box, about) {
   function draw() {
     const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth, height = canvas.clientHeight;
     canvas.width = width * ratio; canvas.height = height * ratio;
-    const scale = 1.1 * ratio * Math.min(width, 1.7 * height) / extent;
+    const e = Math.abs(state.elevation) * Math.PI / 180;
+    const scale = 0.9 * ratio * Math.min(width / flat, height / (tall * Math.cos(e) + flat * Math.sin(e)));
     const place = (p) => [canvas.width / 2 + scale * p[0], canvas.height / 2 - scale * p[1]];
     const things = [];
     about.parts.forEach((part, number) => {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchsoro.sim2real.data.experiment import Trial
+from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.data.schema import Marker
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.observation import ObservationModel
@@ -51,6 +51,21 @@ class BodyMotion:
     def travel(self) -> float:
         """How far a place of the surface gets from where it begins, at most [m]."""
         return max(float(np.linalg.norm(x - x[0], axis=-1).max()) for x in (self.believed, self.explained))
+
+    def planes(self, setup: Setup) -> np.ndarray:
+        """Corners of planes across an axis, as far as the body gets, one after the other [F, 4 P, 3] m."""
+        whole = np.concatenate([self.believed, self.explained]).reshape(-1, 3)
+        low, high, found = whole.min(0), whole.max(0), []
+        for plane in setup.planes:
+            normal = np.abs(plane.normal) / np.linalg.norm(plane.normal)
+            axis = int(normal.argmax())
+            if normal[axis] < 1 - 1e-6:
+                continue
+            for one, other in ((low, low), (high, low), (high, high), (low, high)):
+                corner = np.array(plane.point, float)
+                corner[(axis + 1) % 3], corner[(axis + 2) % 3] = one[(axis + 1) % 3], other[(axis + 2) % 3]
+                found.append(corner)
+        return np.tile(np.reshape(found, (1, -1, 3)), (len(self.time), 1, 1))
 
 
 def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst: Worst) -> BodyMotion | None:

@@ -19,7 +19,7 @@ from torchsoro.sim2real.report.body import BodyMotion
 from torchsoro.sim2real.report.improvement import Worst
 
 RECORDED, NOMINAL, EXPLAINED = "#1f2933", "#b5651d", "#396ba3"
-PLACE = "#a3154a"
+PLACE, SURROUNDINGS = "#a3154a", "#7b8794"
 CLOSE = 0.15  # of a body's picture, up to which a distance in it is shown closer
 LEAST_RANGE = 0.15  # of the widest panel's range, that any panel shows
 AXES = ("#c0392b", "#2e8b57", "#2c5aa0")
@@ -220,12 +220,12 @@ def _surroundings(panel: Axes, setup: Setup, view: tuple[int, int]) -> None:
     low, size = np.array(setup.origin), np.array(setup.size)
     for box in setup.clamps:
         begin, end = (1e3 * np.clip(corner, low - 0.02 * size, low + 1.02 * size)[list(view)] for corner in box)
-        panel.add_patch(Rectangle(tuple(begin), *(end - begin), fc="0.75", ec="0.3", hatch="////", lw=0.8))
+        panel.add_patch(Rectangle(tuple(begin), *(end - begin), fc="0.8", ec=SURROUNDINGS, hatch="////", lw=0.8))
     for plane in setup.planes:
         normal = np.array(plane.normal)[list(view)]
         if np.linalg.norm(normal) > 0.99 * np.linalg.norm(plane.normal):
             x, y = (1e3 * plane.point[axis] for axis in view)
-            panel.axline((x, y), (x - normal[1], y + normal[0]), color="0.3", lw=1.5)
+            panel.axline((x, y), (x - normal[1], y + normal[0]), color=SURROUNDINGS, lw=1.8)
     panel.set(xlim=across, ylim=up)
 
 

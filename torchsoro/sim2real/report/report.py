@@ -19,6 +19,7 @@ from torchsoro.sim2real.report.drawings import (
     EXPLAINED,
     NOMINAL,
     RECORDED,
+    SURROUNDINGS,
     draw_body,
     draw_cosines,
     draw_forces,
@@ -45,7 +46,7 @@ from torchsoro.storage import atomic_write
 BARS = 8  # on the first screen, at most
 LEAST_BARS, FAINT = 3, 0.01  # shown always; of the others, those that are at least as probable
 FAR = 0.03  # of the body's longest edge, from which on its motion is shown
-MARKERS = 6  # whose errors are in the table of trials, at most
+MARKERS = 6  # up to which the error of each is in the table of trials
 TRIALS = 6  # whose markers are all drawn, those that are the furthest off
 
 
@@ -155,6 +156,9 @@ def _body(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
         surfaces = (("believed", NOMINAL, body.believed), (said, EXPLAINED, body.explained))
         moving = [Moving(name=name, color=color, places=places, faces=body.faces) for name, color, places in surfaces]
         moving.append(Moving(name="recorded markers", color=RECORDED, places=body.recorded))
+        if (planes := body.planes(setup)).size:
+            faces = np.arange(planes.shape[1]).reshape(-1, 4)
+            moving.append(Moving(name="planes", color=SURROUNDINGS, places=planes, faces=faces))
         page.slider(
             packed(body.time, moving, begin=body.worst, azimuth=azimuth),
             f"Trial {body.trial}{_heldout(e, trials[e.worst.trial])}, over time; drag to turn.",
@@ -181,7 +185,8 @@ def _effects(page: Document, e: Explanation) -> None:
 
 def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     """All markers over time, of the trials that are the furthest off, and the errors of all."""
-    said = _said(e)
+    said, markers = _said(e), e.problem.experiment.setup.markers
+    each = len(markers) <= MARKERS
     page.section("All markers")
     page.text(
         "Believed is the simulation of the setup as stated; "
@@ -197,12 +202,13 @@ def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
                 "used for the fit": b.trial not in e.heldout,
                 **{
                     f"{m.name} [mm]": f"{1e3 * one:.2g} → {1e3 * other:.2g}"
-                    for m, one, other in zip(trial.setup.markers[:MARKERS], b.error, a.error, strict=False)
+                    for m, one, other in zip(markers if each else (), b.error, a.error, strict=each)
                 },
             }
-            for trial, b, a in zip(trials, e.before, e.after, strict=True)
+            for b, a in zip(e.before, e.after, strict=True)
         ],
-        "Distance between recording and simulation, root mean square over time and all markers, and of each marker.",
+        "Distance between recording and simulation, root mean square over time and all markers"
+        + (f", and of each marker: believed → {said}." if each else "."),
     )
     off = sorted(range(len(trials)), key=lambda k: -e.before[k].total)
     for k in sorted(off[:TRIALS]):
@@ -231,12 +237,11 @@ def _considered(page: Document, e: Explanation) -> None:
     c = e.verdict.conclusion
     rows = [
         {
-            "effect": effect_words(x.name),
+            "effect": candidate_words(x, e.problem),
             "probability": probability(x.probability),
             "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
             "changes the motion by [mm]": float(digits(1e3 * x.size)),
             "leaves [mm]": float(digits(1e3 * x.posterior.unexplained * c.motion)),
-            "fitted": candidate_words(x, e.problem, every=True).partition(": ")[2],
         }
         for x in e.verdict.ranking
     ]

@@ -128,8 +128,8 @@ def _incredible_errors(e: Explanation) -> str:
     return f"More is missing than this, since measurement errors are fitted beyond belief: {', '.join(large)}."
 
 
-def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = False) -> str:
-    """An effect with its place and its main quantities, or all of them if ``every``."""
+def candidate_words(candidate: Candidate, problem: FitProblem) -> str:
+    """An effect with its place and its main quantities."""
     parts = []
     for row in effect_rows(candidate.fit, 0.0, problem):
         main = words.MAIN.get(row["name"], ())
@@ -137,7 +137,7 @@ def candidate_words(candidate: Candidate, problem: FitProblem, *, every: bool = 
             f"{words.quantity_words(row['name'], name)} {words.with_unit(p['value'], p['unit'], name)} "
             f"(90 %: {words.interval(p['value'], p['low'], p['high'], p['unit'], name)})"
             for name, p in row["parameters"].items()
-            if every or not main or name in main
+            if not main or name in main
         ]
         parts.append(f"{words.effect_words(row['name'])}{_place(row)}: {', '.join(numbers)}")
     return " and ".join(parts)
