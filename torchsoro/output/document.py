@@ -12,9 +12,11 @@ from typing import Any
 import jinja2
 from jinja2.utils import htmlsafe_json_dumps
 from markupsafe import Markup
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from torchsoro.output.page import pixels
 from torchsoro.output.slider import SCRIPT
 from torchsoro.storage import atomic_write
 
@@ -109,11 +111,11 @@ class Document:
 
     def figure(self, figure: Figure, caption: str, *, folded: str = "") -> None:
         """A Matplotlib figure, as a picture inside the page; ``folded`` as in :meth:`table`."""
+        figure.set_dpi(DPI)
+        image = Image.fromarray(pixels(FigureCanvasAgg(figure)))
         stream = io.BytesIO()
-        figure.savefig(stream, format="png", dpi=DPI)
-        small = io.BytesIO()
-        Image.open(stream).convert("RGB").quantize(COLORS, dither=Image.Dither.NONE).save(small, "PNG", optimize=True)
-        self.picture(small.getvalue(), caption, folded=folded)
+        image.quantize(COLORS, dither=Image.Dither.NONE).save(stream, "PNG", optimize=True)
+        self.picture(stream.getvalue(), caption, folded=folded)
 
     def picture(self, png: bytes, caption: str, *, folded: str = "") -> None:
         """A PNG, inside the page; ``folded`` as in :meth:`table`."""

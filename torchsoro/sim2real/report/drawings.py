@@ -161,7 +161,7 @@ def draw_body(
     size = np.ptp(1e3 * np.concatenate([body.believed[k], body.explained[k]])[:, view], axis=0)
     apart = 1e3 * float(np.linalg.norm((recorded[m] - believed[m])[list(view)]))
     count = 1 if apart > CLOSE * size.max() else 2  # what is far off needs no closer look
-    high = np.clip(9 / (1.6 * (count - 1) + 1) * size[1] / size[0], 1.6, 4.2) + 1.0
+    high = np.clip(9 / (1 + 0.6 * (count - 1)) * size[1] / size[0], 1.6, 4.2) + 1.0
     figure = Figure(figsize=(9, high), layout="constrained")
     panels: Any = figure.subplots(1, count, squeeze=False, width_ratios=(1.7, 1)[:count])
     whole, close = panels[0, 0], panels[0, -1]

@@ -97,10 +97,12 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     found, said = e.improvement, _said(e)
     if found is not None:
         kind = f"{'held-out' if found.heldout else 'fitted'} trials"
+        # Of several that cannot be told apart, one is drawn.
+        of = f" by {effect_words(e.verdict.chosen[0].name)}" if len(e.verdict.chosen) > 1 else ""
         page.numbers(
             [
                 (millimetres(found.believed), f"error as believed, {kind}"),
-                (millimetres(found.explained), f"error as {said}, {kind}"),
+                (millimetres(found.explained), f"error as {said}{of}, {kind}"),
                 (millimetres(found.floor), "expected of noise and the simulation's own error, as corrected"),
             ]
         )
@@ -190,7 +192,11 @@ def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     page.section("All markers")
     page.text(
         "Believed is the simulation of the setup as stated; "
-        + ("explained is the same with the effect above, " if e.verdict.chosen else "the other is the same, ")
+        + (
+            f"explained is the same with {effect_words(e.best.name)}, "
+            if e.verdict.chosen
+            else "the other is the same, "
+        )
         + "with modulus, pressure and measurement errors fitted."
     )
     page.table(
