@@ -7,14 +7,13 @@ import dataclasses
 import numpy as np
 
 from torchsoro.sim2real.inference.evidence import (
-    Data,
     Discrepancy,
     Linearised,
     Model,
-    TrialData,
     TwinError,
     errors,
 )
+from torchsoro.sim2real.inference.observed import Data, TrialData
 from torchsoro.sim2real.inference.priors import Prior
 
 MARKERS, AXES = 3, 2
@@ -33,7 +32,7 @@ def recorded(share, seed, trials=2, count=60, effect=0.0):
     quiet = Data(
         trials=tuple(TrialData(name=str(i), time=time, position=b) for i, b in enumerate(believed)), noise=0.01
     )
-    model = errors(quiet, EXACT, Discrepancy(share, 0.1))
+    model, *_ = errors(quiet, EXACT, Discrepancy(share, 0.1))
     position = []
     for b, J in zip(believed, slopes, strict=True):
         off = np.stack([np.linalg.cholesky(model.dense(time, a)) @ rng.normal(size=3 * count) for a in range(AXES)])

@@ -9,8 +9,9 @@ import pytest
 from swings import EXACT, recorded
 
 from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude
-from torchsoro.sim2real.inference.decision import MATTERS, VISIBLE
-from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer
+from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer, told
+from torchsoro.sim2real.inference.observed import Data, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
 from torchsoro.sim2real.inference.visible import limit, remedies
@@ -120,6 +121,52 @@ def test_a_discrepancy_that_no_effect_explains_is_unknown():
     assert (found.kind, found.chosen) == ("unknown_physics", ())
 
 
+def test_an_effect_beside_something_else_is_told_as_most_of_the_difference():
+    data, nothing, drag = recorded(0.05, 14, effect=1.0)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    assert (found.kind, found.chosen, found.partly) == ("explained", ("drag",), True)
+    (candidate,) = found.candidates
+    assert MATTERS * data.size < candidate.left < UNEXPLAINED * found.left
+    # The same effect alone leaves nothing that matters.
+    data, nothing, drag = recorded(0.0, 14, effect=1.0)
+    assert not conclude(weighed(data, nothing, drag), limit=0.0).partly
+
+
+def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told():
+    data, nothing, drag = recorded(0.3, 15, effect=0.6)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    (candidate,) = found.candidates
+    assert candidate.left > UNEXPLAINED * found.left
+    assert (found.kind, found.chosen) == ("unknown_physics", ())
+
+
+def test_numbers_that_are_told_leave_the_least_where_a_discrepancy_matters():
+    data, _, drag = recorded(0.3, 16, effect=0.6)
+    found = infer(data, drag)
+    assert found.matters
+    best = found.near.left(told(data, found).at)
+    assert size_of(best) < size_of(found.left)
+    for step in (-0.02, 0.02):
+        assert size_of(best) < size_of(found.near.left(told(data, found).at + step))
+    # Without a trial they do not know it.
+    one, other = (told(data, found, but=i).at for i in range(2))
+    assert one != pytest.approx(other)
+
+
+def test_numbers_that_are_told_are_the_most_probable_where_no_discrepancy_matters():
+    data, _, drag = recorded(0.0, 17, effect=0.3)
+    found = infer(data, drag)
+    assert told(data, found).at == pytest.approx(found.mode.at)
+
+
+def test_a_body_that_sags_may_be_off_by_all_that_it_sagged():
+    time = np.linspace(0, 1, 50)
+    ringing = np.exp(-20 * time) * np.cos(40 * time) - 1
+    data = Data(trials=(TrialData(name="a", time=time, position=10 * ringing[:, None, None]),), noise=0.01)
+    assert data.shares[1] * data.size == pytest.approx(10.0, rel=0.05)
+    assert data.shares[1] > 3
+
+
 def test_two_effects_that_move_alike_are_not_told_apart():
     data, nothing, drag = recorded(0.0, 7, effect=0.3)
     other = dataclasses.replace(drag, model=dataclasses.replace(drag.model, effects=("leak",)))
@@ -141,7 +188,7 @@ def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
 
 def test_evidence_counts_less_where_the_twin_errs_along_an_effect():
     data, nothing, drag = recorded(0.0, 9, effect=0.05)
-    size = np.full_like(data.amplitude, 0.02)
+    size = np.full_like(data.amplitudes[0], 0.02)
     along = tuple(tuple(sign * 0.1 * J[..., 0] for J in drag.slopes) for sign in (-1, 1))
     aside = draws(data, 2, 0.02, 10)
     kappas = [

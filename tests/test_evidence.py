@@ -236,7 +236,7 @@ def test_predictive_densities_of_trials_left_out_are_those_of_the_joint_normal_d
     whole = infer(data, drag)
     exact = dataclasses.replace(whole.none, discrepancy=Discrepancy())
     found = dataclasses.replace(whole, some=exact, none=exact)
-    model = errors(data, EXACT, Discrepancy())
+    model, *_ = errors(data, EXACT, Discrepancy())
     parts = []
     for t, r, J in zip(data.trials, drag.residuals, drag.slopes, strict=True):
         for axis in range(AXES):

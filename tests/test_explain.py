@@ -383,7 +383,7 @@ def test_measurement_errors_stay_within_10_deviations_where_no_effect_explains(m
         [effect("gravity_tilt"), effect("drag")],
         report=lambda line: None,
     )
-    assert told.kind != "explained" and told.posterior.unexplained > 0.05
+    assert told.kind != "explained" and told.posterior.matters
     errors = np.abs(told.null_model.errors / told.problem.observation.deviations)
     assert errors.max() < 10.001
     # What no effect explains is no error of the simulation.

@@ -128,7 +128,10 @@ def test_probabilities_are_told_in_percent_and_never_as_certain():
 
 def test_a_set_of_one_name_and_what_is_unknown_says_so(monkeypatch):
     monkeypatch.setattr(sentences, "candidate_words", lambda candidate, problem: candidate)
-    both = SimpleNamespace(verdict=SimpleNamespace(kind="cannot_distinguish", chosen=("a lag", "a leak")), problem=None)
-    one = SimpleNamespace(verdict=SimpleNamespace(kind="cannot_distinguish", chosen=("a lag",)), problem=None)
-    assert "a lag; a leak" in sentences.verdict_sentence(both)
-    assert "none of the known effects" in sentences.verdict_sentence(one)
+
+    def said(*chosen):
+        verdict = SimpleNamespace(kind="cannot_distinguish", chosen=chosen, conclusion=SimpleNamespace(partly=False))
+        return sentences.verdict_sentence(SimpleNamespace(verdict=verdict, problem=None))
+
+    assert "a lag; a leak" in said("a lag", "a leak")
+    assert "none of the known effects" in said("a lag")

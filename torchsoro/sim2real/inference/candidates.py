@@ -13,12 +13,9 @@ from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
 from torchsoro.sim2real.inference.evidence import (
-    Data,
     Linearised,
     Model,
-    Motions,
     Posterior,
-    TrialData,
     TwinError,
     infer,
 )
@@ -26,6 +23,7 @@ from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.laplace import Mode
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
+from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread
 from torchsoro.sim2real.inference.resolution import between

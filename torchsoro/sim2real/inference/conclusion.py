@@ -21,7 +21,16 @@ from functools import cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, adjusted, errors, leave_one_out, mode_of
+from torchsoro.sim2real.inference.evidence import (
+    Linearised,
+    Posterior,
+    adjusted,
+    closest,
+    errors,
+    leave_one_out,
+    mode_of,
+)
+from torchsoro.sim2real.inference.observed import Data, Motions, size_of
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
@@ -34,12 +43,14 @@ class Candidate:
     Attributes:
         modes: Distinct ones, adjusted, most probable first.
         size: Root mean square of the change of the motion by it, from what is believed, within tolerances [m].
+        left: What it leaves of the recordings, see :func:`remainder` [m].
         ln_evidence: Summed over modes.
         probability: Posterior.
     """
 
     modes: tuple[Posterior, ...]
     size: float
+    left: float
     ln_evidence: float
     probability: float
 
@@ -64,10 +75,12 @@ class Conclusion:
         probabilities: Posterior, of nothing, of what is unknown, and of each name.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
+        left: What that one leaves of the recordings, its beliefs within tolerances, see :func:`remainder` [m].
         kappa: To the power of whose inverse the likelihood was taken.
         limit: Change of the motion that would have been seen [m].
         matters: Change of the motion that has to be seen [m].
         motion: Root mean square of the motion over markers and axes [m].
+        partly: Whether the best candidate leaves a discrepancy that matters.
         predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
         remedies: For "cannot_tell": what would make it tellable.
     """
@@ -77,10 +90,12 @@ class Conclusion:
     probabilities: dict[str, float]
     candidates: tuple[Candidate, ...]
     nothing: Posterior
+    left: float
     kappa: float
     limit: float
     matters: float
     motion: float
+    partly: bool = False
     predictive: tuple[float, float] = (0.0, math.inf)
     remedies: dict[str, float] = field(default_factory=dict)
 
@@ -111,10 +126,19 @@ class Weighing:
         return tuple(a - b for a, b in zip(self.believed, found.left, strict=True))
 
     @cached_property
+    def bounded(self) -> Posterior:
+        """The model without an effect, its beliefs within their tolerances, by the mode that is least beyond them."""
+
+        def beyond(p: Posterior) -> float:
+            return max(1.0, float(np.abs(p.near.at[: p.near.model.beliefs]).max(initial=0.0)))
+
+        return within(min(sorted(self.nothing, key=lambda p: -p.ln_evidence), key=beyond))
+
+    @cached_property
     def believed(self) -> Motions:
-        """Residuals of the model without an effect, its beliefs within their tolerances [T, M, A] m."""
-        found = within(self.null)
-        return found.near.left(mode_of(self.data, found.near, found.discrepancy).at)
+        """Residuals of the same [T, M, A] m."""
+        near = self.bounded.near
+        return near.left(mode_of(self.data, near, self.bounded.discrepancy).at)
 
     @cached_property
     def kappa(self) -> float:
@@ -124,10 +148,10 @@ class Weighing:
         draws, n = best.near.numerics.draws, len(changes)
         if not draws or not changes:
             return 1.0
-        model = errors(self.data, best.near.numerics, best.discrepancy)
+        models = errors(self.data, best.near.numerics, best.discrepancy)
         grams = [
             model.gram([(trial.time, np.stack([c[i] for c in (*changes, *draws)], -1))]).product
-            for i, trial in enumerate(self.data.trials)
+            for i, (trial, model) in enumerate(zip(self.data.trials, models, strict=True))
         ]
         product = np.sum(grams, 0)
         lengths = np.maximum(np.diag(product)[:n], 1e-300)
@@ -169,6 +193,7 @@ class Weighing:
             Candidate(
                 modes=tuple(modes),
                 size=size_of(self.change(self.groups[name][0])),
+                left=remainder(self.data, modes[0].near),
                 ln_evidence=ln_p[name] - share,
                 probability=probabilities[name],
             )
@@ -185,14 +210,15 @@ def _same(one: Posterior, other: Posterior) -> bool:
     return bool((np.abs(off) < SAME * spread).all())
 
 
-def size_of(change: Motions) -> float:
-    """Root mean square over all samples [m]."""
-    return float(np.sqrt(np.nanmean(np.concatenate([c.ravel() for c in change]) ** 2)))
-
-
 def apart(one: Posterior, other: Posterior) -> float:
     """Root mean square distance of two predictions [m]."""
     return size_of(tuple(a - b for a, b in zip(one.left, other.left, strict=True)))
+
+
+def remainder(data: Data, near: Linearised) -> float:
+    """Root mean square of the least that a model leaves, beyond noise and the twin's own error [m]."""
+    known = data.noise**2 + float((near.numerics.amplitude**2).mean())
+    return math.sqrt(max(size_of(near.left(closest(data, near).at)) ** 2 - known, 0.0))
 
 
 def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None = None) -> Conclusion:
@@ -207,22 +233,22 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
-    # What does not matter is nothing, and what leaves more than its law may be wrong by is not what is missing.
+    # What does not matter is nothing, and what leaves much of the difference is not what is missing.
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
-    names = {c.name: c for c in candidates}
+    names, left = {c.name: c for c in candidates}, remainder(data, weighing.bounded.near)
     for c in candidates:
         # An extension that moves as what it extends adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
         plain = [d for d in plain if apart(c.best, d.best) < least]
         if c.size < least:
             told[NOTHING] += c.probability
+        elif c.best.matters and c.left > UNEXPLAINED * left:
+            told[UNKNOWN] += c.probability
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name
             told[name] = told.get(name, 0.0) + c.probability
-        elif c.best.matters and c.best.discrepancy.share * data.size > UNEXPLAINED * apart(c.best, null):
-            told[UNKNOWN] += c.probability
         else:
             told[c.name] = told.get(c.name, 0.0) + c.probability
     chosen: list[str] = []
@@ -233,7 +259,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     predictive = (0.0, math.inf)
     first = next((c for c in candidates if c.name == chosen[0]), None)
     if first is not None:
-        predictive = compared(data, first.best, within(null), weighing.kappa)
+        predictive = compared(data, first.best, weighing.bounded, weighing.kappa)
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"
     elif chosen == [NOTHING]:
@@ -248,10 +274,12 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         probabilities=told,
         candidates=tuple(candidates),
         nothing=null,
+        left=left,
         kappa=weighing.kappa,
         limit=limit,
         matters=matters,
         motion=data.size,
+        partly=first is not None and first.best.matters,
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )

@@ -20,75 +20,17 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import minimize
 
-from torchsoro.sim2real.inference.decision import COMMON, LASTING, MATTERS
+from torchsoro.sim2real.inference.decision import COMMON, LASTING
 from torchsoro.sim2real.inference.laplace import Mode, posterior
+from torchsoro.sim2real.inference.observed import Data, Motions, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, tempered, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
-SHARES = (MATTERS, 1.0)  # of the motion: where the prior of a discrepancy that matters is uniform in ln s
 NARROW = 0.05  # of ln s and ln tau: what they need not be known better than
 APART = 0.15  # of ln s and ln tau, for second differences
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
-STILL = 0.1  # of the mean motion: least amplitude of a discrepancy along an axis without motion
-
-Motions = tuple[np.ndarray, ...]  # of each trial, as recorded [T, M, A] m
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class TrialData:
-    """One recorded trial; nothing in it changes.
-
-    Attributes:
-        name: Of the trial.
-        time: [T] s.
-        position: [T, M, A] m; not a number where a sample was lost.
-    """
-
-    name: str
-    time: np.ndarray
-    position: np.ndarray
-
-    def __post_init__(self) -> None:
-        """Keep copies that cannot be written to."""
-        if self.position.ndim != 3 or self.time.shape != self.position.shape[:1]:
-            raise ValueError(
-                f"trial {self.name}: time and position of shapes {self.time.shape} and {self.position.shape}, "
-                "wanted [T] and [T, M, A]"
-            )
-        for name in ("time", "position"):
-            value = np.array(getattr(self, name), dtype=np.float64)
-            value.setflags(write=False)
-            object.__setattr__(self, name, value)
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Data:
-    """The trials that decide. Trials that are only predicted are not among them, and reach no decision.
-
-    Attributes:
-        trials: Recordings.
-        noise: Standard deviation of a sample's noise [m].
-    """
-
-    trials: tuple[TrialData, ...]
-    noise: float
-
-    @cached_property
-    def motion(self) -> np.ndarray:
-        """Root mean square of the motion about its mean, over all trials [A, M] m."""
-        squares = [np.nanmean((t.position - np.nanmean(t.position, 0)) ** 2, 0).T for t in self.trials]
-        return np.sqrt(np.mean(squares, 0))
-
-    @cached_property
-    def amplitude(self) -> np.ndarray:
-        """Of a discrepancy with s = 1 [A, M] m: the motion, and a little of its mean where there is none."""
-        return np.hypot(self.motion, STILL * self.size)
-
-    @cached_property
-    def size(self) -> float:
-        """Root mean square of the motion over markers and axes [m]."""
-        return float(np.sqrt(np.mean(self.motion**2)))
+SETTLED = 5  # rounds in which the size of what is left and its weight agree to a percent
 
 
 @dataclass(frozen=True)
@@ -234,33 +176,32 @@ class Posterior:
         """Of the unknowns, with that discrepancy."""
         return self.best.mode
 
-    @property
-    def unexplained(self) -> float:
-        """Share of the motion that the model leaves beyond noise and the twin's own error; 0 if it does not matter."""
-        return self.discrepancy.share if self.matters else 0.0
-
     @cached_property
     def left(self) -> Motions:
         """Residuals at the mode [T, M, A] m."""
         return self.near.left(self.mode.at)
 
 
-def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> ErrorModel:
-    """All that separates the prediction of a trial from its recording.
+def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> list[ErrorModel]:
+    """All that separates predictions from recordings, of each trial.
 
     Args:
         data: With the noise and the motion.
         numerics: The twin's own error.
         discrepancy: What the model does not explain.
     """
-    lasting = np.full_like(data.amplitude, math.sqrt(LASTING) * data.noise)
-    found = [
-        Process(time=NOISE_TIME, loading=_each(lasting)),
+    one = np.full_like(numerics.amplitude, data.noise)
+    known = (
+        Process(time=NOISE_TIME, loading=_each(math.sqrt(LASTING) * one)),
         Process(time=numerics.time, loading=_moving(numerics.amplitude)),
-        Process(time=discrepancy.time, loading=_moving(discrepancy.share * data.amplitude)),
+    )
+    return [
+        ErrorModel(
+            white=math.sqrt(1 - LASTING) * one,
+            processes=(*known, Process(time=discrepancy.time, loading=_moving(discrepancy.share * amplitude))),
+        )
+        for amplitude in data.amplitudes
     ]
-    white = np.full_like(data.amplitude, math.sqrt(1 - LASTING) * data.noise)
-    return ErrorModel(white=white, processes=tuple(found))
 
 
 def _moving(deviation: np.ndarray) -> np.ndarray:
@@ -275,8 +216,7 @@ def _each(deviation: np.ndarray) -> np.ndarray:
 
 def grams(data: Data, near: Linearised, discrepancy: Discrepancy) -> list[Gram]:
     """Products of residual and slopes under the errors of each trial."""
-    model = errors(data, near.numerics, discrepancy)
-    return [model.gram(near.chunks(data, i)) for i in range(len(data.trials))]
+    return [model.gram(near.chunks(data, i)) for i, model in enumerate(errors(data, near.numerics, discrepancy))]
 
 
 def infer(data: Data, near: Linearised) -> Posterior:
@@ -337,7 +277,8 @@ def time_range(data: Data) -> tuple[float, float]:
 def _ranges(data: Data) -> tuple[np.ndarray, np.ndarray]:
     """Of ln s and ln tau."""
     low, high = time_range(data)
-    return np.array([math.log(SHARES[0]), low]), np.array([math.log(SHARES[1]), high])
+    least, most = np.log(data.shares)
+    return np.array([least, low]), np.array([most, high])
 
 
 def _discrepancy(x: np.ndarray) -> Discrepancy:
@@ -346,8 +287,8 @@ def _discrepancy(x: np.ndarray) -> Discrepancy:
 
 def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
     """Of residuals, with a discrepancy."""
-    value, model = 0.0, errors(data, near.numerics, _discrepancy(x))
-    for trial, r in zip(data.trials, left, strict=True):
+    value, models = 0.0, errors(data, near.numerics, _discrepancy(x))
+    for trial, model, r in zip(data.trials, models, left, strict=True):
         gram = model.gram([(trial.time, r[..., None])])
         value -= 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
     return value
@@ -414,16 +355,41 @@ def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarra
     return np.array([ln_z(parts) - ln_z(parts[:i] + parts[i + 1 :]) for i in range(len(parts))])
 
 
-def without(data: Data, found: Posterior, number: int, kappa: float = 1.0) -> Mode:
-    """Mode of the unknowns of a model without one of the trials, with s and tau of all of them.
+def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = None) -> Mode:
+    """The numbers of a model that are told and predicted with; s and tau are those of all trials.
+
+    They are the most probable ones. But where a discrepancy matters, these leave to it what they might explain: then
+    they are those of :func:`closest`, which predict better.
 
     Args:
         data: Recordings.
         found: A model after all of them.
-        number: Of the trial that is left out.
         kappa: See :func:`adjusted`.
+        but: Number of a trial that is left out.
     """
     near = found.near
-    parts = grams(data, near, found.discrepancy)
-    rest = total([tempered(g, kappa) for i, g in enumerate(parts) if i != number])
-    return posterior(rest, near.at, near.model.priors)
+    if found.matters:
+        return dataclasses.replace(found.mode, at=closest(data, near, but).at)
+    if but is None:
+        return found.mode
+    parts = [tempered(g, kappa) for i, g in enumerate(grams(data, near, found.discrepancy)) if i != but]
+    return posterior(total(parts), near.at, near.model.priors)
+
+
+def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
+    """The mode by least squares: with errors of all samples independent, and as large as what is left.
+
+    Args:
+        data: Recordings.
+        near: A model near a point.
+        but: Number of a trial that is left out.
+    """
+    exact = dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+    kept = [i for i in range(len(data.trials)) if i != but]
+    at = near.at
+    for _ in range(SETTLED):
+        left = size_of([r for i, r in enumerate(near.left(at)) if i in kept])
+        parts = grams(dataclasses.replace(data, noise=max(left, data.noise)), exact, Discrepancy())
+        mode = posterior(total([parts[i] for i in kept]), near.at, near.model.priors)
+        at = mode.at
+    return mode

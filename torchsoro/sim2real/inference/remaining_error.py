@@ -24,17 +24,16 @@ import numpy as np
 from scipy.optimize import minimize
 
 from torchsoro.sim2real.inference.evidence import (
-    Data,
     Discrepancy,
     Linearised,
     Model,
-    Motions,
     TwinError,
     errors,
     grams,
     time_range,
 )
 from torchsoro.sim2real.inference.laplace import posterior
+from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.state_space import total
 
 ORDER = 2  # of convergence with the edge of the cells, of smooth motion
@@ -93,7 +92,7 @@ def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
         at=np.zeros(len(free)),
         residuals=difference,
         slopes=tuple(J[..., free] for J in near.slopes),
-        numerics=TwinError(amplitude=np.zeros_like(data.amplitude)),
+        numerics=TwinError(amplitude=np.zeros_like(data.amplitudes[0])),
     )
     return still.left(posterior(total(grams(data, still, Discrepancy())), still.at, model.priors).at)
 
@@ -109,10 +108,10 @@ def _process(data: Data, draws: tuple[Motions, ...]) -> TwinError:
     quiet = dataclasses.replace(data, noise=FAINT * float(amplitude.mean()))
 
     def lost(x: np.ndarray) -> float:
-        model = errors(quiet, TwinError(amplitude=math.exp(x[0]) * amplitude, time=math.exp(x[1])), Discrepancy())
+        models = errors(quiet, TwinError(amplitude=math.exp(x[0]) * amplitude, time=math.exp(x[1])), Discrepancy())
         value = 0.0
         for draw in draws:
-            for trial, d in zip(data.trials, draw, strict=True):
+            for trial, model, d in zip(data.trials, models, draw, strict=True):
                 gram = model.gram([(trial.time, d[..., None])])
                 value += 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
         return value

@@ -14,14 +14,16 @@ from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses, weigh, weighing_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
-from torchsoro.sim2real.inference.evidence import Data, Posterior, without
+from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
+ROUNDS = 3  # of that, at most
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,12 +35,14 @@ class Candidate:
         posterior: Near there.
         probability: Posterior, of its name.
         size: Root mean square of the change of the motion by it [m].
+        left: Root mean square of the least that it leaves of the recordings beyond noise and the twin's own error [m].
     """
 
     fit: Fit
     posterior: Posterior
     probability: float
     size: float
+    left: float
 
     @property
     def name(self) -> str:
@@ -122,10 +126,17 @@ def weighed(
         report: See :func:`judge`.
     """
     data, names = data_of(problem), len({e.name for e in effects})
-    known = weigh(problem, [null_model, *ends])
+    believed = dataclasses.replace(
+        null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
+    )
+    strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
+    known = weigh(problem, [null_model, *strained, *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
-    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
-    if far := [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]:
+    for _ in range(ROUNDS):
+        leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
+        far = [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]
+        if not far:
+            break
         again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far])
         sound = {p.near.model.name for _, p in again}
         # What breaks down there stays as it was.
@@ -136,10 +147,11 @@ def weighed(
     found = conclude(weighing, visible.limit(*asked), visible.remedies(*asked))
     ranking = [
         Candidate(
-            fit=at_mode(problem, _fit_of(known, c.best), c.best.mode),
+            fit=at_mode(problem, _fit_of(known, c.best), told(data, c.best)),
             posterior=c.best,
             probability=found.probabilities.get(c.name, 0.0),
             size=c.size,
+            left=c.left,
         )
         for c in found.candidates
     ]
@@ -149,7 +161,7 @@ def weighed(
     verdict = Verdict(
         kind=found.kind,
         problem=problem,
-        null_model=at_mode(problem, _fit_of(known, found.nothing), found.nothing.mode),
+        null_model=at_mode(problem, _fit_of(known, found.nothing), told(data, found.nothing)),
         ranking=tuple(ranking),
         chosen=tuple(by_name[name] for name in found.chosen) if found.kind in NAMED else (),
         conclusion=found,
@@ -192,7 +204,7 @@ def _predicted(verdict: Verdict, data: Data, kappa: float, trials: Sequence[Tria
             return {}
         folds = []
         for i, trial in enumerate(problem.trials[:FOLDS]):
-            fit = at_mode(problem, best, without(data, verdict.posterior, i, kappa))
+            fit = at_mode(problem, best, told(data, verdict.posterior, kappa, but=i))
             others = problem.only([t for t in problem.trials if t is not trial])
             folds.append((others, dataclasses.replace(fit, errors=np.delete(fit.errors, i)), [trial]))
     found: dict[str, tuple[float, float]] = {}

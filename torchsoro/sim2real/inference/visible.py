@@ -15,7 +15,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, VISIBLE
-from torchsoro.sim2real.inference.evidence import Data, Motions, Posterior, errors
+from torchsoro.sim2real.inference.evidence import Posterior, errors
+from torchsoro.sim2real.inference.observed import Data, Motions
 
 FACTORS = (2.0, 4.0, 8.0, 16.0)  # by which an experiment or a twin may be made better
 
@@ -32,14 +33,14 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
         trials: Times as many trials as there are.
     """
     near = null.near
-    model = errors(data, near.numerics, null.discrepancy)
+    models = errors(data, near.numerics, null.discrepancy)
     count = responses[0].shape[-1]
     columns = [
         # A sample that was lost tells nothing of a response either.
         np.concatenate([np.where(np.isfinite(r)[..., None], c, np.nan), J], -1)
         for r, c, J in zip(near.residuals, responses, near.slopes, strict=True)
     ]
-    grams = [model.gram([(t.time, x)]).product for t, x in zip(data.trials, columns, strict=True)]
+    grams = [model.gram([(t.time, x)]).product for t, model, x in zip(data.trials, models, columns, strict=True)]
     product = trials * np.sum(grams, 0)
     A, B, G = product[count:, count:], product[count:, :count], product[:count, :count]
     weight = np.diag([p.weight(x) for p, x in zip(near.model.priors, null.mode.at, strict=True)])

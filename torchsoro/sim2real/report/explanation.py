@@ -177,6 +177,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "verdict": v.kind,
         "effects": effect_rows(v.chosen[0].fit, v.chosen[0].probability, problem) if v.chosen else [],
         "set": list(c.chosen),
+        "partly": c.partly,
         "probabilities": c.probabilities,
         "ranking": [
             {
@@ -184,7 +185,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
                 "probability": x.probability,
                 "ln_evidence": x.posterior.ln_evidence,
                 "change_m": x.size,
-                "unexplained_m": x.posterior.unexplained * c.motion,
+                "unexplained_m": x.left,
                 "unknowns": x.fit.unknowns,
                 "effects": effect_rows(x.fit, x.probability, problem),
             }

@@ -247,7 +247,7 @@ def _considered(page: Document, e: Explanation) -> None:
             "probability": probability(x.probability),
             "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
             "changes the motion by [mm]": float(digits(1e3 * x.size)),
-            "leaves [mm]": float(digits(1e3 * x.posterior.unexplained * c.motion)),
+            "leaves [mm]": float(digits(1e3 * x.left)),
         }
         for x in e.verdict.ranking
     ]
@@ -255,9 +255,10 @@ def _considered(page: Document, e: Explanation) -> None:
         page.section("What was considered")
         page.table(
             rows,
-            "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the motion "
-            "beyond noise and the simulation's own error; an effect that leaves more than its law may be wrong by is "
-            "counted as none of the known ones, and one that changes the motion by less than matters as nothing.",
+            "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the "
+            "least that it leaves of the difference beyond noise and the simulation's own error; an effect that leaves "
+            "more than a fifth of it counts as none of the known ones, and one that changes the motion by less than "
+            "matters as nothing.",
         )
 
 

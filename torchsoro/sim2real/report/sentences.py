@@ -30,12 +30,13 @@ def verdict_sentence(e: Explanation) -> str:
         return "Something is missing from the setup that is none of the known effects."
     if v.kind == "cannot_tell":
         return "It cannot be told from these recordings whether something is missing from the setup."
+    how = "Most of the difference is" if v.conclusion.partly else "The difference is"
     parts = "; ".join(candidate_words(c, e.problem) for c in v.chosen)
     if v.kind == "cannot_distinguish" and len(v.chosen) == 1:
-        return f"The difference is explained by {parts}; or by none of the known effects: the recordings cannot tell."
+        return f"{how} explained by {parts}; or by none of the known effects: the recordings cannot tell."
     if v.kind == "cannot_distinguish":
-        return f"The difference is explained by one of these, and the recordings cannot tell by which: {parts}."
-    return f"The difference is explained by {parts}."
+        return f"{how} explained by one of these, and the recordings cannot tell by which: {parts}."
+    return f"{how} explained by {parts}."
 
 
 def evidence(e: Explanation) -> list[str]:
@@ -48,11 +49,17 @@ def evidence(e: Explanation) -> list[str]:
             f"On {trials}, left out of the fit, the error of the prediction is {1e3 * e.improvement.explained:.2f} mm; "
             f"that of the setup as stated is {1e3 * e.improvement.believed:.2f} mm."
         )
+    if v.chosen and v.conclusion.partly:
+        best = v.chosen[0]
+        found.append(
+            f"Of a difference of {1e3 * v.conclusion.left:.2g} mm it leaves {1e3 * best.left:.2g} mm that are none of "
+            "the known effects."
+        )
     if v.kind == "unknown_physics":
-        if v.ranking and v.ranking[0].posterior.unexplained < v.posterior.unexplained:
-            left = 1e3 * v.ranking[0].posterior.unexplained * v.conclusion.motion
+        if v.ranking and v.ranking[0].left < v.conclusion.left:
             closest = candidate_words(v.ranking[0], e.problem)
-            found.append(f"Closest of the known effects: {closest}; it leaves {left:.2g} mm unexplained.")
+            left = f"it leaves {1e3 * v.ranking[0].left:.2g} mm unexplained"
+            found.append(f"Closest of the known effects: {closest}; {left}.")
         if e.forces:
             found.append(str(e.forces))
     if v.kind == "cannot_distinguish":
@@ -73,15 +80,11 @@ def told(name: str) -> str:
 
 
 def _probable(e: Explanation) -> str:
-    """Posterior probabilities of the set, and what the best leaves."""
+    """Posterior probabilities of the set."""
     c = e.verdict.conclusion
     leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.chosen))]
     shares = ", ".join(f"{told(name)} {words.probability(p)}" for name, p in leading)
-    sentence = f"Probabilities of what is missing: {shares}."
-    left = e.verdict.posterior.unexplained
-    if left:
-        sentence += f" {100 * left:.0f} % of the motion are left unexplained."
-    return sentence
+    return f"Probabilities of what is missing: {shares}."
 
 
 def _visible(e: Explanation) -> str:
