@@ -240,7 +240,6 @@ def _mismatches(page: Document, e: Explanation, trials: Sequence[Trial]) -> None
 
 def _considered(page: Document, e: Explanation) -> None:
     """All that was weighed."""
-    c = e.verdict.conclusion
     rows = [
         {
             "effect": candidate_words(x, e.problem),
