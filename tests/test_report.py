@@ -74,6 +74,13 @@ def test_the_body_is_drawn_where_its_markers_are(dragged, shown):
     assert moved[tip.argmin()] == pytest.approx(worst.believed, rel=0.2)
 
 
+def test_a_body_that_would_not_fit_into_memory_is_refused(dragged, shown, monkeypatch):
+    trial, _, after, worst, whole = shown
+    monkeypatch.setattr("torchsoro.sim2real.report.body.MOST", 10 * whole.believed.shape[1])
+    with pytest.raises(ValueError, match=r"trial b is 0\.2\d* s long, wanted at most"):
+        body_motion(*dragged, trial, after.clock, worst)
+
+
 def test_planes_are_drawn_where_they_are_as_far_as_the_body_gets(shown):
     body = shown[-1]
     ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 2.0), friction="stick")

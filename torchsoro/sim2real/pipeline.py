@@ -185,6 +185,11 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     # The report shows the trial that is the furthest off.
     k = int(np.argmax([p.total for p in before]))
     worst = worst_of(k, everything[k], drawn[k], after[k].seen)
+    body = None
+    try:
+        body = body_motion(problem, best, everything[k], after[k].clock, worst)
+    except ValueError as error:
+        progress.note(f"The report does not draw the body: {error}")
     found = Explanation(
         problem=problem,
         discretization=discretization,
@@ -200,6 +205,6 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         following=tuple(following),
         hints=(*inputs.hints, *map(str, told)),
         worst=worst,
-        body=body_motion(problem, best, everything[k], after[k].clock, worst),
+        body=body,
     )
     return found, everything

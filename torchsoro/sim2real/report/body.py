@@ -10,14 +10,17 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.data.schema import Marker
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.report.improvement import Worst
+from torchsoro.sim2real.twin.batch import SAMPLE
 from torchsoro.sim2real.twin.grid import BODY
 from torchsoro.sim2real.twin.twin import Twin
 
 FRAMES = 60  # of a motion, that are kept
 FACES = 600  # of a surface, up to which it is divided
+MOST = 4_000_000  # vertices times samples, which take a gigabyte
 VERTICES = 2000  # of a mesh, up to which it is drawn itself
 
 
@@ -68,7 +71,7 @@ class BodyMotion:
         return np.tile(np.reshape(found, (1, -1, 3)), (len(self.time), 1, 1))
 
 
-def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst: Worst) -> BodyMotion | None:
+def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst: Worst) -> BodyMotion:
     """The body in a trial, by the finest twin at hand, as it would be seen with the measurement errors of a fit.
 
     Args:
@@ -78,8 +81,8 @@ def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst
         clock: Offset of the recording's clock, as explained [s].
         worst: Of this trial.
 
-    Returns:
-        The motion; None where a simulation breaks down.
+    Raises:
+        ValueError: where a simulation breaks down, or is so long that it does not fit into memory with a whole surface.
     """
     recording = trial.recording
     assert recording is not None
@@ -91,10 +94,15 @@ def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst
     # What the finer twin would add is in its own motion.
     none = DiscretizationError(shift=() if problem.fine else problem.discretization.shift)
     there = problem.only([trial], twin=dataclasses.replace(twin, setup=setup), discretization=none, slips=())
+    samples = round(there.scenarios[0].until / SAMPLE)
+    if samples * len(places) > MOST:
+        raise ValueError(
+            f"trial {trial.name} is {samples * SAMPLE:g} s long, wanted at most {MOST * SAMPLE / len(places):.3g} s"
+        )
     still = np.zeros((1, len(problem.common)))
     motions = [m.alone() for (m,) in there.simulate([((), still), (fit.effects, fit.point[None])])]
     if not all(m.sound.all() for m in motions):
-        return None
+        raise ValueError(BREAKS)
     kept = np.unique(np.append(np.linspace(0, len(recording.time) - 1, FRAMES).round().astype(int), worst.sample))
     seen = dataclasses.replace(recording, time=recording.time[kept], position=recording.position[kept])
     observation = ObservationModel(setup, [dataclasses.replace(trial, recording=seen)], problem.priors)

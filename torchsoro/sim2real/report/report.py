@@ -96,7 +96,7 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     """The first screen: three errors, probabilities, trials that were left out, and the worst marker over time."""
     found, said = e.improvement, _said(e)
     if found is not None:
-        kind = f"{'held-out' if found.heldout else 'fitted'} trials"
+        kind = "in held-out trials" if found.heldout else "in the trials of the fit"
         # Of several that cannot be told apart, one is drawn.
         of = f" by {effect_words(e.verdict.chosen[0].name)}" if len(e.verdict.chosen) > 1 else ""
         page.numbers(
@@ -118,7 +118,7 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
                 ("", after, f"{millimetres(after)} {said.split()[0]}", 1),
             ]
         rows.append(("expected of noise and the simulation's own error", found.floor, millimetres(found.floor), 2))
-        page.bars(rows, f"Error of {kind}, root mean square over markers and time")
+        page.bars(rows, f"Error {kind}, root mean square over markers and time")
     if e.worst is not None:
         w = e.worst
         trial, believed, explained = trials[w.trial], e.drawn[w.trial], e.after[w.trial].seen
