@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from ringing import effect
+from scipy.spatial.transform import Rotation
 
 from torchsoro.output.slider import Moving, packed, unpacked
 from torchsoro.sim2real.data.schema import PlaneTable
@@ -58,18 +59,26 @@ def test_the_marked_moment_has_the_largest_distance_of_all_markers(shown):
 
 
 def test_the_body_is_drawn_where_its_markers_are(dragged, shown):
-    problem, _ = dragged
+    problem, fit = dragged
     trial, _, after, worst, body = shown
+    _, ln_scale, *turn = fit.errors[len(problem.trials) :][:5]
+    frame = math.exp(ln_scale) * Rotation.from_rotvec(turn).as_matrix().T
     assert body.time[body.worst] == worst.time and body.trial == trial.name
     kept = np.searchsorted(trial.recording.time, body.time)
-    assert np.abs(body.markers[1] - after.seen[kept]).max() < 1e-6
-    np.testing.assert_array_equal(body.recorded, trial.recording.position[kept])
+    assert np.abs(body.markers[1] @ frame - after.seen[kept]).max() < 1e-6
+    np.testing.assert_allclose(body.recorded @ frame, trial.recording.position[kept], atol=1e-12)
+    # What is clamped stays where the setup has it.
+    held = body.rest[:, 0] < 1e-9
+    assert held.any() and np.abs(body.explained[:, held] - body.rest[held]).max() < 2e-4
     # The tip's marker lies on the corner of the surface; only it has an error of its place.
     at_rest, _ = surface(problem.twin)
     tip = np.linalg.norm(at_rest - problem.twin.setup.markers[0].at, axis=1)
     assert tip.min() < 1e-6
     for simulated, markers in ((body.believed, body.markers[0]), (body.explained, body.markers[1])):
         assert np.abs(simulated[:, tip.argmin()] - markers[:, 0]).max() < 2e-3
+    # A place of the body is where the surface around it is.
+    corner = body.moved(at_rest[tip.argmin()])
+    assert np.linalg.norm(corner - body.explained[body.worst][tip.argmin()]) < 1e-3
     moved = np.linalg.norm(body.explained[body.worst] - body.believed[body.worst], axis=1)
     assert moved[tip.argmin()] == pytest.approx(worst.believed, rel=0.2)
 

@@ -102,7 +102,7 @@ class Mismatch:
         worst = together(self.before)[self.time >= (self.start or 0.0)].max()
         return (
             f"Trial {self.trial}: the recording leaves the simulation {self.where}; from then on they are up to "
-            f"{worst:.2g} standard deviations of noise and of the simulation's own error apart."
+            f"{float(f'{worst:.2g}'):g} standard deviations of noise and of the simulation's own error apart."
         )
 
 

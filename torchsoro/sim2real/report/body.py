@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.data.schema import Marker
@@ -18,6 +20,7 @@ from torchsoro.sim2real.twin.batch import SAMPLE
 from torchsoro.sim2real.twin.grid import BODY
 from torchsoro.sim2real.twin.twin import Twin
 
+NEAR = 8  # vertices that a place moves with
 FRAMES = 60  # of a motion, that are kept
 FACES = 600  # of a surface, up to which it is divided
 MOST = 4_000_000  # vertices times samples, which take a gigabyte
@@ -26,13 +29,14 @@ VERTICES = 2000  # of a mesh, up to which it is drawn itself
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BodyMotion:
-    """Surfaces and markers of a trial; places are in the frame of the recording.
+    """Surfaces and markers of a trial, in the frame of the setup, into which recorded places are brought.
 
     Attributes:
         trial: Its name.
         time: Of the frames by the recording's clock [F] s.
         worst: Number of the frame in which the recording is the furthest from what was believed.
         marker: Number of the marker that is.
+        rest: The surface at rest [V, 3] m.
         faces: Vertices of the surface's polygons [Q, 3 or 4].
         believed: The surface [F, V, 3] m.
         explained: The same [F, V, 3] m.
@@ -44,6 +48,7 @@ class BodyMotion:
     time: np.ndarray
     worst: int
     marker: int
+    rest: np.ndarray
     faces: np.ndarray
     believed: np.ndarray
     explained: np.ndarray
@@ -54,6 +59,11 @@ class BodyMotion:
     def travel(self) -> float:
         """How far a place of the surface gets from where it begins, at most [m]."""
         return max(float(np.linalg.norm(x - x[0], axis=-1).max()) for x in (self.believed, self.explained))
+
+    def moved(self, place: np.ndarray) -> np.ndarray:
+        """Where a place of the body at rest [3] m is at the worst moment, as explained: with the surface around it."""
+        near = np.argsort(np.linalg.norm(self.rest - place, axis=1))[:NEAR]
+        return place + (self.explained[self.worst] - self.rest)[near].mean(0)
 
     def planes(self, setup: Setup) -> np.ndarray:
         """Corners of planes across an axis, as far as the body gets, one after the other [F, 4 P, 3] m."""
@@ -72,7 +82,7 @@ class BodyMotion:
 
 
 def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst: Worst) -> BodyMotion:
-    """The body in a trial, by the finest twin at hand, as it would be seen with the measurement errors of a fit.
+    """The body in a trial, by the finest twin at hand; from recorded places, errors of clock and frame are taken away.
 
     Args:
         problem: The fit's.
@@ -112,11 +122,14 @@ def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst
     believed, explained = (observation.observe(m, 0, errors) for m in motions)
     recorded = explained[:, count:].copy()
     recorded[..., list(problem.experiment.setup.axes)] = seen.position
+    back = Rotation.from_rotvec(known[2:5]).as_matrix() / math.exp(known[1])
+    believed, explained, recorded = (x @ back for x in (believed, explained, recorded))
     return BodyMotion(
         trial=trial.name,
         time=seen.time,
         worst=int(np.searchsorted(kept, worst.sample)),
         marker=worst.marker,
+        rest=places,
         faces=faces,
         believed=believed[:, :count],
         explained=explained[:, :count],

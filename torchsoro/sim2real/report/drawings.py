@@ -152,7 +152,7 @@ def draw_body(
         body: Its motion.
         setup: Of the trial.
         places: Of effects, with their names.
-        forces: That would be needed.
+        forces: That would be needed, of which those of this trial are drawn.
         said: What the second simulation is.
     """
     one, other = view = side_view(body, setup)
@@ -182,13 +182,16 @@ def draw_body(
     whole.set_ylabel(f"{'xyz'[other]} [mm]", fontsize=8)
     _surroundings(whole, setup, view)
     for name, place in places:
-        whole.plot(*(1e3 * place[list(view)]), "x", ms=9, mew=2.4, color=PLACE, label=name)
-    needed = [] if forces is None else forces.needed
-    for n in needed[:3]:
-        arrow = 0.3 * max(setup.size) * n.force / np.linalg.norm(needed[0].force)
-        ends = 1e3 * np.stack([n.place, n.place + arrow])[:, view]
-        whole.annotate("", ends[1], ends[0], arrowprops={"arrowstyle": "-|>", "color": PLACE, "lw": 2})
-        whole.annotate(f"{np.linalg.norm(n.force):.2g} N, trial {n.trial}", ends[1], fontsize=7, color=PLACE)
+        whole.plot(*(1e3 * body.moved(place)[list(view)]), "x", ms=9, mew=2.4, color=PLACE, label=name)
+    needed = [] if forces is None else [n for n in forces.needed if n.trial == body.trial]
+    for n in needed[:2]:
+        ends = body.moved(n.place) + 0.3 * max(setup.size) / np.linalg.norm(needed[0].force) * np.outer((0, 1), n.force)
+        begin, end = 1e3 * ends[:, view]
+        whole.annotate("", end, begin, arrowprops={"arrowstyle": "-|>", "color": PLACE, "lw": 2})
+        when = "throughout" if n.whole else f"{n.start:.2g} to {n.end:.2g} s"
+        label = f"{np.linalg.norm(n.force):.2g} N, {when}"
+        plate = {"fc": "white", "ec": "none", "alpha": 0.8, "pad": 1}
+        whole.annotate(label, end, xytext=(4, 4), textcoords="offset points", fontsize=7, color=PLACE, bbox=plate)
     whole.set_title(f"trial {body.trial} at {body.time[k]:.3g} s", fontsize=9)
     if count > 1:
         middle, half = 1e3 * (recorded[m] + believed[m])[list(view)] / 2, max(0.9 * apart, 0.02 * size.max())

@@ -150,7 +150,7 @@ def _body(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     page.figure(
         draw_body(body, setup, places, e.forces, said),
         f"The body where recording and belief are the furthest apart, to scale: as believed, and as {said}. Lines join "
-        "each recorded marker to where the simulations have it.",
+        "each recorded marker, by the scale and the rotation that were fitted, to where the simulations have it.",
     )
     if body.travel > FAR * max(setup.size):
         one, other = side_view(body, setup)
