@@ -181,6 +181,18 @@ def test_probability_of_a_box_far_in_the_tail_keeps_its_digits():
     assert found == pytest.approx(stats.norm.logsf(20.0), rel=1e-12)
 
 
+@given(st.floats(0.01, 0.99), st.sampled_from([math.inf, 4.0]), st.floats(-2.0, 0.0), st.floats(0.5, 9.0))
+def test_a_quantile_of_a_prior_has_its_share_of_the_mass_below(u, freedom, low, width):
+    prior = Prior(1.5, freedom=freedom, low=low, high=low + width)
+    at = float(prior.quantile(np.array([u]))[0])
+    assert quad(lambda x: math.exp(prior.ln_density(x)), low, at)[0] == pytest.approx(u, abs=1e-6)
+
+
+def test_a_quantile_of_a_uniform_prior_is_that_share_of_the_way():
+    prior = Prior(math.inf, low=-1.0, high=3.0)
+    assert prior.quantile(np.array([0.0, 0.25, 1.0])).tolist() == [-1.0, 0.0, 3.0]
+
+
 @pytest.mark.parametrize("numbers", [{"scale": 0.0}, {"scale": math.inf}, {"scale": 1.0, "low": 2.0, "high": 1.0}])
 def test_a_prior_that_is_no_density_is_refused(numbers):
     with pytest.raises(ValueError, match="wanted"):

@@ -55,6 +55,14 @@ class Prior:
         low, high = norm.cdf(ends) if math.isinf(self.freedom) else t.cdf(ends, self.freedom)
         return math.log(float(high) - float(low))
 
+    def quantile(self, u: np.ndarray) -> np.ndarray:
+        """Values below which the distribution has shares u of its mass, 0 to 1."""
+        if math.isinf(self.scale):
+            return self.low + u * (self.high - self.low)
+        law = norm if math.isinf(self.freedom) else t(self.freedom)
+        low, high = law.cdf(np.array([self.low, self.high]) / self.scale)
+        return np.clip(self.scale * law.ppf(low + u * (high - low)), self.low, self.high)
+
     def ln_density(self, x: float) -> float:
         """Ln of the density at a value within the bounds."""
         if math.isinf(self.scale):
