@@ -9,9 +9,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from ringing import effect
 from scipy.spatial.transform import Rotation
 
+from torchsoro.design.mesh import Surface
 from torchsoro.output.slider import Moving, packed, unpacked
 from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
@@ -111,6 +113,17 @@ def test_the_surface_is_closed_and_has_the_area_of_the_body(made):
     assert np.linalg.norm(normals, axis=1).sum() == pytest.approx(2 * (x * y + y * z + z * x))
     # Normals point out: the divergence theorem gives the volume.
     assert (normals * (a + b + c + d) / 12).sum() == pytest.approx(x * y * z)
+
+
+def test_a_fine_mesh_is_coarsened_and_stays_where_it_is():
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.02)
+    twin = SimpleNamespace(setup=SimpleNamespace(surface=Surface(mesh=ball), size=(0.04, 0.04, 0.04)))
+    vertices, faces = surface(twin)
+    assert 300 < len(faces) <= 1200 < len(ball.faces)
+    radii = np.linalg.norm(vertices, axis=1)
+    assert 0.018 < radii.min() and radii.max() < 0.0201
+    coarse = trimesh.Trimesh(vertices, faces)
+    assert coarse.area == pytest.approx(ball.area, rel=0.05) and coarse.volume == pytest.approx(ball.volume, rel=0.05)
 
 
 def test_the_view_from_the_side_keeps_the_axis_along_which_the_worst_marker_is_off(shown):

@@ -22,9 +22,8 @@ from torchsoro.sim2real.twin.twin import Twin
 
 NEAR = 8  # vertices that a place moves with
 FRAMES = 60  # of a motion, that are kept
-FACES = 600  # of a surface, up to which it is divided
+FACES = 1200  # of a surface, at most
 MOST = 4_000_000  # vertices times samples, which take a gigabyte
-VERTICES = 2000  # of a mesh, up to which it is drawn itself
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -139,14 +138,19 @@ def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst
 
 
 def surface(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
-    """The outside of a body at rest: its mesh if that is small, else sides of its cells, divided to be about even.
+    """The outside of a body at rest: its mesh, coarsened, or the sides of a box's cells, divided to be about even.
 
     Returns:
         Vertices [V, 3] m, and polygons [Q, 3 or 4].
     """
-    mesh = None if twin.setup.surface is None else twin.setup.surface.mesh
-    if mesh is not None and len(mesh.vertices) <= VERTICES:
-        return np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+    if twin.setup.surface is not None:
+        # Corners of cells that are filled in part lie off the body.
+        mesh, width = twin.setup.surface.mesh, 0.02 * max(twin.setup.size)
+        vertices, faces = np.asarray(mesh.vertices, float), np.asarray(mesh.faces)
+        while len(faces) > FACES:
+            vertices, faces = _clustered(vertices, faces, width)
+            width *= 1.2
+        return vertices, faces
     # Chambers are inside.
     solid = np.pad(twin.grid.hole >= BODY, 1)
     planes = [axis.planes for axis in twin.grid.axes]
@@ -166,9 +170,21 @@ def surface(twin: Twin) -> tuple[np.ndarray, np.ndarray]:
     corners, index = np.unique(sides.reshape(-1, 3), axis=0, return_inverse=True)
     vertices = np.stack([planes[a][corners[:, a]] for a in range(3)], -1)
     faces = index.reshape(-1, 4)
-    while 4 * len(faces) <= FACES:
+    while 8 * len(faces) <= FACES:
         vertices, faces = _divided(vertices, faces)
     return vertices, faces
+
+
+def _clustered(vertices: np.ndarray, faces: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh whose vertices in each cube of this width [m] are one (Rossignac and Borrel 1993)."""
+    _, index = np.unique(np.floor(vertices / width).astype(int), axis=0, return_inverse=True)
+    count = np.bincount(index.ravel())
+    middle = np.stack([np.bincount(index.ravel(), x) / count for x in vertices.T], -1)
+    corners = index.ravel()[faces]
+    one, two, three = corners.T
+    corners = corners[(one != two) & (two != three) & (three != one)]
+    _, first = np.unique(np.sort(corners, 1), axis=0, return_index=True)
+    return middle, corners[np.sort(first)]
 
 
 def _divided(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

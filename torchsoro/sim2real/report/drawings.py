@@ -169,7 +169,8 @@ def draw_body(
         for surface, color in ((body.believed, NOMINAL), (body.explained, EXPLAINED)):
             polygons = 1e3 * surface[k][:, view][body.faces]
             panel.add_collection(PolyCollection(polygons, facecolors=color, edgecolors="none", alpha=0.1))
-            panel.add_collection(PolyCollection(polygons, facecolors="none", edgecolors=color, lw=0.4, alpha=0.35))
+            width = 0.4 if body.faces.shape[1] == 4 else 0.15  # triangles are many
+            panel.add_collection(PolyCollection(polygons, facecolors="none", edgecolors=color, lw=width, alpha=0.35))
         for there, color, label in ((believed, NOMINAL, "believed"), (explained, EXPLAINED, said)):
             ends = 1e3 * np.stack([recorded, there], 1)[..., view]
             panel.add_collection(LineCollection(list(ends), colors=color, lw=1.0))
