@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,11 +21,14 @@ from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.phases import mismatches
+from torchsoro.sim2real.inference.verdict import weighed
 from torchsoro.sim2real.report.body import body_motion, surface
 from torchsoro.sim2real.report.drawings import side_view
-from torchsoro.sim2real.report.explanation import effect_rows
+from torchsoro.sim2real.report.explanation import Explanation, effect_rows
 from torchsoro.sim2real.report.improvement import Improvement, distances, worst_of
-from torchsoro.sim2real.report.words import interval
+from torchsoro.sim2real.report.report import write
+from torchsoro.sim2real.report.words import digits, interval
 from torchsoro.simulation.contact import Plane
 
 POSITIVE = {"time_s", "time_constant_s", "mass_kg", "stiffness_n_m", "damping_n_s_m", "reach_m", "viscosity_pa_s"}
@@ -192,3 +197,42 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
     extent = 1e3 * (np.nanmax(places, (0, 1)) - np.nanmin(places, (0, 1))).max()
     assert np.nanmax(np.abs(found - 1e3 * places)) <= 0.51 * extent / 20000
     assert [part["start"] for part in data["parts"]] == [0, 8]
+
+
+@pytest.mark.parametrize("kind", ["nothing_missing", "cannot_tell", "unknown_physics", "cannot_distinguish"])
+def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, shown, kind, tmp_path):
+    problem, fit = dragged
+    _, _, _, worst, body = shown
+    (null_model,) = problem.fit([((), None)], rounds=2)
+    found = weighed(problem, [effect("drag")], null_model, [fit], report=lambda line: None)
+    named = kind == "cannot_distinguish"
+    verdict = dataclasses.replace(
+        found, kind=kind, chosen=2 * found.chosen[:1] if named else (), heldout={"a": (3e-3, 1e-4), "b": (4e-3, 2e-4)}
+    )
+    before, after = (tuple(predict(problem, verdict.best, problem.trials, believed=b)) for b in (True, False))
+    told = Explanation(
+        problem=problem,
+        discretization=problem.discretization,
+        verdict=verdict,
+        before=before,
+        after=after,
+        drawn=tuple(p.seen for p in before),
+        heldout=(),
+        seconds=1.0,
+        mismatches=tuple(mismatches(problem, null_model, problem.trials, after)),
+        worst=worst,
+        body=body,
+    )
+    write(told, problem.trials, tmp_path, {})
+    answer = json.loads((tmp_path / "explanation.json").read_text())
+    page = (tmp_path / "report.html").read_text()
+    assert answer["improvement"]["heldout"] and answer["improvement"]["trials"] == ["a", "b"]
+    large = [f"{digits(1e3 * answer['improvement'][key])} mm" for key in ("believed_m", "explained_m", "floor_m")]
+    assert re.findall(r"<b>([^<]*)</b>", page) == large and large[0] == "3.54 mm"
+    assert ("error as explained by drag" in page) == named and ("fitted without an effect" in page) != named
+    assert answer["worst"]["trial"] == "b" and answer["worst"]["time_s"] == worst.time
+    lengths = [float(x) for x in re.findall(r'<rect class="\w+" width="([\d.]+)"', page)]
+    bars = [100 * p for p in sorted(answer["probabilities"].values(), reverse=True)]
+    assert lengths[: len(bars)] == pytest.approx([max(b, 0.4) for b in bars], abs=0.06)
+    assert lengths[len(bars) : len(bars) + 4] == pytest.approx([100.0, 5.0, 75.0, 2.5], abs=0.06)
+    assert page.count("slider(document.currentScript") == 1 and len(page) < 2e6
