@@ -96,7 +96,9 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
     """The first screen: three errors, probabilities, trials that were left out, and the worst marker over time."""
     found, said = e.improvement, _said(e)
     if found is not None:
-        kind = "in held-out trials" if found.heldout else "in the trials of the fit"
+        kind = "in the trials of the fit"
+        if found.heldout:
+            kind = "in held-out trials" if e.heldout else "in trials predicted from the others"
         # Of several that cannot be told apart, one is drawn.
         of = f" by {effect_words(e.verdict.chosen[0].name)}" if len(e.verdict.chosen) > 1 else ""
         page.numbers(
