@@ -117,6 +117,7 @@ class Simulator(nn.Module):
         weight: Tensor | None = None,
         start: Trajectory | Tensor | Start | None = None,
         divergence: Literal["raise", "mark"] = "raise",
+        record: Literal["all", "probes"] = "all",
         progress: Callable[[int, int], None] | None = None,
     ) -> Trajectory:
         """Simulate.
@@ -139,6 +140,8 @@ class Simulator(nn.Module):
                 at zero. The undeformed body at time zero if None.
             divergence: Whether a simulation that diverges raises, or is marked (``Trajectory.sound``) while the others
                 of the batch go on as they would without it; in lanes of a CPU only, without a gradient.
+            record: "probes" leaves out centre of gravity, chamber volumes and pressures, which then have no numbers
+                [..., S, 0]; with places as probes and simulations that are marked only.
             progress: Called between stretches of the simulation, up to a hundred without a gradient, with the substeps
                 that are done and their number in all.
 
@@ -160,6 +163,10 @@ class Simulator(nn.Module):
             raise ValueError(
                 "divergence = 'mark': diverge apart: wanted the total-Lagrangian formulation in lanes of a CPU"
             )
+        if record not in ("all", "probes"):
+            raise ValueError(f"record = {record!r}: wanted 'all' or 'probes'")
+        if record == "probes" and (divergence != "mark" or probes is None or not probes.is_floating_point()):
+            raise ValueError("record = 'probes': wanted places as probes, and divergence = 'mark'")
         check_body(body)
         self.formulation.check_planes(planes)
         if start is None:
@@ -189,7 +196,7 @@ class Simulator(nn.Module):
             others=[(start.displacement, 2), (start.velocity, 2)] if isinstance(start, Start) else [],
         )
         scene = self._scene(attached, planes, where[:0, 0].long() if where.is_floating_point() else where, dt)
-        scene = replace(scene, apart=divergence == "mark")
+        scene = replace(scene, apart=divergence == "mark", only_markers=record == "probes")
         velocity = torch.zeros_like(x) if body.velocity is None else body.velocity
         x, velocity, weights = wide(x, 2), wide(velocity, 2), wide(mass, 1)
         scene, whole, x, velocity, weights = self.formulation.place(scene, whole, x, velocity, weights)
@@ -244,6 +251,8 @@ class Simulator(nn.Module):
         found = torch.stack([torch.isfinite(t.detach()).flatten(lead).all(lead) for t in recorded.values()]).all(0)
         for name in ("position", "center_of_gravity"):
             x = recorded[name].detach()
+            if not x.shape[-1]:  # not recorded
+                continue
             inside = (x > x.new_tensor(self.low)) & (x < x.new_tensor(self.high))
             found &= inside.flatten(lead).all(lead)
         return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from threading import local
 
 import numpy as np
 import torch
@@ -42,9 +42,14 @@ from torchsoro.simulation.threads import thread_count
 _ROOM = 2**22  # numbers of samples that are observed at a time
 
 
-@cache
+_own = local()
+
+
 def _pool(threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads)
+    """Threads that march with the caller: no other's, since those that share some could wait for each other for ever."""
+    if getattr(_own, "threads", 0) != threads:
+        _own.threads, _own.pool = threads, ThreadPoolExecutor(threads)
+    return _own.pool
 
 
 def in_lanes(scene: Scene, like: Tensor) -> bool:
@@ -86,6 +91,8 @@ class LaneIntegrator:
         self.lanes: Lanes = lay_out(scene.lattice, scene.kind, self.batch, like.dtype)
         self.mesh: Mesh = self.lanes.mesh
         self.history = 6 * self.elements + scene.softens
+        # Nodes whose motion is observed; all if None.
+        self.near = scene.markers.near if scene.only_markers and scene.markers is not None else None
         constants = [like, inputs.prony, inputs.planes, inputs.softening, inputs.fluid, inputs.ties]
         constants += [inputs.air, inputs.attached]
         self.nodal, case = once(scene, "case", constants, self._constants)
@@ -239,7 +246,7 @@ class LaneIntegrator:
         at = np.full(self.steps + 1, -1)
         inner = [k for k in self.samples if k > 0]
         at[inner] = np.arange(len(inner))
-        seen = start.new_zeros(len(inner), lanes.groups, 6, mesh.component)
+        seen = kept_memory(start, len(inner), lanes.groups, 6, mesh.component)
         slots = self.steps if keep else 1
         # Velocities before drag, which those after a substep do not tell.
         touching = slots if keep and (len(self.case.plane_stick) or self.case.quadratic.size) else 0
@@ -249,12 +256,16 @@ class LaneIntegrator:
         threads = thread_count()
         work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
         if 0 in self.samples:
-            observe(0, start)
+            motion = start[:, : 6 * nodes].unflatten(1, (6, nodes))
+            observe(0, start if self.near is None else motion[..., self.near].flatten(1))
         done = min(self._march(work, march, self.steps, ring, past, not self.scene.apart))
         self.kept = (states, histories, pushed, volumes)
         if done < self.steps:
             last = lanes.to_nodes(states[done % ring].view(groups, 6, -1)).reshape(self.batch, -1)
             report(self.scene, self.inputs, self.first + done, last)
+        if self.near is not None and inner:
+            observe(inner, lanes.to_some_nodes(seen, self.near).flatten(2))
+            inner = []
         each = max(1, _ROOM // (self.batch * 6 * nodes))
         for first in range(0, len(inner), each):
             part = inner[first : first + each]

@@ -125,6 +125,14 @@ class Lanes:
             return rows.reshape(-1, *rows.shape[2:])[: self.batch].contiguous()
         return lanes[:, :, self.nodes]
 
+    def to_some_nodes(self, lanes: Tensor, some: Tensor) -> Tensor:
+        """What some nodes [U] have of samples by lane [S, groups, K, component], as [S, B, K, U]."""
+        at = self.nodes[some]
+        if self.variations:
+            found = lanes[..., at.unsqueeze(-1) + torch.arange(LANES)].permute(0, 1, 4, 2, 3)
+            return found.flatten(1, 2)[:, : self.batch]
+        return lanes[..., at]
+
     def from_batch(self, values: Tensor, axis: int = 0) -> Tensor:
         """Numbers of a simulation, with the batch along an axis, as [..., groups, ..., 16]."""
         if self.variations:

@@ -46,9 +46,9 @@ class Markers:
         """Displacements and velocities [..., M, 3], and derivatives of the former [..., M, 3, 3].
 
         Args:
-            motion: Displacements and velocities of the nodes [..., 6, nodes].
+            motion: Displacements and velocities of the nodes that are near [..., 6, U].
         """
-        found = (motion[..., self.near] @ self.matrix.to(motion)).unflatten(-1, (4, len(self.nodes)))
+        found = (motion @ self.matrix.to(motion)).unflatten(-1, (4, len(self.nodes)))
         d, v = found[..., :3, :, :], found[..., 3:, 0, :]
         return d[..., 0, :].transpose(-1, -2), v.transpose(-1, -2), d[..., 1:, :].movedim(-1, -3)
 

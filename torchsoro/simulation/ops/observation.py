@@ -4,7 +4,8 @@ The observations are seven tensors: positions and velocities of the probes [B, P
 there [B, P, 3, 3] if the probes are markers (else of none), position and velocity of the centre of gravity [B, 3],
 volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An adjoint takes the gradients by
 them and returns those by the arguments. In the total-Lagrangian form states and pressures may be those of several
-samples, with one more leading axis, which the observations then have, too.
+samples, with one more leading axis, which the observations then have, too. Where only markers are observed, the state
+is the motion of the nodes near them, and what is not observed has no numbers.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice
+from torchsoro.simulation.ops.markers import Markers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Scene
 
@@ -89,11 +91,14 @@ def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[
 def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
     lattice = scene.lattice
     assert lattice is not None
+    if scene.only_markers:
+        assert scene.markers is not None
+        none = state.new_zeros(*state.shape[:-1], 0)
+        return *_at_markers(scene.markers, state.unflatten(-1, (6, -1))), none, none, none, none
     d, v = _motion(state, lattice.nodes)
     motion = state[..., : 6 * lattice.nodes].unflatten(-1, (6, lattice.nodes))
     if scene.markers is not None:
-        moved, drift, gradient = scene.markers.observe(motion)
-        place, gradient = scene.markers.places + moved, gradient + torch.eye(3).to(state)
+        place, drift, gradient = _at_markers(scene.markers, motion[..., scene.markers.near])
     else:
         at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
         place = lattice.on("places", state)[scene.probes] + (d[..., at] * how).sum(-1).transpose(-1, -2)
@@ -124,6 +129,12 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
         torch.cat(volumes, -1),
         torch.cat(means, -1),
     )
+
+
+def _at_markers(markers: Markers, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Places, velocities and deformation gradients of markers, from the motion of the nodes near them [..., 6, U]."""
+    moved, drift, gradient = markers.observe(near)
+    return markers.places + moved, drift, gradient + torch.eye(3).to(near)
 
 
 def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:

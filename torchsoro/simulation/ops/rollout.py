@@ -125,6 +125,8 @@ def _observed(scene: Scene, inputs: Inputs, samples: Sequence[int]) -> tuple[tup
     batch, chambers = inputs.pressure.shape[1:]
     marked = 0 if scene.markers is None else len(scene.markers.places)
     at_probes, center, gas = (batch, marked or len(scene.probes), 3), (batch, 3), (batch, chambers)
+    if scene.only_markers:
+        center = gas = (batch, 0)
     shapes = (at_probes, at_probes, (batch, marked, 3, 3), center, center, gas, gas)
     return tuple((len(samples), *shape) for shape in shapes)
 

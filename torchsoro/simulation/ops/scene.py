@@ -56,6 +56,7 @@ class Scene:
         lattice: Of the total-Lagrangian form; None for the updated form.
         lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
         apart: Whether simulations that diverge go on with what is not finite, and the others are not disturbed.
+        only_markers: Whether nothing is recorded but the motion of the markers; where simulations go on apart only.
         steady: Whether the scene is of one run, whose segments have the same coefficients, Maxwell elements and planes.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
@@ -82,6 +83,7 @@ class Scene:
     markers: Markers | None = None
     lanes: bool = True
     apart: bool = False
+    only_markers: bool = False
     steady: bool = False
     handle: int = field(init=False, default_factory=_handles.__next__)
 
