@@ -55,11 +55,12 @@ def lagged(scenario: Scenario, tau: Tensor) -> Waveform:
     p = p.expand(len(tau), *p.shape[-2:])
     ratio = 2e-3 / tau.clamp(min=1e-9)[:, None]
     keep, early = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
-    found = [p[..., 0]]
-    for k in range(1, len(time)):
-        # Exact for a supply that changes linearly in a sample.
-        found.append(keep * found[-1] + (early - keep) * p[..., k - 1] + (1 - early) * p[..., k])
-    late = torch.where(tau[:, None, None] > 0, torch.stack(found, -1), p)
+    # Exact for a supply that changes linearly in a sample.
+    pushed = (early - keep).unsqueeze(-1) * p[..., :-1] + (1 - early).unsqueeze(-1) * p[..., 1:]
+    found, kept = torch.cat([p[..., :1], pushed], -1).movedim(-1, 0).contiguous().numpy(), keep.numpy()
+    for k in range(1, len(found)):
+        found[k] += kept * found[k - 1]
+    late = torch.where(tau[:, None, None] > 0, torch.from_numpy(found).movedim(0, -1), p)
     return Waveform(time=time, pressure=late)
 
 

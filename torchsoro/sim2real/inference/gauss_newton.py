@@ -171,9 +171,9 @@ class GaussNewton:
         base = [m.alone(0) for m in motions]
         chi2, errors, r, J = likelihood.measure(base, errors)
         columns = np.zeros((len(r), len(at)))
-        for k, i in enumerate(moving, start=1):
-            left = likelihood.residual([m.alone(k) for m in motions], errors)
-            columns[:, i] = (r - left) / steps[i]
+        if len(moving):
+            beside = likelihood.residual(motions, errors)[:, 1:]
+            columns[:, moving] = (r[:, None] - beside) / steps[moving]
         chi2 += float((likelihood.prior_residual(at, self.held)[0] ** 2).sum())
         if not (math.isfinite(chi2) and np.isfinite(columns).all()):
             return None

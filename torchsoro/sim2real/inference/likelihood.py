@@ -258,11 +258,12 @@ class Likelihood:
     # Residuals --------------------------------------------------------------------------------------------------
 
     def residual(self, motions: Sequence[MarkerTrajectory], errors: np.ndarray) -> np.ndarray:
-        """Whitened residual of all trials."""
+        """Whitened residual of all trials [N]; of motions with a batch [N, B]."""
         left = []
         for i, (motion, trial, noise_model) in enumerate(zip(motions, self.trials, self.noise_models, strict=True)):
             assert trial.recording is not None
-            left.append(noise_model.whiten(trial.recording.position - self.observation.observe(motion, i, errors)))
+            off = trial.recording.position - self.observation.observe(motion, i, errors)
+            left.append(noise_model.whiten(off if off.ndim == 3 else np.moveaxis(off, 0, -1)))
         return np.concatenate(left)
 
     def linear(self, motions: Sequence[MarkerTrajectory], errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -4,14 +4,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
+import numba
 import numpy as np
-from scipy.linalg import solve_triangular
 
 from torchsoro.sim2real.data.recording import Recording
 
 CORRELATION = 0.03  # correlation time of the twin's own error, and of the lasting part of the noise [s]
 LASTING = 0.25  # share of the noise's variance that is correlated in time
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Channel:
+    """Samples of equal covariance, and the recursion that whitens them (a Kalman filter, see ``state_space``).
+
+    Attributes:
+        rows: Numbers of the samples that were seen [R].
+        pairs: Marker and axis of each [P, 2].
+        keep: What is left of the expectation since the sample before [R].
+        gain: By which a sample changes the expectation [R].
+        scale: One over the standard deviation of a sample about its expectation [R].
+    """
+
+    rows: np.ndarray
+    pairs: np.ndarray
+    keep: np.ndarray
+    gain: np.ndarray
+    scale: np.ndarray
+
+    @classmethod
+    def of(cls, rows: np.ndarray, pairs: Sequence[tuple[int, int]], time: np.ndarray, white: float, slow: float) -> Channel:
+        """Of variances of white noise and of what is correlated, at times [R] s."""
+        keep, gain, scale = np.zeros((3, len(rows)))
+        variance, last = slow, float(time[0])
+        for r, now in enumerate(time.tolist()):
+            keep[r] = math.exp((last - now) / CORRELATION)
+            variance, last = slow + keep[r] ** 2 * (variance - slow), now
+            gain[r], scale[r] = variance / (variance + white), 1 / math.sqrt(variance + white)
+            variance *= 1 - gain[r]
+        return cls(rows=rows, pairs=np.array(pairs), keep=keep, gain=gain, scale=scale)
+
+    def whiten(self, values: np.ndarray) -> np.ndarray:
+        """Of columns [P, R, C], ones of unit covariance."""
+        return _innovations(np.ascontiguousarray(values, dtype=np.float64), self.keep, self.gain, self.scale)
 
 
 class NoiseModel:
@@ -27,33 +63,40 @@ class NoiseModel:
     def __init__(
         self, recording: Recording, noise: float, discretization: np.ndarray, lasting: float = LASTING
     ) -> None:
-        lag = np.abs(recording.time[:, None] - recording.time[None, :])
-        correlation = np.exp(-lag / CORRELATION)
-        self.channels: list[tuple[np.ndarray, list[tuple[int, int]], np.ndarray]] = []
-        known: dict[tuple[bytes, float], int] = {}
+        alike: dict[tuple[bytes, float], list[tuple[int, int]]] = {}
         for m, a in np.ndindex(*discretization.shape):
             rows = np.flatnonzero(recording.seen[:, m, a])
-            if not len(rows):
-                continue
-            key = rows.tobytes(), float(discretization[m, a])
-            if key in known:
-                self.channels[known[key]][1].append((m, a))
-                continue
-            known[key] = len(self.channels)
-            slow = lasting * noise**2 + discretization[m, a] ** 2
-            covariance = (1 - lasting) * noise**2 * np.eye(len(rows)) + slow * correlation[np.ix_(rows, rows)]
-            root = np.linalg.cholesky(covariance)
-            self.channels.append((rows, [(m, a)], solve_triangular(root, np.eye(len(rows)), lower=True)))
-        self.count = sum(len(rows) * len(pairs) for rows, pairs, _ in self.channels)
+            if len(rows):
+                alike.setdefault((rows.tobytes(), float(discretization[m, a])), []).append((m, a))
+        self.channels: list[Channel] = []
+        for (_, deviation), pairs in alike.items():
+            rows = np.flatnonzero(recording.seen[:, *pairs[0]])
+            white, slow = (1 - lasting) * noise**2, lasting * noise**2 + deviation**2
+            self.channels.append(Channel.of(rows, pairs, recording.time[rows], white, slow))
+        self.count = sum(len(c.rows) * len(c.pairs) for c in self.channels)
 
     def whiten(self, values: np.ndarray) -> np.ndarray:
         """Residuals [T, M, A, ...] to [samples, ...] of unit covariance, if noise and twin are as stated."""
         parts = []
-        for rows, pairs, inverse in self.channels:
-            v = np.stack([values[rows, m, a] for m, a in pairs])
-            flat = inverse @ v.reshape(len(pairs), len(rows), -1)
-            parts.append(flat.reshape(-1, *values.shape[3:]))
+        for c in self.channels:
+            picked = values[c.rows, c.pairs[:, :1], c.pairs[:, 1:]]
+            parts.append(c.whiten(picked.reshape(*picked.shape[:2], -1)).reshape(-1, *values.shape[3:]))
         return np.concatenate(parts)
+
+
+@numba.njit(cache=True)
+def _innovations(values, keep, gain, scale):
+    """Samples less what is expected of them, over the standard deviation of that."""
+    found = np.empty_like(values)
+    for p in range(values.shape[0]):
+        mean = np.zeros(values.shape[2])
+        for r in range(values.shape[1]):
+            for c in range(values.shape[2]):
+                mean[c] *= keep[r]
+                left = values[p, r, c] - mean[c]
+                mean[c] += gain[r] * left
+                found[p, r, c] = scale[r] * left
+    return found
 
 
 def estimate_noise(recordings: Sequence[Recording]) -> float:

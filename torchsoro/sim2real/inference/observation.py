@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
+# Of a rotation about x, y, z: the change of a place is this matrix times the place.
+SPINS = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
 CLOCK_LIMIT = 3.0  # standard deviations of a clock offset, beyond which it is not looked for
 
 
@@ -102,18 +103,18 @@ class ObservationModel:
         """The recording of trial ``number``.
 
         Args:
-            motion: Of that trial, without a batch.
+            motion: Of that trial, with or without a batch.
             number: Of the trial.
             errors: Measurement errors [K].
 
         Returns:
-            Coordinates at the times of the recording [T, M, A] m.
+            Coordinates at the times of the recording [..., T, M, A] m.
         """
         own, place, frame = self._view(motion, number, errors)
         return self._recorded(_at(motion, own, place)[0] @ frame.T, number, errors)
 
     def linearise(self, motion: MarkerTrajectory, number: int, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`see`, and the derivatives of the places by the errors [T, M, A, K]."""
+        """As :meth:`observe`, without a batch, and the derivatives of the places by the errors [T, M, A, K]."""
         count, rate = len(self.trials), errors[len(self.trials)]
         own, place, frame = self._view(motion, number, errors)
         body, velocity, gradient = _at(motion, own, place)
@@ -124,8 +125,7 @@ class ObservationModel:
         by[..., number] = -turned / (1 + rate)
         by[..., count] = -turned * own[:, None, None] / (1 + rate)
         by[..., count + 1] = seen
-        for axis, unit in enumerate(np.eye(3)):
-            by[..., count + 2 + axis] = np.cross(unit, seen)
+        by[..., count + 2 : count + 5] = np.einsum("aij,tmj->tmia", SPINS, seen)
         moved = np.einsum("ia,tmaj->tmij", frame, gradient)
         for m in range(self.markers):
             by[:, m, :, count + 5 + 3 * m : count + 8 + 3 * m] = moved[:, m]
@@ -156,20 +156,28 @@ class ObservationModel:
         ]
 
     def _recorded(self, seen: np.ndarray, number: int, errors: np.ndarray) -> np.ndarray:
-        """Places [T, M, 3] m with what slips, along the axes that are recorded."""
+        """Places [..., T, M, 3] m with what slips, along the axes that are recorded."""
         seen = seen.copy()
         for marker, first, course in self._slipping(number):
-            seen[:, marker] += course[:, None] * errors[first : first + 3]
-        return seen[:, :, list(self.setup.axes)]
+            seen[..., marker, :] += course[:, None] * errors[first : first + 3]
+        return seen[..., list(self.setup.axes)]
 
 
 def _at(motion: MarkerTrajectory, time: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places [T, M, 3] m and velocities [T, M, 3] m/s at times, and deformation gradients [T, M, 3, 3].
+    """Places [..., T, M, 3] m and velocities [..., T, M, 3] m/s at times, and deformation gradients [..., T, M, 3, 3].
 
-    The places are of points at a distance ``beside`` [M, 3] m from the motion's own in the undeformed body.
+    The places are of points at a distance ``beside`` [M, 3] m from the motion's own in the undeformed body. Between two
+    samples they move along the cubic that has the places and velocities of both; the gradients change linearly.
     """
-    course = CubicHermiteSpline(motion.time, motion.position, motion.velocity)
     last = np.clip(np.searchsorted(motion.time, time, side="right") - 1, 0, len(motion.time) - 2)
-    s = ((time - motion.time[last]) / (motion.time[last + 1] - motion.time[last]))[:, None, None, None]
-    gradient = (1 - s) * motion.deformation[last] + s * motion.deformation[last + 1]
-    return course(time) + np.einsum("tmij,mj->tmi", gradient, beside), course(time, 1), gradient
+    step = motion.time[last + 1] - motion.time[last]
+    s, step = ((time - motion.time[last]) / step)[:, None, None], step[:, None, None]
+    begin, end = motion.position[..., last, :, :], motion.position[..., last + 1, :, :]
+    first, second = step * motion.velocity[..., last, :, :], step * motion.velocity[..., last + 1, :, :]
+    way = end - begin
+    bend, twist = 3 * way - 2 * first - second, first + second - 2 * way
+    place = begin + s * (first + s * (bend + s * twist))
+    velocity = (first + s * (2 * bend + s * (3 * twist))) / step
+    s = s[..., None]
+    gradient = (1 - s) * motion.deformation[..., last, :, :, :] + s * motion.deformation[..., last + 1, :, :, :]
+    return place + np.einsum("...mij,mj->...mi", gradient, beside), velocity, gradient

@@ -45,6 +45,7 @@ def ranked_starts(
     prior = np.concatenate([slope, 1 / problem.observation.deviations])
     known = np.concatenate([np.where(slope > 0, residual / np.where(slope > 0, slope, 1), 0), base.errors])
     sound = np.all([m.sound for m in motions], axis=0)
+    beside = problem.residual(motions, base.errors)
     ranked, at = [], 0
     if held.any():
         # The effect is a number of the setup without its prior: its response is known at the base.
@@ -63,14 +64,13 @@ def ranked_starts(
         at += n
         if not sound[list(mine)].all():
             continue
-        left = [problem.residual([m.alone(k) for m in motions], base.errors) for k in mine]
-        slopes = np.stack([base.r - r for r in left], 1)
+        slopes = base.r[:, None] - beside[:, mine]
         if number < linear:
             far = EXTRAPOLATED if effect.joint or effect.local else WEAK_REACH / weak
             begin, reach = base.r, _reach(directions[:, :kinds], low[count:], high[count:], far)
             offset = np.zeros(n)
         else:
-            begin, reach, offset = left[0], (np.array([-AROUND]), np.array([AROUND])), np.ones(1)
+            begin, reach, offset = beside[:, mine[0]], (np.array([-AROUND]), np.array([AROUND])), np.ones(1)
         J = np.concatenate([slopes, base.columns, base.J], 1)
         rows = np.concatenate([np.zeros((len(prior), n)), np.diag(prior)], 1)
         free = np.full(len(prior), np.inf)

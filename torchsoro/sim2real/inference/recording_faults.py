@@ -31,13 +31,14 @@ def find_slips(
         tried = np.linspace(time[0], time[-1], 62)[1:-1]
         courses = np.stack([MarkerSlip(trial=trial.name, marker=0, start=t).course(time) for t in tried], -1)
         found = np.zeros((markers, len(tried)))
-        for rows, pairs, inverse in noise_model.channels:
-            steps = inverse @ courses[rows]
-            ones = (inverse @ np.ones(len(rows)))[:, None]
+        for channel in noise_model.channels:
+            rows = channel.rows
+            steps = channel.whiten(courses[None, rows])[0]
+            ones = channel.whiten(np.ones((1, len(rows), 1)))[0]
             # Apart from where the marker is from the start on.
             steps = steps - ones * (ones.T @ steps) / float((ones**2).sum())
-            for m, a in pairs:
-                white = inverse @ r[rows, m, a]
+            for m, a in channel.pairs:
+                white = channel.whiten(r[None, rows, m, a, None])[0, :, 0]
                 excess += float(white @ white) - len(rows)
                 white = white - ones[:, 0] * float(ones[:, 0] @ white) / float((ones**2).sum())
                 found[m] += (steps.T @ white) ** 2 / ((steps**2).sum(0) + 1e-9)

@@ -75,7 +75,8 @@ def simulate(
         alike.setdefault(_kind(s), []).extend((i, b) for b in range(s.batch))
     groups = []
     for members in alike.values():
-        members.sort(key=lambda lane: steps[lane[0]][lane[1]])
+        # What is alike goes together: all of a group take the time of the most elements, and the shortest step.
+        members.sort(key=lambda lane: (*_extras(scenarios[lane[0]]), steps[lane[0]][lane[1]]))
         groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
     markers = torch.tensor([m.at for m in twin.setup.markers], dtype=torch.float64).reshape(-1, 3)
     samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
@@ -128,20 +129,31 @@ def stable(grid: Grid, s: Scenario, share: float) -> np.ndarray:
     nu = s.poisson_ratio.unsqueeze(-1)
     bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
     bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch) for m in (bulk, shear))
-    steep, dt = max(a.steep for a in grid.axes), torch.ones(s.batch, dtype=torch.float64)
+    steep, dt = max(a.steep for a in grid.axes), np.ones(s.batch)
+    bulk, shear = bulk.numpy(), shear.numpy()
     for _ in range(1 if s.prony is None else HALVINGS):
-        factor = torch.ones_like(dt) if s.prony is None else 1 + s.prony.step_moduli(dt.unsqueeze(-1)).sum(-1)
-        speed = torch.maximum(math.sqrt(3) * bulk, torch.sqrt(2 * factor) * shear)
+        factor = 1.0 if s.prony is None else 1 + _step_moduli(s.prony, dt)
+        speed = np.maximum(math.sqrt(3) * bulk, np.sqrt(2 * factor) * shear)
         bound = share * 2 / (speed * math.sqrt(steep))
-        dt = bound if s.prony is None else torch.sqrt(dt * bound)
-    return dt.clamp(max=SAMPLE).numpy()
+        dt = bound if s.prony is None else np.sqrt(dt * bound)
+    return np.minimum(dt, SAMPLE)
+
+
+def _step_moduli(prony: Prony, dt: np.ndarray) -> np.ndarray:
+    """The sum of ``Prony.step_moduli`` for a step of each variation [B], a hundred times a generation."""
+    ratio = dt[:, None] / prony.times.numpy()
+    return (prony.moduli.numpy() * -2 * np.expm1(-ratio) / (ratio * (1 + np.exp(-ratio)))).sum(-1)
 
 
 def _kind(s: Scenario) -> object:
-    """What the variations of a group must have in common: numbers of elements and springs, and planes."""
+    """What the variations of a group must have in common: planes."""
+    return tuple((tuple(torch.as_tensor(g.normal).tolist()), g.sticks) for g in s.planes)
+
+
+def _extras(s: Scenario) -> tuple[int, int]:
+    """Numbers of Maxwell elements and of springs; in a group, those that a variation has not are of no strength."""
     elements = 0 if s.prony is None else s.prony.elements
-    planes = tuple((tuple(torch.as_tensor(g.normal).tolist()), g.sticks) for g in s.planes)
-    return elements, planes, sum(isinstance(load, Spring) for load in s.loads)
+    return elements, sum(isinstance(load, Spring) for load in s.loads)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +183,7 @@ class _Group:
         return simulator(
             self.body(),
             duration=samples * SAMPLE,
-            prony=self.prony(first.prony),
+            prony=self.prony(),
             pressure=self.pressure(dt, samples),
             gravity=self.rows(lambda s: s.gravity, 1),
             planes=[self.plane(k, plane) for k, plane in enumerate(first.planes)],
@@ -211,12 +223,20 @@ class _Group:
             air_stiffness=air.clamp(min=0) if self.twin.setup.chambers else None,
         )
 
-    def prony(self, like: Prony | None) -> Prony | None:
+    def prony(self) -> Prony | None:
         """Maxwell elements [K, E]."""
-        if like is None:
+        most = max(_extras(self.scenarios[i])[0] for i, _ in self.lanes)
+        if not most:
             return None
-        moduli, times = (self.rows(lambda s, name=name: getattr(s.prony, name), 1) for name in ("moduli", "times"))
-        return Prony(moduli=moduli.double(), times=times.double())
+
+        def padded(name: str, value: float) -> Tensor:
+            def of(s: Scenario) -> Tensor:
+                own = torch.zeros(0, dtype=torch.float64) if s.prony is None else getattr(s.prony, name)
+                return torch.nn.functional.pad(own, (0, most - own.shape[-1]), value=value)
+
+            return self.rows(of, 1).double()
+
+        return Prony(moduli=padded("moduli", 0.0), times=padded("times", 1.0))
 
     def pressure(self, dt: float, samples: int) -> Waveform | None:
         """Supply [K, chambers, steps + 1], or what is the same for all."""
