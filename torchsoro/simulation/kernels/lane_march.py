@@ -113,7 +113,10 @@ class Case(NamedTuple):
 
 
 class Work(NamedTuple):
-    """States, and what threads hand each other."""
+    """States, and what threads hand each other.
+
+    Of a sample, ``seen`` holds those sixteens of numbers of a component that ``seen_place`` has a place for.
+    """
 
     states: np.ndarray
     histories: np.ndarray
@@ -121,6 +124,8 @@ class Work(NamedTuple):
     volumes: np.ndarray
     seen: np.ndarray
     seen_at: np.ndarray
+    seen_place: np.ndarray
+    seen_width: int
     forces: np.ndarray
     areas: np.ndarray
     swept: np.ndarray

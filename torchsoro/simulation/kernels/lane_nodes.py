@@ -165,7 +165,8 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
         d2 = select(moves, d2 + dt * (o2 + u2), d2)
         store_vector(d, b, n, (d0, d1, d2))
         store_vector(d, b + 3 * n, n, (u0, u1, u2))
-        if sample >= 0:
-            o = (sample * case.groups + g) * 6 * n + i
-            store_vector(work.seen, o, n, (d0, d1, d2))
-            store_vector(work.seen, o + 3 * n, n, (u0, u1, u2))
+        if sample >= 0 and work.seen_place[i // 16] >= 0:
+            width = work.seen_width
+            o = (sample * case.groups + g) * 6 * width + 16 * work.seen_place[i // 16]
+            store_vector(work.seen, o, width, (d0, d1, d2))
+            store_vector(work.seen, o + 3 * width, width, (u0, u1, u2))

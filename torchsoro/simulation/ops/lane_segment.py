@@ -246,7 +246,8 @@ class LaneIntegrator:
         at = np.full(self.steps + 1, -1)
         inner = [k for k in self.samples if k > 0]
         at[inner] = np.arange(len(inner))
-        seen = kept_memory(start, len(inner), lanes.groups, 6, mesh.component)
+        place = lanes.sixteens(self.near)
+        seen = kept_memory(start, len(inner), lanes.groups, 6, LANES * (int(place.max()) + 1))
         slots = self.steps if keep else 1
         # Velocities before drag, which those after a substep do not tell.
         touching = slots if keep and (len(self.case.plane_stick) or self.case.quadratic.size) else 0
@@ -254,7 +255,7 @@ class LaneIntegrator:
         self._clear_ends(pushed)
         volumes = start.new_zeros(slots, groups, mesh.chambers, LANES)
         threads = thread_count()
-        work = self._work(start, states, histories, pushed, volumes, seen, at, threads)
+        work = self._work(start, states, histories, pushed, volumes, (seen, at, place), threads)
         if 0 in self.samples:
             motion = start[:, : 6 * nodes].unflatten(1, (6, nodes))
             observe(0, start if self.near is None else motion[..., self.near].flatten(1))
@@ -291,7 +292,8 @@ class LaneIntegrator:
         field[..., : self.mesh.front] = 0
         field[..., self.mesh.front + self.mesh.planes * self.mesh.plane :] = 0
 
-    def _work(self, like, states, histories, pushed, volumes, seen, at, threads: int) -> Work:
+    def _work(self, like, states, histories, pushed, volumes, sampled, threads: int) -> Work:
+        seen, at, place = sampled
         mesh, groups = self.mesh, self.lanes.groups
         items, size = len(mesh.item_plane), 9 * mesh.patch
         tasks = groups * items
@@ -303,6 +305,8 @@ class LaneIntegrator:
             volumes=numbers(volumes),
             seen=numbers(seen),
             seen_at=at,
+            seen_place=place,
+            seen_width=seen.shape[-1],
             forces=numbers(like.new_zeros(tasks, size)),
             areas=numbers(like.new_zeros(tasks, mesh.chambers, size)),
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
@@ -399,7 +403,8 @@ class LaneIntegrator:
                 16 * steps * groups * mesh.chambers,
             )),
         )  # fmt: skip
-        work = self._work(bar, states, histories, pushed, volumes, bar.new_zeros(0), at, thread_count())
+        sampled = bar.new_zeros(0), at, lanes.sixteens(None)
+        work = self._work(bar, states, histories, pushed, volumes, sampled, thread_count())
         self._march(work, march_back, sums, steps)
         first, found = gather_gradients(
             self.scene, self.inputs, lanes, self.case, self.nodal[:, :1], (moving, history, pulls, sums), wanted

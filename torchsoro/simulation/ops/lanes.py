@@ -125,13 +125,22 @@ class Lanes:
             return rows.reshape(-1, *rows.shape[2:])[: self.batch].contiguous()
         return lanes[:, :, self.nodes]
 
+    def sixteens(self, some: Tensor | None) -> np.ndarray:
+        """Of each sixteen numbers of a component its place among those that have any of some nodes [U]; -1 for none."""
+        count = self.mesh.component // LANES
+        if some is None:
+            return np.arange(count)
+        found, chosen = np.full(count, -1), np.unique(self.nodes[some].numpy() // LANES)
+        found[chosen] = np.arange(len(chosen))
+        return found
+
     def to_some_nodes(self, lanes: Tensor, some: Tensor) -> Tensor:
-        """What some nodes [U] have of samples by lane [S, groups, K, component], as [S, B, K, U]."""
-        at = self.nodes[some]
+        """What some nodes [U] have of samples by lane, of these ``sixteens`` only [S, groups, K, ...], as [S, B, K, U].
+        """
         if self.variations:
-            found = lanes[..., at.unsqueeze(-1) + torch.arange(LANES)].permute(0, 1, 4, 2, 3)
-            return found.flatten(1, 2)[:, : self.batch]
-        return lanes[..., at]
+            return lanes.unflatten(-1, (-1, LANES)).permute(0, 1, 4, 2, 3).flatten(1, 2)[:, : self.batch]
+        at = self.nodes[some]
+        return lanes[..., LANES * torch.from_numpy(self.sixteens(some))[at // LANES] + at % LANES]
 
     def from_batch(self, values: Tensor, axis: int = 0) -> Tensor:
         """Numbers of a simulation, with the batch along an axis, as [..., groups, ..., 16]."""
@@ -170,7 +179,7 @@ def _blocks(layer: np.ndarray, row: int, first: list[np.ndarray]) -> list[tuple[
 
 
 _known: OrderedDict[tuple, Lanes] = OrderedDict()
-MOST = 16  # layouts that are remembered
+MOST = 64  # layouts that are remembered
 
 
 def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
