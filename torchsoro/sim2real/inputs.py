@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
 from torchsoro.sim2real.data.plausibility import plausible
@@ -65,6 +66,7 @@ def read_inputs(options: Options) -> Inputs:
     if options.experiment is None:
         raise ValueError("experiment: not given, wanted a folder, or --predict with a model.toml")
     check_numbers(options)
+    check_device(options.device)
     effects = named(options.effects)
     check_folder("out", Path(options.out), RESULTS)
     experiment = read_experiment(Path(options.experiment))
@@ -118,6 +120,16 @@ def check_numbers(options: Options) -> None:
             raise ValueError(f"{name} = {value!r}, wanted {wanted}")
 
 
+def check_device(name: str) -> None:
+    """Where to simulate.
+
+    Raises:
+        ValueError: for CUDA where there is none.
+    """
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
+
+
 def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
     """Effects of the library by name; None for all.
 
@@ -145,10 +157,10 @@ def _check_noise(experiment: Experiment, recordings: list[Recording]) -> None:
 def _twin(options: Options, experiment: Experiment) -> Twin:
     setup, trials = experiment.setup, len(experiment.trials)
     if not options.edge:
-        return choose_twin(setup, trials, 60 * options.budget, walls=options.walls)
+        return choose_twin(setup, trials, 60 * options.budget, walls=options.walls, device=options.device)
     if options.edge > max(setup.size):
         raise ValueError(f"edge = {options.edge:g} m, wanted at most {max(setup.size):g} m, the body's longest edge")
-    twin = Twin(setup, edge=options.edge, walls=options.walls)
+    twin = Twin(setup, edge=options.edge, walls=options.walls, device=options.device)
     needed = cost(twin, trials) / 60
     if needed > DEAR * options.budget:
         raise ValueError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -28,5 +29,7 @@ class Options:
     """Cells through each wall around a chamber, at least."""
     effects: tuple[str, ...] = ()
     """Names of the effects to consider; the whole library if none is given."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Where twins are simulated: a GPU takes all variations that are asked for at once."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""

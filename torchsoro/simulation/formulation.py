@@ -187,11 +187,14 @@ class Total:
             width, with chambers that hold no particles, and nodes on its faces. If None, a uniform one around the
             particles.
         limit: Largest Courant number of a step; ``stability.STABLE_COURANT`` if None. A full lattice bears more.
+        device: Where to simulate a body whose tensors are on a CPU, as "cuda"; with them if None. Of simulations that
+            are marked and record probes only.
     """
 
     lanes: bool = field(default=True, repr=False)
     lattice: Lattice | None = field(default=None, repr=False)
     limit: float | None = field(default=None, repr=False)
+    device: str | None = field(default=None, repr=False)
     name: ClassVar[FormulationName] = "total"
     air_density: ClassVar[float] = AIR
 
@@ -242,7 +245,8 @@ class Total:
             lattice = Lattice.around(x[0], scene.cell)
         else:
             lattice.check(x[0])
-        return on_lattice(replace(scene, lanes=self.lanes), inputs, x, velocity, weight, lattice)
+        where = None if self.device is None else torch.device(self.device)
+        return on_lattice(replace(scene, lanes=self.lanes, device=where), inputs, x, velocity, weight, lattice)
 
     def initial(self, scene: Scene, inputs: Inputs, x: Tensor, velocity: Tensor, *, moving: bool) -> Tensor:
         """State [B, L]."""

@@ -139,7 +139,7 @@ class Simulator(nn.Module):
                 last time. Or a state alone (``Trajectory.final``), or a ``Start`` of the nodes, with which time begins
                 at zero. The undeformed body at time zero if None.
             divergence: Whether a simulation that diverges raises, or is marked (``Trajectory.sound``) while the others
-                of the batch go on as they would without it; in lanes of a CPU only, without a gradient.
+                of the batch go on as they would without it; of the total-Lagrangian form, without a gradient.
             record: "probes" leaves out centre of gravity, chamber volumes and pressures, which then have no numbers
                 [..., S, 0]; with places as probes and simulations that are marked only.
             progress: Called between stretches of the simulation, up to a hundred without a gradient, with the substeps
@@ -159,14 +159,14 @@ class Simulator(nn.Module):
             steps, every = _steps(duration, sample_every, self.dt)
         if divergence not in ("raise", "mark"):
             raise ValueError(f"divergence = {divergence!r}: wanted 'raise' or 'mark'")
-        if divergence == "mark" and not self.formulation.in_lanes(x):
-            raise ValueError(
-                "divergence = 'mark': diverge apart: wanted the total-Lagrangian formulation in lanes of a CPU"
-            )
+        if divergence == "mark" and self.formulation.name != "total":
+            raise ValueError("divergence = 'mark': wanted the total-Lagrangian formulation")
         if record not in ("all", "probes"):
             raise ValueError(f"record = {record!r}: wanted 'all' or 'probes'")
         if record == "probes" and (divergence != "mark" or probes is None or not probes.is_floating_point()):
             raise ValueError("record = 'probes': wanted places as probes, and divergence = 'mark'")
+        if getattr(self.formulation, "device", None) is not None and record != "probes":
+            raise ValueError("Total(device=...): a device of its own, wanted record = 'probes'")
         check_body(body)
         self.formulation.check_planes(planes)
         if start is None:

@@ -34,7 +34,9 @@ class Channel:
     scale: np.ndarray
 
     @classmethod
-    def of(cls, rows: np.ndarray, pairs: Sequence[tuple[int, int]], time: np.ndarray, white: float, slow: float) -> Channel:
+    def of(
+        cls, rows: np.ndarray, pairs: Sequence[tuple[int, int]], time: np.ndarray, white: float, slow: float
+    ) -> Channel:
         """Of variances of white noise and of what is correlated, at times [R] s."""
         keep, gain, scale = np.zeros((3, len(rows)))
         variance, last = slow, float(time[0])

@@ -13,7 +13,9 @@ from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 # Of a rotation about x, y, z: the change of a place is this matrix times the place.
-SPINS = np.array([[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
+SPINS = np.array(
+    [[[0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 0, 0], [-1, 0, 0]], [[0, -1, 0], [1, 0, 0], [0, 0, 0]]]
+)
 CLOCK_LIMIT = 3.0  # standard deviations of a clock offset, beyond which it is not looked for
 
 

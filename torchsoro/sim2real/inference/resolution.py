@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 from torchsoro.sim2real.data.experiment import Setup
@@ -28,7 +29,7 @@ def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     return twin.count * steps * trials * simulations / SPEED / CORES
 
 
-def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS) -> Twin:
+def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS, device: str = "cpu") -> Twin:
     """The finest twin with which an explanation takes about the budget.
 
     Args:
@@ -36,6 +37,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
         trials: To simulate.
         budget: On two cores [s].
         walls: Cells through each wall, at least.
+        device: Of the twin; decides nothing.
 
     Raises:
         ValueError: if the coarsest takes more than three times the budget.
@@ -43,7 +45,9 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     thin, long = min(setup.size), max(setup.size)
     chambers = bool(setup.chambers)
     edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
-    twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
+    twins = [
+        Twin(setup, edge=edge, walls=walls, across=n, device=device) for edge, n in zip(edges, (3, 2), strict=True)
+    ]
     for twin in twins:
         if cost(twin, trials) <= budget / (SLOW_WITH_PLANES if setup.planes else SLOW):
             return twin
@@ -67,7 +71,7 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
     least = min(a.cells for a in twin.grid.axes)
     for share in FINER:
         walls, across = math.ceil(share * twin.walls), math.ceil(share * least)
-        fine = Twin(twin.setup, edge=twin.edge / share, walls=walls, across=across)
+        fine = dataclasses.replace(twin, edge=twin.edge / share, walls=walls, across=across)
         # A group of lanes takes as long with one trial as with sixteen.
         if cost(fine, trials, 16 / trials * CORES) <= seconds:
             break
@@ -83,4 +87,4 @@ def between(twin: Twin, fine: Twin) -> Twin:
     """
     share = (1 + twin.edge / fine.edge) / 2
     across = math.ceil(share * min(a.cells for a in twin.grid.axes))
-    return Twin(twin.setup, edge=twin.edge / share, walls=math.ceil(share * twin.walls), across=across)
+    return dataclasses.replace(twin, edge=twin.edge / share, walls=math.ceil(share * twin.walls), across=across)

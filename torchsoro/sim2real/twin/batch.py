@@ -34,6 +34,8 @@ SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 HALVINGS = 30  # of the error of ln dt, where the stiffness depends on the step
 THREADS = os.cpu_count() or 1
 MARCHING = 0.75  # of ln of the number of threads that simulate one group, by which it takes less time, in ln
+ALIKE = 1.6  # steps over the shortest, that a GPU takes in one batch
+MOST_AT_ONCE = 1024  # variations on a GPU
 FAR = 1e3  # m, half the edge of the box that a motion that has not diverged stays in
 
 Lane = tuple[int, int]  # number of the scenario, and of its variation
@@ -73,11 +75,14 @@ def simulate(
     alike: dict[object, list[Lane]] = {}
     for i, s in enumerate(scenarios):
         alike.setdefault(_kind(s), []).extend((i, b) for b in range(s.batch))
-    groups = []
+    groups: list[list[Lane]] = []
     for members in alike.values():
         # What is alike goes together: all of a group take the time of the most elements, and the shortest step.
         members.sort(key=lambda lane: (*_extras(scenarios[lane[0]]), steps[lane[0]][lane[1]]))
-        groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
+        if twin.device == "cpu":
+            groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
+        else:
+            groups += _at_once(members, [steps[i][b] for i, b in members])
     markers = torch.tensor([m.at for m in twin.setup.markers], dtype=torch.float64).reshape(-1, 3)
     samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
     shape = samples, len(markers)
@@ -96,16 +101,34 @@ def simulate(
         return found.dt
 
     largest, first = 0.0, 0
-    for width, count in sorted(Counter(waves(len(groups), threads)).items(), reverse=True):
+    plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
+    for width, count in sorted(Counter(plan).items(), reverse=True):
         part = groups[first : first + width * count]
-        with ThreadPoolExecutor(width) as pool:
-            largest = max(largest, *pool.map(run, part, [threads // width] * len(part)))
+        each = [threads // width] * len(part)
+        if width == 1:
+            largest = max(largest, *map(run, part, each))
+        else:
+            with ThreadPoolExecutor(width) as pool:
+                largest = max(largest, *pool.map(run, part, each))
         first += len(part)
     time = np.arange(samples) * SAMPLE
     return [
         MarkerTrajectory(time=time, position=x, velocity=v, deformation=F, sound=ok, dt=largest)
         for x, v, F, ok in zip(position, velocity, deformation, sound, strict=True)
     ]
+
+
+def _at_once(members: list[Lane], steps: list[float]) -> list[list[Lane]]:
+    """Batches for a GPU, which takes hardly longer for more: as large as the memory allows and steps are alike."""
+    order = sorted(zip(steps, members, strict=True))
+    batches: list[list[Lane]] = []
+    shortest = 0.0
+    for step, lane in order:
+        if not batches or step > ALIKE * shortest or len(batches[-1]) == MOST_AT_ONCE:
+            batches.append([])
+            shortest = step
+        batches[-1].append(lane)
+    return batches
 
 
 @cache
@@ -178,7 +201,11 @@ class _Group:
             dt=dt,
             low=(-FAR,) * 3,
             high=(FAR,) * 3,
-            formulation=Total(lattice=lattice, limit=1.001 * share),
+            formulation=Total(
+                lattice=lattice,
+                limit=1.001 * share,
+                device=None if self.twin.device == "cpu" else self.twin.device,
+            ),
         )
         return simulator(
             self.body(),

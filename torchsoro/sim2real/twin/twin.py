@@ -72,6 +72,7 @@ class Twin:
         edge: Of a cell, about [m]; walls around chambers, and chambers, have more cells if they need them.
         walls: Cells through each wall around a chamber, at least.
         across: Cells across a body without a chamber, at least.
+        device: Where it is simulated, "cpu" or "cuda".
 
     Raises:
         ValueError: for an edge or walls with which there are too many cells, a clamp that holds nothing or all of the
@@ -83,6 +84,7 @@ class Twin:
     edge: float
     walls: int = 3
     across: int = 3
+    device: str = "cpu"
 
     def __post_init__(self) -> None:
         """Check the numbers, and that the body can be laid on a grid and held."""

@@ -46,7 +46,7 @@ _own = local()
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:
-    """Threads that march with the caller: no other's, since those that share some could wait for each other for ever."""
+    """Threads of the caller alone: those that march with several could wait for each other for ever."""
     if getattr(_own, "threads", 0) != threads:
         _own.threads, _own.pool = threads, ThreadPoolExecutor(threads)
     return _own.pool

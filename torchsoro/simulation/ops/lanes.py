@@ -135,8 +135,7 @@ class Lanes:
         return found
 
     def to_some_nodes(self, lanes: Tensor, some: Tensor) -> Tensor:
-        """What some nodes [U] have of samples by lane, of these ``sixteens`` only [S, groups, K, ...], as [S, B, K, U].
-        """
+        """Samples of some nodes [U] by lane, with their ``sixteens`` only [S, groups, K, ...], as [S, B, K, U]."""
         if self.variations:
             return lanes.unflatten(-1, (-1, LANES)).permute(0, 1, 4, 2, 3).flatten(1, 2)[:, : self.batch]
         at = self.nodes[some]

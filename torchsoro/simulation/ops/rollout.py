@@ -65,7 +65,9 @@ def _integrator(
 ) -> SegmentIntegrator | TotalSegmentIntegrator | LaneIntegrator:
     # Taichi is imported only where it simulates: that takes as long as a coarse simulation.
     kind: type
-    if in_lanes(scene, inputs.coefficients):
+    if scene.device is not None:
+        from torchsoro.simulation.ops.elsewhere import ElsewhereIntegrator as kind
+    elif in_lanes(scene, inputs.coefficients):
         kind = LaneIntegrator
     elif scene.lattice is None:
         from torchsoro.simulation.ops.segment import SegmentIntegrator as kind

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 from weakref import WeakValueDictionary
 
+import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
@@ -57,6 +58,8 @@ class Scene:
         lanes: Whether the total-Lagrangian form runs in lanes on a CPU, else by Taichi, as it does on a GPU.
         apart: Whether simulations that diverge go on with what is not finite, and the others are not disturbed.
         only_markers: Whether nothing is recorded but the motion of the markers; where simulations go on apart only.
+        device: Where to simulate a scene whose tensors are on a CPU; with them if None. Of the total-Lagrangian form,
+            where only markers are recorded.
         steady: Whether the scene is of one run, whose segments have the same coefficients, Maxwell elements and planes.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
@@ -84,6 +87,7 @@ class Scene:
     lanes: bool = True
     apart: bool = False
     only_markers: bool = False
+    device: torch.device | None = None
     steady: bool = False
     handle: int = field(init=False, default_factory=_handles.__next__)
 

@@ -16,7 +16,7 @@ from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.fixed import fixed
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.memory import empty_record
-from torchsoro.simulation.ops.scene import Inputs, Observe, Scene
+from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
 from torchsoro.simulation.ops.tiles import tile_count, tile_counts
 from torchsoro.simulation.runtime import init
 
@@ -84,6 +84,7 @@ class TotalSegmentIntegrator:
         common = fixed(scene, inputs)
         self.nodal, self.chamber, self.tables, self.fixed = common.nodal, common.chamber, common.tables, common.arena
         self.checked = False
+        self.near = None if scene.markers is None or not scene.only_markers else scene.markers.near.to(like.device)
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, self._forces())
         tiles, chunks = tile_count(self.lattice), -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
@@ -112,7 +113,7 @@ class TotalSegmentIntegrator:
         force = self.inputs.force
         return force if self.scene.force_start is None else force * self._started().to(force)
 
-    def forward(self, start: Tensor, *, keep: bool, observe: Observe) -> Tensor:
+    def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
         """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
         ring, slots = (self.steps + 1, self.steps) if keep else (2, 1)
         # The kernels write no history at places without a particle.
@@ -124,11 +125,19 @@ class TotalSegmentIntegrator:
             *(total.total_march, total.total_substep, ints, self.fixed.buffer, self.supply.buffer, states.view(-1)),
             *(self.kept.buffer, self.scratch.buffer),
         )
+        sampled: dict[int, Tensor] = {}
+
+        def look(k: int, state: Tensor) -> None:
+            if self.near is None:
+                observe(k, state)
+            else:  # all together in the end, so that the host does not wait
+                sampled[k] = state[:, : 6 * self.nodes].unflatten(1, (6, self.nodes)).index_select(2, self.near)
+
         if 0 in self.samples:
-            observe(0, states[0])
+            look(0, states[0])
         now = 0
         while now < self.steps:
-            before = None if keep else states[now % 2].clone()
+            before = None if keep or self.scene.apart else states[now % 2].clone()
             stop = min([self.steps, *(k for k in (now + CHUNK, *self.samples) if k > now and not self.checked)])
             march(now, stop)
             after = states[stop % ring]
@@ -141,8 +150,10 @@ class TotalSegmentIntegrator:
                     march(now, collapsed)
                 report(self.scene, self.inputs, self.first + collapsed, states[collapsed % ring])
             if stop in self.samples:
-                observe(stop, after)
+                look(stop, after)
             now = stop
+        if sampled:
+            observe(list(sampled), torch.stack(list(sampled.values())).flatten(2))
         return states
 
     def _wrong(self, ints: Tensor, state: Tensor) -> bool:
