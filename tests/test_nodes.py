@@ -45,9 +45,9 @@ def bar(hollow: bool = False) -> tuple[Lattice, Body]:
     return grid.lattice, body
 
 
-def run(lattice: Lattice, body: Body, steps: int = 100, **settings):
+def run(lattice: Lattice, body: Body, steps: int = 100, engine: dict | None = None, **settings):
     """Motion of a bar without gravity, sampled at every step."""
-    form = Total(lattice=lattice, limit=1.5)
+    form = Total(lattice=lattice, limit=1.5, **(engine or {}))
     simulate = Simulator(cell=lattice.cell, dt=STEP, low=(-1.0,) * 3, high=(1.0,) * 3, formulation=form)
     return simulate(body, **{"duration": steps * STEP, "gravity": FREE, "sample_every": STEP, **settings})
 
@@ -272,17 +272,36 @@ def test_gradients_by_what_acts_on_nodes_are_those_of_differences(name):
         assert float(by[k]) == pytest.approx(sum(parts) / (12 * step), rel=1e-6)
 
 
-def test_a_simulation_that_diverges_is_marked_and_leaves_the_others_as_they_are():
+@pytest.mark.parametrize("engine", [{}, {"lanes": False}, {"device": "cpu"}])
+def test_a_simulation_that_diverges_is_marked_and_leaves_the_others_as_they_are(engine):
     lattice, body = bar()
     wild = torch.stack([vector(0.1, 0.0, 0.0), vector(0.1, 0.0, 3e4)]).unsqueeze(1).expand(2, lattice.nodes, 3).clone()
     wild[1, ::2] *= -1
     start = Start(displacement=torch.zeros_like(wild), velocity=wild)
     places = vector(0.03, 0.02, 0.02).unsqueeze(0)
-    found = run(lattice, body, start=start, divergence="mark", probes=places)
+    how = {"divergence": "mark", "record": "probes", "engine": engine}
+    found = run(lattice, body, start=start, probes=places, **how)
     assert found.sound.tolist() == [True, False]
+    assert found.center_of_gravity.shape == found.chamber_volume.shape == (2, 101, 0)
     alone = run(lattice, body, start=Start(displacement=start.displacement[:1], velocity=wild[:1]), probes=places)
-    torch.testing.assert_close(found.position[0], alone.position[0], rtol=0, atol=1e-12)
+    for name in ("position", "velocity", "deformation"):
+        torch.testing.assert_close(getattr(found, name)[0], getattr(alone, name)[0], rtol=1e-9, atol=1e-11)
     assert alone.sound.tolist() == [True]
+
+
+@pytest.mark.parametrize(
+    ("settings", "engine", "message"),
+    [
+        ({"record": "markers"}, {}, "record = 'markers'"),
+        ({"record": "probes"}, {}, "divergence = 'mark'"),
+        ({"record": "probes", "divergence": "mark", "probes": torch.arange(2)}, {}, "wanted places"),
+        ({"divergence": "mark"}, {"device": "cuda"}, "record = 'probes'"),
+    ],
+)
+def test_a_record_that_is_not_kept_is_refused(settings, engine, message):
+    lattice, body = bar()
+    with pytest.raises(ValueError, match=message):
+        run(lattice, body, engine=engine, **{"probes": vector(0.03, 0.02, 0.02).unsqueeze(0), **settings})
 
 
 # Lattices ---------------------------------------------------------------------------------------------------------
