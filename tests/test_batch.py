@@ -50,7 +50,7 @@ def test_every_group_is_simulated_once_whatever_the_number_of_threads(threads):
 
 
 def test_threads_that_have_no_group_of_their_own_help_with_others():
-    assert sorted(waves(9, 16)) == [1, 8]
+    assert sorted(waves(9, 8)) == [1, 8]
     assert waves(1, 16) == (1,)
 
 

@@ -33,6 +33,7 @@ CUT = 1.0  # the same where cells are filled in part, whose nodes may have littl
 SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 HALVINGS = 30  # of the error of ln dt, where the stiffness depends on the step
 THREADS = os.cpu_count() or 1
+TOGETHER = 8  # threads that simulate one group, at most: they wait for each other twice a step
 MARCHING = 0.75  # of ln of the number of threads that simulate one group, by which it takes less time, in ln
 ALIKE = 1.6  # steps over the shortest, that a GPU takes in one batch
 MOST_AT_ONCE = 1024  # variations on a GPU
@@ -104,7 +105,7 @@ def simulate(
     plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
     for width, count in sorted(Counter(plan).items(), reverse=True):
         part = groups[first : first + width * count]
-        each = [threads // width] * len(part)
+        each = [min(threads // width, TOGETHER)] * len(part)
         if width == 1:
             largest = max(largest, *map(run, part, each))
         else:
@@ -144,7 +145,7 @@ def waves(groups: int, threads: int) -> tuple[int, ...]:
     if (full := groups // threads - 1) > 0:  # waves of one thread each, without a search
         return (threads,) * full + waves(groups - full * threads, threads)
     plans = [(width, *waves(groups - width, threads)) for width in range(1, min(groups, threads) + 1)]
-    return min(plans, key=lambda plan: sum((threads // width) ** -MARCHING for width in plan))
+    return min(plans, key=lambda plan: sum(min(threads // width, TOGETHER) ** -MARCHING for width in plan))
 
 
 def stable(grid: Grid, s: Scenario, share: float) -> np.ndarray:
