@@ -350,7 +350,7 @@ def test_particles_beside_the_places_of_the_lattice_are_refused():
         ({"loads": [Spring(particles=torch.tensor([0]), stiffness=1.0, mean=True)]}, "loads: Spring on nodes or means"),
         ({"probes": torch.zeros(1, 3)}, "probes: places"),
         ({"start": Start(displacement=torch.zeros(1, 3), velocity=torch.zeros(1, 3))}, "start: a Start of nodes"),
-        ({"divergence": "mark"}, "diverge apart: wanted the total-Lagrangian formulation in lanes"),
+        ({"divergence": "mark"}, "divergence = 'mark': wanted the total-Lagrangian formulation"),
     ],
 )
 def test_the_updated_form_refuses_what_it_does_not_have(settings, message):
