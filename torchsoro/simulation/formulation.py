@@ -66,7 +66,7 @@ class Formulation(Protocol):
         ...
 
     def in_lanes(self, like: Tensor) -> bool:
-        """Whether simulations run in lanes, where they may diverge apart, and forces have one row for all steps."""
+        """Whether simulations run in lanes, where forces have one row for all steps."""
         ...
 
     def check_continued(self, before: float, dt: float, prony: Prony | None) -> None:
