@@ -188,16 +188,18 @@ def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most
 def _pairs(
     problem: FitProblem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
-    """Two effects together: each of the three that do best with every other, on more and more of the trials."""
-    singles = singles[:3]
+    """Two effects together: each that was fitted with every other, on more and more of the trials.
+
+    Not the leading ones alone: which of several that do badly by themselves does best hangs on rounding. Nor from one
+    place alone: a response far off says little of where to begin.
+    """
     tasks: list[Task] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
-        for other in effects:
-            if other.name not in known:
-                tasks.append(
-                    ((*one.effects, other), np.concatenate([one.point, other.probe_points(problem.twin)[-1][0]]))
-                )
+        for other in (e for e in effects if e.name not in known):
+            points = other.probe_points(problem.twin)
+            for at in sorted({round(i * (len(points) - 1) / (STARTS - 1)) for i in range(STARTS)}):
+                tasks.append(((*one.effects, other), np.concatenate([one.point, points[at][0]])))
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         whole = share == 1
