@@ -142,6 +142,26 @@ def test_evidence_of_a_strength_that_cannot_be_negative_agrees_with_quadrature(s
     assert whole == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("beyond", [0.0, 0.02, 0.5, 5.0])
+def test_evidence_of_two_like_unknowns_pressed_against_their_bounds_agrees_with_quadrature(beyond):
+    rng = np.random.default_rng(4)
+    J = np.stack([np.sin(3 * TIME), np.sin(3.3 * TIME), TIME], 1)
+    y = J @ np.array([1 + beyond, 1 + 2 * beyond, 0.3]) + NOISE * rng.normal(size=len(TIME))
+    priors = (Prior(1.0, low=-1.0, high=1.0), Prior(1.0, low=-1.0, high=1.0), Prior(1.0))
+    found = posterior(linear_gram(y, J), np.zeros(3), priors)
+    # The third is integrated out exactly, the others by quadrature.
+    covariance = NOISE**2 * np.eye(len(TIME)) + np.outer(J[:, 2], J[:, 2])
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    a = 1 - min(2.0, 9 * float(np.sqrt(np.diag(found.covariance)[:2]).max())) * np.linspace(1, 0, 901) ** 2
+    w, J = whiten @ y, whiten @ J[:, :2]
+    off = w - a[:, None, None] * J[:, 0] - a[:, None] * J[:, 1]
+    ln_p = stats.norm.logpdf(off).sum(-1) + np.log(np.diag(whiten)).sum()
+    ln_prior = np.array([priors[0].ln_density(v) for v in a])
+    ln_p += ln_prior[:, None] + ln_prior
+    whole = np.trapezoid(np.trapezoid(np.exp(ln_p - found.ln_evidence), a), a)
+    assert whole == pytest.approx(1.0, abs=0.1)
+
+
 def test_evidence_of_a_decay_rate_agrees_with_quadrature_within_0_05():
     rng = np.random.default_rng(2)
     y = np.exp(-2.5 * TIME) + NOISE * rng.normal(size=len(TIME))

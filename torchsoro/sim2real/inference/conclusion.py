@@ -145,7 +145,7 @@ class Weighing:
         """Mean adjustment over the changes by all names, by the errors of the most probable model."""
         best = self.best
         changes = [self.change(modes[0]) for modes in self.groups.values()]
-        draws, n = best.near.numerics.draws, len(changes)
+        draws, n = [tuple(best.discrepancy.twin * d for d in draw) for draw in best.near.numerics.draws], len(changes)
         if not draws or not changes:
             return 1.0
         models = errors(self.data, best.near.numerics, best.discrepancy)

@@ -1,12 +1,14 @@
 """Evidence: how probable recordings are under a model, its parameters and measurement errors integrated out.
 
-    y = h(x) + d + e,     d ~ N(0, S_num + s^2 K(tau)),     e ~ noise, a share of which lasts
+    y = h(x) + d + e,     d ~ N(0, c^2 S_num + s^2 K(tau)),     e ~ noise, a share of which lasts
 
-x are strengths, places, beliefs and measurement errors with their priors; S_num is the covariance of the twin's own
-error, s that of what the model does not explain, as a share of the motion, and tau its correlation time. Given s and
-tau, x is integrated out by Laplace's approximation (:mod:`torchsoro.sim2real.inference.laplace`); s and tau follow by
-restricted maximum likelihood. No law of an effect is nature's to the last digit: s is at least what does not matter,
-so that differences between candidates that do not matter decide nothing.
+x are strengths, places, beliefs and measurement errors with their priors; S_num is the covariance that the twin's own
+error is priced at, and c the share of it that there is; s is the size of what the model does not explain, as a share of
+the motion, and tau its correlation time. Given s, tau and c, x is integrated out by Laplace's approximation
+(:mod:`torchsoro.sim2real.inference.laplace`); they follow by restricted maximum likelihood. Without c, a model whose
+twin is priced a factor higher would lose the logarithm of that factor with each sample. No law of an effect is nature's
+to the last digit: s is at least what does not matter, so that differences between candidates that do not matter decide
+nothing.
 """
 
 from __future__ import annotations
@@ -27,8 +29,9 @@ from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, tempered, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
-NARROW = 0.05  # of ln s and ln tau: what they need not be known better than
-APART = 0.15  # of ln s and ln tau, for second differences
+NARROW = 0.05  # of ln s, ln tau and ln c: what they need not be known better than
+APART = 0.15  # of ln s, ln tau and ln c, for second differences
+LEAST_PRICE = 0.1  # of the price of the twin's error, that it has; the noise is above what is less
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
 SETTLED = 5  # rounds in which the size of what is left and its weight agree to a percent
 
@@ -40,10 +43,12 @@ class Discrepancy:
     Attributes:
         share: Of the motion, standard deviation; 0 for none.
         time: Correlation time [s].
+        twin: Share of its price that the twin's own error has beside it.
     """
 
     share: float = 0.0
     time: float = NOISE_TIME
+    twin: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -124,7 +129,7 @@ class Branch:
     Attributes:
         discrepancy: With which it is most probable.
         mode: Of its unknowns, with that.
-        ln_occam: ln of the share of the prior range of s and tau that is left.
+        ln_occam: ln of the share of the prior range of s, tau and c that is left.
     """
 
     discrepancy: Discrepancy
@@ -133,7 +138,7 @@ class Branch:
 
     @property
     def ln_evidence(self) -> float:
-        """With s and tau integrated out."""
+        """With s, tau and c integrated out."""
         return self.mode.ln_evidence + self.ln_occam
 
 
@@ -193,7 +198,7 @@ def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> list[Er
     one = np.full_like(numerics.amplitude, data.noise)
     known = (
         Process(time=NOISE_TIME, loading=_each(math.sqrt(LASTING) * one)),
-        Process(time=numerics.time, loading=_moving(numerics.amplitude)),
+        Process(time=numerics.time, loading=_moving(discrepancy.twin * numerics.amplitude)),
     )
     return [
         ErrorModel(
@@ -228,7 +233,7 @@ def infer(data: Data, near: Linearised) -> Posterior:
     """
 
     def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> Branch:
-        """The mode, and the ln s and ln tau that its residual tells, within bounds."""
+        """The mode, and the ln s, ln tau and ln c that its residual tells, within bounds."""
         x = start
         for _ in range(ALTERNATIONS):
             left = near.left(mode_of(data, near, _discrepancy(x)).at)
@@ -239,11 +244,11 @@ def infer(data: Data, near: Linearised) -> Posterior:
         ln_occam = _ln_occam(data, near, near.left(mode.at), x, low, high)
         return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
 
-    low, high = _ranges(data)
+    low, high = _ranges(data, near.numerics)
     middle = 0.5 * (low + high)
     # From little and from much: with much, the first mode is not bent by a wrong model.
-    some = [settled(np.array([ln_s, middle[1]]), low, high) for ln_s in (middle[0], high[0])]
-    none = settled(np.array([low[0], middle[1]]), low, np.array([low[0], high[1]]))
+    some = [settled(np.array([ln_s, middle[1], high[2]]), low, high) for ln_s in (middle[0], high[0])]
+    none = settled(np.array([low[0], middle[1], high[2]]), low, np.array([low[0], *high[1:]]))
     return Posterior(near=near, some=max(some, key=lambda branch: branch.ln_evidence), none=none)
 
 
@@ -274,15 +279,17 @@ def time_range(data: Data) -> tuple[float, float]:
     return math.log(shortest), math.log(longest)
 
 
-def _ranges(data: Data) -> tuple[np.ndarray, np.ndarray]:
-    """Of ln s and ln tau."""
+def _ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
+    """Of ln s, ln tau and ln c."""
     low, high = time_range(data)
     least, most = np.log(data.shares)
-    return np.array([least, low]), np.array([most, high])
+    price = math.log(LEAST_PRICE) if numerics.amplitude.any() else 0.0
+    return np.array([least, low, price]), np.array([most, high, 0.0])
 
 
 def _discrepancy(x: np.ndarray) -> Discrepancy:
-    return Discrepancy(share=math.exp(x[0]), time=math.exp(x[1]))
+    share, time, twin = map(math.exp, x)
+    return Discrepancy(share=share, time=time, twin=twin)
 
 
 def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
@@ -297,7 +304,7 @@ def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: 
 def _restricted(
     data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Ln s and ln tau with which residuals are most probable, within bounds."""
+    """Ln s, ln tau and ln c with which residuals are most probable, within bounds."""
     moving = np.flatnonzero(high > low)
 
     def at(free: np.ndarray) -> np.ndarray:
@@ -316,7 +323,7 @@ def _restricted(
 
 
 def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """Logarithm of the share of the prior range of ln s and ln tau that residuals leave: by a parabola along each."""
+    """Ln of the share of the prior range of ln s, ln tau and ln c that residuals leave: by a parabola along each."""
     found, top = 0.0, _ln_likelihood(data, near, left, x)
     for k in np.flatnonzero(high > low):
         middle = float(np.clip(x[k], low[k] + APART, high[k] - APART))
@@ -339,7 +346,7 @@ def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: n
 def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarray:
     """Ln of the predictive density of each trial, given the others [trials].
 
-    ln p(y_i | y_-i) = ln Z(y) - ln Z(y_-i), with s and tau of all trials.
+    ln p(y_i | y_-i) = ln Z(y) - ln Z(y_-i), with s, tau and c of all trials.
 
     Args:
         data: Recordings.
@@ -356,7 +363,7 @@ def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarra
 
 
 def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = None) -> Mode:
-    """The numbers of a model that are told and predicted with; s and tau are those of all trials.
+    """The numbers of a model that are told and predicted with; s, tau and c are those of all trials.
 
     They are the most probable ones. But where a discrepancy matters, these leave to it what they might explain: then
     they are those of :func:`closest`, which predict better.

@@ -7,6 +7,13 @@ For a recording y, a prediction that is h + J (x - x0) near x0, errors of covari
 where x* is the mode within the bounds, H = J' C^-1 J + diag w is minus the second derivative of the log posterior
 there, m its mode if there were no bounds, and P the probability of the bounds under N(m, H^-1). It is exact for a
 linear prediction with normal priors, one bound included.
+
+Far outside of the bounds, P is tiny, and no approximation of it is good enough. Unknowns that the recording presses
+against a bound, where ln p falls by g per unit away from it, are integrated from there one by one,
+
+    int_0^inf exp(-g d - S d^2 / 2) dd = sqrt(pi / 2 S) erfcx(g / sqrt(2 S)),
+
+S being the second derivative with the others at their best, and the others with these at their bounds.
 """
 
 from __future__ import annotations
@@ -17,14 +24,18 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import lsq_linear
-from scipy.special import log_ndtr
+from scipy.special import erfcx, log_ndtr
 
 from torchsoro.sim2real.inference.priors import Prior, bounds
 from torchsoro.sim2real.inference.state_space import Gram
 
+PRESSED = 3.0  # standard deviations that an unknown would go beyond a bound, above which it is integrated from there
 NEAR = 8.0  # standard deviations from a mode, beyond which a bound takes nothing away
 FLAT = 1e-4  # weight of a uniform prior over the squared inverse of its width, so that H can be inverted
+EDGE = 1e-6  # of a standard deviation, within which an unknown is at its bound
 ROUNDS = 30  # of iterated least squares, at most
+SWEEPS = 50  # of expectation propagation, at most
+SETTLED = 1e-9  # change of ln P in one, below which it is done
 LN_TWO_PI = math.log(2 * math.pi)
 
 
@@ -66,20 +77,35 @@ def posterior(gram: Gram, at: np.ndarray, priors: Sequence[Prior]) -> Mode:
             break
     weight = np.array([p.weight(v) for p, v in zip(priors, x, strict=True)])
     H = A + np.diag(weight + floor)
-    covariance = np.linalg.inv(H)
-    free = covariance @ pull
     step = x - at
     ln_likelihood = -0.5 * (r2 - 2 * float(b @ step) + float(step @ A @ step) + gram.ln_det + gram.count * LN_TWO_PI)
     ln_prior = sum(p.ln_density(v) for p, v in zip(priors, x, strict=True))
-    off = x - free
-    ln_evidence = (
-        ln_likelihood
-        + ln_prior
-        + 0.5 * float(off @ H @ off)
-        + 0.5 * (len(x) * LN_TWO_PI - float(np.linalg.slogdet(H)[1]))
-        + ln_box(free, covariance, low, high)
+    return Mode(
+        at=x,
+        covariance=np.linalg.inv(H),
+        ln_evidence=ln_likelihood + ln_prior + _ln_volume(H, pull, x, low, high),
+        ln_likelihood=ln_likelihood,
     )
-    return Mode(at=x, covariance=covariance, ln_evidence=ln_evidence, ln_likelihood=ln_likelihood)
+
+
+def _ln_volume(H: np.ndarray, pull: np.ndarray, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+    """Ln of the integral within bounds of exp of what pull' x - x' H x / 2 is above its value at the mode x there."""
+    slope = pull - H @ x
+    stiff = np.diag(H)
+    pressed = np.where(slope > 0, x >= high, x <= low) & (np.abs(slope) > PRESSED * np.sqrt(stiff))
+    free = np.flatnonzero(~pressed)
+    inner = H[np.ix_(free, free)]
+    covariance = np.linalg.inv(inner)
+    mean = x[free] + covariance @ slope[free]
+    off = x[free] - mean
+    found = 0.5 * float(off @ inner @ off) + 0.5 * (len(free) * LN_TWO_PI - float(np.linalg.slogdet(inner)[1]))
+    found += ln_box(mean, covariance, low[free], high[free])
+    for k in np.flatnonzero(pressed):
+        across = H[k, free]
+        bend = math.sqrt(H[k, k] - float(across @ covariance @ across))
+        away = abs(slope[k]) / bend / math.sqrt(2)
+        found += math.log(float(erfcx(away)) * math.sqrt(0.5 * math.pi) / bend)
+    return found
 
 
 def _bounded(H: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -90,14 +116,16 @@ def _bounded(H: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray)
     scale = 1 / np.sqrt(np.diag(H))
     root = np.linalg.cholesky(H * np.outer(scale, scale)).T
     found = lsq_linear(root, np.linalg.solve(root.T, pull * scale), bounds=(low / scale, high / scale), tol=1e-12)
-    return np.clip(found.x * scale, low, high)
+    # From inside, bounds are reached but for the last digits.
+    x = np.where(found.x * scale - low < EDGE * scale, low, found.x * scale)
+    return np.where(high - x < EDGE * scale, high, x)
 
 
 def ln_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
-    """Ln of the probability of a box under a normal distribution.
+    """Ln of the probability of a box under a normal distribution, by expectation propagation.
 
-    One dimension after the other, the rest conditioned on the truncated moments (Mendell and Elston 1974): exact for
-    one bounded dimension and for independent ones.
+    Each interval is replaced by the Gaussian that makes the same of the distribution under all the others (Cunningham,
+    Hennig and Lacoste-Julien 2011): exact for one bounded dimension and for independent ones.
 
     Args:
         mean: [K].
@@ -107,18 +135,32 @@ def ln_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.n
     """
     deviation = np.sqrt(np.diag(covariance))
     tight = np.flatnonzero((low > mean - NEAR * deviation) | (high < mean + NEAR * deviation))
-    mean, covariance = mean[tight].copy(), covariance[np.ix_(tight, tight)].copy()
-    low, high, ln_p = low[tight], high[tight], 0.0
-    left = list(range(len(tight)))
-    while left:
-        each = [_truncated(mean[i], covariance[i, i], low[i], high[i]) for i in left]
-        k = int(np.argmin([p for p, _, _ in each]))  # what is cut most first
-        i, (ln_part, middle, variance) = left.pop(k), each[k]
-        ln_p += ln_part
-        share = covariance[:, i] / covariance[i, i]
-        mean = mean + share * (middle - mean[i])
-        covariance = covariance + np.outer(share, share) * (variance - covariance[i, i])
-    return ln_p
+    if not len(tight):
+        return 0.0
+    # In deviations from the mean.
+    scale = deviation[tight]
+    K = covariance[np.ix_(tight, tight)] / np.outer(scale, scale)
+    a, b = ((edge[tight] - mean[tight]) / scale for edge in (low, high))
+    if len(tight) == 1:
+        return _truncated(0.0, 1.0, a[0], b[0])[0]
+    tau, nu = np.zeros(len(tight)), np.zeros(len(tight))
+    found = -math.inf
+    for _ in range(SWEEPS):
+        root = np.sqrt(tau)
+        B = np.eye(len(tight)) + root[:, None] * K * root
+        S = K - (K * root) @ np.linalg.solve(B, root[:, None] * K)
+        spread = np.diag(S)
+        precision = 1 / spread - tau  # of the cavity, and its precision times its mean
+        pull = S @ nu / spread - nu
+        cut = [_truncated(p / q, 1 / q, *edges) for p, q, *edges in zip(pull, precision, a, b, strict=True)]
+        ln_z, middle, variance = np.array(cut).T
+        ln_c = ln_z + 0.5 * np.log1p(tau / precision) - 0.5 * ((pull + nu) ** 2 / (precision + tau) - pull**2 / precision)
+        before, found = found, float(ln_c.sum() + 0.5 * nu @ S @ nu - 0.5 * np.linalg.slogdet(B)[1])
+        if abs(found - before) < SETTLED:
+            break
+        tau = np.maximum(1 / variance - precision, 0.0)
+        nu = middle / variance - pull
+    return found
 
 
 def _truncated(mean: float, variance: float, low: float, high: float) -> tuple[float, float, float]:
