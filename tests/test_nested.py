@@ -37,7 +37,7 @@ def test_likelihood_at_the_best_point_is_that_of_the_linear_model(dragged):
         for p, x in zip(found.model.priors[:count], found.at[:count], strict=True)
     ]
     low, high = time_range(data)
-    cube = np.array([[*place, 0.25, 0.5], [*place[:-1], 0.9 * place[-1], 0.25, 0.5]])
+    cube = np.array([[*place, 0.25, 0.5, 1.0], [*place[:-1], 0.9 * place[-1], 0.25, 0.5, 1.0]])
     best, beside = nested.likelihood(problem, fit, found)(cube)
     faults = dataclasses.replace(
         found,

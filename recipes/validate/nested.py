@@ -25,7 +25,7 @@ from threadpoolctl import threadpool_limits
 from torchsoro.command_line import Count, options, program
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.candidates import data_of, held_of, near
-from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, grams, infer, time_range
+from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, grams, infer, ranges
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.laplace import posterior
 from torchsoro.sim2real.inference.search import search
@@ -57,7 +57,7 @@ class Options:
 
 
 def likelihood(problem: FitProblem, fit: Fit, found: Linearised) -> Callable[[np.ndarray], np.ndarray]:
-    """Ln likelihoods at points of the unit cube [B, K + 2]: quantiles of the unknowns, of s and of tau."""
+    """Ln likelihoods at points of the unit cube [B, K + 3]: quantiles of the unknowns, of s, tau and c."""
     data, moving = data_of(problem), ~held_of(problem, fit.effects)
     count = int(moving.sum())
     model, faults = found.model, found.at[count:]
@@ -83,19 +83,19 @@ def likelihood(problem: FitProblem, fit: Fit, found: Linearised) -> Callable[[np
     (best,) = linear(found.at[None, :count])
     assert best is not None
     shift = [a - b for a, b in zip(found.residuals, best.residuals, strict=True)]
-    (least, most), (shortest, longest) = np.log(data.shares), time_range(data)
+    low, high = ranges(data, found.numerics)
 
     def ln_likelihood(cube: np.ndarray) -> np.ndarray:
         points = np.stack([p.quantile(u) for p, u in zip(model.priors[:count], cube.T[:count], strict=True)], 1)
         # As probable that no discrepancy matters as that one does.
-        shares = np.exp(least + np.clip(2 * cube[:, -2] - 1, 0, 1) * (most - least))
-        times = np.exp(shortest + cube[:, -1] * (longest - shortest))
+        quantiles = np.concatenate([np.clip(2 * cube[:, -3:-2] - 1, 0, 1), cube[:, -2:]], 1)
+        discrepancies = [Discrepancy(*map(float, x)) for x in np.exp(low + quantiles * (high - low))]
         values = np.full(len(cube), WORST)
         for b, one in enumerate(linear(points)):
             if one is not None:
                 left = tuple(r + d for r, d in zip(one.residuals, shift, strict=True))
                 moved = dataclasses.replace(one, residuals=left)
-                gram = total(grams(data, moved, Discrepancy(float(shares[b]), float(times[b]))))
+                gram = total(grams(data, moved, discrepancies[b]))
                 values[b] = posterior(gram, faults, few.priors).ln_evidence
         return values
 
@@ -109,7 +109,7 @@ def sampled(problem: FitProblem, fit: Fit, found: Linearised, asked: Options) ->
     sampler = nautilus.Sampler(
         lambda u: u,
         likelihood(problem, fit, found),
-        n_dim=count + 2,
+        n_dim=count + 3,
         n_live=asked.live,
         n_networks=1,
         n_batch=64,

@@ -244,7 +244,7 @@ def infer(data: Data, near: Linearised) -> Posterior:
         ln_occam = _ln_occam(data, near, near.left(mode.at), x, low, high)
         return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
 
-    low, high = _ranges(data, near.numerics)
+    low, high = ranges(data, near.numerics)
     middle = 0.5 * (low + high)
     # From little and from much: with much, the first mode is not bent by a wrong model.
     some = [settled(np.array([ln_s, middle[1], high[2]]), low, high) for ln_s in (middle[0], high[0])]
@@ -279,8 +279,8 @@ def time_range(data: Data) -> tuple[float, float]:
     return math.log(shortest), math.log(longest)
 
 
-def _ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
-    """Of ln s, ln tau and ln c."""
+def ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of ln s, ln tau and ln c, between which their priors are uniform."""
     low, high = time_range(data)
     least, most = np.log(data.shares)
     price = math.log(LEAST_PRICE) if numerics.amplitude.any() else 0.0

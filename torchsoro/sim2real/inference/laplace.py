@@ -154,8 +154,9 @@ def ln_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.n
         pull = S @ nu / spread - nu
         cut = [_truncated(p / q, 1 / q, *edges) for p, q, *edges in zip(pull, precision, a, b, strict=True)]
         ln_z, middle, variance = np.array(cut).T
-        ln_c = ln_z + 0.5 * np.log1p(tau / precision) - 0.5 * ((pull + nu) ** 2 / (precision + tau) - pull**2 / precision)
-        before, found = found, float(ln_c.sum() + 0.5 * nu @ S @ nu - 0.5 * np.linalg.slogdet(B)[1])
+        shift = (pull + nu) ** 2 / (precision + tau) - pull**2 / precision
+        ln_factors = ln_z + 0.5 * (np.log1p(tau / precision) - shift)
+        before, found = found, float(ln_factors.sum() + 0.5 * (nu @ S @ nu - np.linalg.slogdet(B)[1]))
         if abs(found - before) < SETTLED:
             break
         tau = np.maximum(1 / variance - precision, 0.0)
