@@ -9,20 +9,28 @@ likelihood: Ribatet, Cooley and Davison 2012),
     kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
 and the likelihood is taken to the power of 1 / kappa.
+
+Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
+how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
+not known, of root mean square r, left by a model with K numbers of its own, have the likelihood (Schwarz 1978)
+
+    ln p = -N ln r - K/2 ln N.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.decision import COMMON, CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Linearised,
+    Model,
     Posterior,
     adjusted,
     closest,
@@ -44,7 +52,7 @@ class Candidate:
         modes: Distinct ones, adjusted, most probable first.
         size: Root mean square of the change of the motion by it, from what is believed, within tolerances [m].
         left: What it leaves of the recordings, see :func:`remainder` [m].
-        ln_evidence: Summed over modes.
+        ln_evidence: Summed over modes, adjusted.
         probability: Posterior.
     """
 
@@ -172,34 +180,68 @@ class Weighing:
         """The most probable of all."""
         return max((*self.effects, *self.nothing), key=lambda p: p.ln_evidence)
 
+    @cached_property
+    def unexplained(self) -> float:
+        """What the model without an effect leaves, its beliefs within their tolerances [m]."""
+        return max(remainder(self.data, self.bounded.near), self.data.noise)
+
+    def _ln_prior(self, model: Model) -> float:
+        """Of a name; a model without effects stands for what has none."""
+        pair = math.log(self.names) if len(model.effects) > 1 else 0.0
+        return math.log(MISSING / (self.names + 1)) - pair
+
     def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
         """Posterior probabilities of all names, and what has an effect, most probable first."""
         kappa = self.kappa
         null = adjusted(self.data, self.null, kappa)
         groups = {name: [adjusted(self.data, p, kappa) for p in modes] for name, modes in self.groups.items()}
-        share = math.log(MISSING / (self.names + 1))
+        ln_prior = {name: self._ln_prior(modes[0].near.model) for name, modes in groups.items()}
+        ln_p = {name: ln_prior[name] + _summed(modes) for name, modes in groups.items()}
         # Without a discrepancy that matters nothing is missing, with one something is that has no name.
-        ln_p = {
-            NOTHING: math.log(1 - MISSING) + null.none.ln_evidence,
-            UNKNOWN: share + null.some.ln_evidence,
-        }
-        for name, modes in groups.items():
-            pair = -math.log(self.names) if len(modes[0].near.model.effects) > 1 else 0.0
-            ln_p[name] = share + pair + float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
-        most = max(ln_p.values())
-        whole = sum(math.exp(value - most) for value in ln_p.values())
-        probabilities = {name: math.exp(value - most) / whole for name, value in ln_p.items()}
+        ln_p[NOTHING] = math.log(1 - MISSING) + null.none.ln_evidence
+        ln_p[UNKNOWN] = self._ln_prior(null.near.model) + null.some.ln_evidence
+        probabilities = normalised(ln_p)
+        left = {name: remainder(self.data, modes[0].near) for name, modes in groups.items()}
+        if self.best.matters:
+            # Whether something is missing is told by evidence, what it is by the size of what is left.
+            missing = 1 - probabilities[NOTHING]
+            count = independent(self.data, self.best.discrepancy.time)
+            rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(self.unexplained)}
+            for name, modes in groups.items():
+                own = len(modes[0].near.model.own)
+                size = max(left[name], self.data.noise)
+                rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
+            probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         found = [
             Candidate(
                 modes=tuple(modes),
                 size=size_of(self.change(self.groups[name][0])),
-                left=remainder(self.data, modes[0].near),
-                ln_evidence=ln_p[name] - share,
+                left=left[name],
+                ln_evidence=_summed(modes),
                 probability=probabilities[name],
             )
             for name, modes in groups.items()
         ]
         return probabilities, sorted(found, key=lambda c: -c.probability)
+
+
+def normalised(ln_p: dict[str, float]) -> dict[str, float]:
+    """Probabilities in proportion, that add up to one."""
+    most = max(ln_p.values())
+    whole = sum(math.exp(value - most) for value in ln_p.values())
+    return {name: math.exp(value - most) / whole for name, value in ln_p.items()}
+
+
+def independent(data: Data, time: float) -> float:
+    """Number of independent values of a discrepancy with a correlation time [s], in trials, axes and markers."""
+    axes, markers = data.amplitudes[0].shape
+    channels = axes * markers / (1 + (markers - 1) * COMMON**2)
+    return channels * sum(max(1.0, float(t.time[-1] - t.time[0]) / time) for t in data.trials)
+
+
+def _summed(modes: Sequence[Posterior]) -> float:
+    """Ln evidence of all modes."""
+    return float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
 
 
 def _same(one: Posterior, other: Posterior) -> bool:
@@ -237,7 +279,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
-    names, left = {c.name: c for c in candidates}, remainder(data, weighing.bounded.near)
+    names, left = {c.name: c for c in candidates}, weighing.unexplained
     for c in candidates:
         # An extension that moves as what it extends adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]

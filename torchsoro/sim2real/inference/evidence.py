@@ -30,6 +30,7 @@ from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Pro
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
 NARROW = 0.05  # of ln s, ln tau and ln c: what they need not be known better than
+FIRST = 0.5  # step in ln s, ln tau and ln c with which their search begins
 APART = 0.15  # of ln s, ln tau and ln c, for second differences
 LEAST_PRICE = 0.1  # of the price of the twin's error, that it has; the noise is above what is less
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
@@ -312,12 +313,19 @@ def _restricted(
         full[moving] = free
         return full
 
+    start = np.clip(x, low, high)[moving]
+    away = np.where(start > 0.5 * (low + high)[moving], -FIRST, FIRST)
     found = minimize(
         lambda free: -_ln_likelihood(data, near, left, at(free)),
-        np.clip(x, low, high)[moving],
+        start,
         method="Nelder-Mead",
         bounds=[(low[k], high[k]) for k in moving],
-        options={"maxfev": 30 * len(moving), "xatol": 0.5 * NARROW, "fatol": 0.05},
+        options={
+            "maxfev": 30 * len(moving),
+            "xatol": 0.5 * NARROW,
+            "fatol": 0.05,
+            "initial_simplex": start + np.concatenate([np.zeros((1, len(start))), np.diag(away)]),
+        },
     )
     return np.clip(at(found.x), low, high)
 
