@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from swings import EXACT, recorded
 
-from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude
+from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude, independent
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, size_of
@@ -130,6 +130,31 @@ def test_an_effect_beside_something_else_is_told_as_most_of_the_difference():
     # The same effect alone leaves nothing that matters.
     data, nothing, drag = recorded(0.0, 14, effect=1.0)
     assert not conclude(weighed(data, nothing, drag), limit=0.0).partly
+
+
+def test_where_no_model_is_right_the_one_that_leaves_less_is_told():
+    # One leaves a smooth difference, which is easily foretold from sample to sample, the other a smaller rough one.
+    data, nothing, _ = recorded(0.0, 18)
+    time = data.trials[0].time
+    everywhere = np.ones((1, 3, 2))
+    smooth = tuple(0.2 * np.sin(4 * time)[:, None, None] * everywhere for _ in data.trials)
+    rough = tuple(0.1 * np.sin(90 * time)[:, None, None] * everywhere for _ in data.trials)
+    start = tuple(1.0 * np.sin(9 * time)[:, None, None] * everywhere for _ in data.trials)
+
+    def ending(name, left):
+        slopes = tuple((a - b)[..., None] for a, b in zip(start, left, strict=True))
+        model = Model(effects=(name,), priors=(Prior(1.0),), own=(0,))
+        return Linearised(model=model, at=np.zeros(1), residuals=start, slopes=slopes, numerics=EXACT)
+
+    nothing = dataclasses.replace(nothing, residuals=start)
+    weighing = weighed(data, nothing, ending("drag", smooth), ending("leak", rough))
+    evidence = {p.near.model.name: p.ln_evidence for p in weighing.effects}
+    found = conclude(weighing, limit=0.0)
+    assert evidence["drag"] > evidence["leak"]
+    assert (found.chosen, found.partly) == (("leak",), True)
+    # Numbers of its own count: the same remainder with more of them is less probable.
+    count = independent(data, 0.05)
+    assert count > independent(data, 0.1) > 0.4 * count
 
 
 def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told():

@@ -144,24 +144,31 @@ def ln_box(mean: np.ndarray, covariance: np.ndarray, low: np.ndarray, high: np.n
     if len(tight) == 1:
         return _truncated(0.0, 1.0, a[0], b[0])[0]
     tau, nu = np.zeros(len(tight)), np.zeros(len(tight))
+    inverse, ln_det = np.linalg.inv(K), float(np.linalg.slogdet(K)[1])
     found = -math.inf
     for _ in range(SWEEPS):
-        root = np.sqrt(tau)
-        B = np.eye(len(tight)) + root[:, None] * K * root
-        S = K - (K * root) @ np.linalg.solve(B, root[:, None] * K)
+        unit = 1 / np.sqrt(np.diag(inverse) + tau)
+        P = (inverse + np.diag(tau)) * np.outer(unit, unit)
+        S = np.linalg.inv(P) * np.outer(unit, unit)
         spread = np.diag(S)
-        precision = 1 / spread - tau  # of the cavity, and its precision times its mean
+        # Of the cavity: its precision, which bounds of others can only raise, and that times its mean.
+        precision = np.maximum(1 / spread - tau, 1.0)
         pull = S @ nu / spread - nu
         cut = [_truncated(p / q, 1 / q, *edges) for p, q, *edges in zip(pull, precision, a, b, strict=True)]
         ln_z, middle, variance = np.array(cut).T
         shift = (pull + nu) ** 2 / (precision + tau) - pull**2 / precision
         ln_factors = ln_z + 0.5 * (np.log1p(tau / precision) - shift)
-        before, found = found, float(ln_factors.sum() + 0.5 * (nu @ S @ nu - np.linalg.slogdet(B)[1]))
+        before, found = found, float(ln_factors.sum() + 0.5 * (nu @ S @ nu - _ln_det(P, unit) - ln_det))
         if abs(found - before) < SETTLED:
             break
         tau = np.maximum(1 / variance - precision, 0.0)
         nu = middle / variance - pull
     return found
+
+
+def _ln_det(scaled: np.ndarray, unit: np.ndarray) -> float:
+    """Ln of the determinant of a matrix that was scaled on both sides."""
+    return float(np.linalg.slogdet(scaled)[1]) - 2 * float(np.log(unit).sum())
 
 
 def _truncated(mean: float, variance: float, low: float, high: float) -> tuple[float, float, float]:
