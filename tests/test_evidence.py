@@ -201,6 +201,23 @@ def test_probability_of_a_box_far_in_the_tail_keeps_its_digits():
     assert found == pytest.approx(stats.norm.logsf(20.0), rel=1e-12)
 
 
+@given(st.floats(-1e4, 1e4), st.floats(-9.0, 3.0), st.floats(-0.9, 0.9))
+def test_probability_of_a_narrow_box_far_out_is_that_of_its_edge(mean, ln_width, correlation):
+    # In units of deviations; exact where the density falls by a constant rate through the box.
+    width = 10**ln_width
+    alone = ln_box(np.array([mean]), np.eye(1), np.zeros(1), np.array([width]))
+    assert math.isfinite(alone)
+    if width < 1e-3:
+        fall = abs(mean) * width
+        exact = stats.norm.logpdf(min(abs(mean), abs(mean - width))) + math.log(
+            -math.expm1(-fall) / fall * width if fall > 1e-9 else width
+        )
+        assert alone == pytest.approx(exact, abs=1e-6 * (1 + abs(mean)))
+    # Beside another that is as narrow, whatever they have in common.
+    K = np.array([[1.0, correlation], [correlation, 1.0]])
+    assert math.isfinite(ln_box(np.array([mean, 0.5]), K, np.zeros(2), np.array([width, 1e-7])))
+
+
 @given(st.floats(0.01, 0.99), st.sampled_from([math.inf, 4.0]), st.floats(-2.0, 0.0), st.floats(0.5, 9.0))
 def test_a_quantile_of_a_prior_has_its_share_of_the_mass_below(u, freedom, low, width):
     prior = Prior(1.5, freedom=freedom, low=low, high=low + width)

@@ -183,7 +183,7 @@ class Weighing:
     @cached_property
     def unexplained(self) -> float:
         """What the model without an effect leaves, its beliefs within their tolerances [m]."""
-        return max(remainder(self.data, self.bounded.near), self.data.noise)
+        return max(remainder(self.data, self.bounded), self.data.noise)
 
     def _ln_prior(self, model: Model) -> float:
         """Of a name; a model without effects stands for what has none."""
@@ -201,7 +201,7 @@ class Weighing:
         ln_p[NOTHING] = math.log(1 - MISSING) + null.none.ln_evidence
         ln_p[UNKNOWN] = self._ln_prior(null.near.model) + null.some.ln_evidence
         probabilities = normalised(ln_p)
-        left = {name: remainder(self.data, modes[0].near) for name, modes in groups.items()}
+        left = {name: remainder(self.data, modes[0]) for name, modes in groups.items()}
         if self.best.matters:
             # Whether something is missing is told by evidence, what it is by the size of what is left.
             missing = 1 - probabilities[NOTHING]
@@ -257,9 +257,10 @@ def apart(one: Posterior, other: Posterior) -> float:
     return size_of(tuple(a - b for a, b in zip(one.left, other.left, strict=True)))
 
 
-def remainder(data: Data, near: Linearised) -> float:
-    """Root mean square of the least that a model leaves, beyond noise and the twin's own error [m]."""
-    known = data.noise**2 + float((near.numerics.amplitude**2).mean())
+def remainder(data: Data, found: Posterior) -> float:
+    """Root mean square of the least that a model leaves, beyond noise and what there is of the twin's own error [m]."""
+    near = found.near
+    known = data.noise**2 + float(((found.discrepancy.twin * near.numerics.amplitude) ** 2).mean())
     return math.sqrt(max(size_of(near.left(closest(data, near).at)) ** 2 - known, 0.0))
 
 
