@@ -29,7 +29,6 @@ import numpy as np
 
 from torchsoro.sim2real.inference.decision import COMMON, CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
-    Linearised,
     Model,
     Posterior,
     adjusted,
