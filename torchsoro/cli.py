@@ -10,13 +10,14 @@ asked for is imported. ``torchsoro walker`` and ``python recipes/walker.py`` are
 from __future__ import annotations
 
 import ast
-import importlib.metadata
 import importlib.util
 import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+
+import torchsoro
 
 COMMANDS = ("view", "walker", "climber", "replay", "compare", "material", "explain", "convert", "benchmark")
 """Recipes in the order of ``--help``; a recipe that is not there is left out."""
@@ -83,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if command in ("-h", "--help", "help"):
         print(usage())
     elif command == "--version":
-        print(f"torchsoro {importlib.metadata.version('torchsoro')}")
+        print(f"torchsoro {torchsoro.__version__}")
     else:
         try:
             recipe = load(command)

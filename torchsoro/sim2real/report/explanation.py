@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 from scipy.stats import norm, truncnorm
 
+import torchsoro
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import ForceMap
@@ -224,7 +224,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "hints": list(e.hints),
         "next": [{"record": p.words, "alike": p.cosine, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
-        "version": version("torchsoro"),
+        "version": torchsoro.__version__,
         "settings": dict(settings),
     }
 
