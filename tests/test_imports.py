@@ -18,7 +18,7 @@ PACKAGE = ROOT / "torchsoro"
 # Rooms from the ground up: a module may import those of a lower line, and those of its own room as long as that makes
 # no circle. A room is a folder, or a file that lies beside the folders.
 ORDER = """
-errors
+errors version
 storage command_line
 simulation.laws simulation.axis
 simulation.kernels

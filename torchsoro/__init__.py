@@ -6,6 +6,8 @@ command line answers before torch and Taichi are loaded.
 
 import lazy_loader
 
-__version__ = "0.1.0"
+from torchsoro.version import VERSION
+
+__version__ = VERSION
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
-import torchsoro
+from torchsoro.version import VERSION
 
 COMMANDS = ("view", "walker", "climber", "replay", "compare", "material", "explain", "convert", "benchmark")
 """Recipes in the order of ``--help``; a recipe that is not there is left out."""
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if command in ("-h", "--help", "help"):
         print(usage())
     elif command == "--version":
-        print(f"torchsoro {torchsoro.__version__}")
+        print(f"torchsoro {VERSION}")
     else:
         try:
             recipe = load(command)

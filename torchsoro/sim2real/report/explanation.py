@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, truncnorm
 
-import torchsoro
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import ForceMap
@@ -23,6 +22,7 @@ from torchsoro.sim2real.inference.verdict import Verdict
 from torchsoro.sim2real.report.body import BodyMotion
 from torchsoro.sim2real.report.improvement import Improvement, Worst
 from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.version import VERSION
 
 LEVEL = 0.9  # probability that an interval is to hold the truth
 # Standard deviation of a place by the form of the model, over the body's size; as Hypothesis.model_form_deviation of a
@@ -224,7 +224,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "hints": list(e.hints),
         "next": [{"record": p.words, "alike": p.cosine, "distance": p.distance} for p in e.following],
         "cost": {"simulations": problem.tally.simulations, "seconds": e.seconds},
-        "version": torchsoro.__version__,
+        "version": VERSION,
         "settings": dict(settings),
     }
 
