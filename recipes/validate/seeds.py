@@ -1,4 +1,4 @@
-"""Design a robot from several initial fields that differ by 1e-6, and print what becomes of each.
+"""Design a robot from several initial fields that differ by a millionth, and print what becomes of each.
 
     python recipes/validate/seeds.py                       # ten desk walkers, about a minute each on two cores
     python recipes/validate/seeds.py climber --seeds 3
@@ -26,14 +26,12 @@ import torch
 import tyro
 
 from torchsoro.command_line import Count, options, program
-from torchsoro.design.loop import optimize
 from torchsoro.design.presets import CLIMBER, WALKER
 from torchsoro.design.robot import build
 from torchsoro.design.settings import Settings
+from torchsoro.design.starts import disturb, optimize_starts
 from torchsoro.simulation.threads import set_threads, thread_count
 from torchsoro.storage import atomic_write
-
-CHANGE = 1e-6  # of the initial field, standard deviation
 
 
 @options
@@ -53,11 +51,9 @@ class Options:
 def designed(settings: Settings, seed: int) -> dict[str, float]:
     """Result of the design from the initial field of a seed."""
     robot = build(settings)
-    change = CHANGE * torch.randn(robot.field.phi.shape, generator=torch.Generator().manual_seed(seed))
-    with torch.no_grad():
-        robot.field.phi.add_(change.to(robot.field.phi)).clamp_(-1, 1)
+    disturb(robot.field, seed)
     begin, used = time.perf_counter(), time.process_time()
-    found = optimize(robot)
+    found = optimize_starts(robot)
     with torch.no_grad():
         outcome = robot(found.gamma)
     return {

@@ -116,11 +116,15 @@ class Optimized:
     Attributes:
         gamma: Density of the best design [N] (see :func:`better`).
         iteration: Iteration that it is of; None where no iteration had full gravity, and it is the last.
+        worth: What it is worth, in cells (see :func:`worth_of`); minus infinity where ``iteration`` is None.
+        violation: C above its limit; infinite where ``iteration`` is None.
         metrics: Everything logged, by column (see ``RunFolder.metrics``).
     """
 
     gamma: torch.Tensor
     iteration: int | None
+    worth: float
+    violation: float
     metrics: dict[str, list[float]]
 
 
@@ -182,7 +186,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
     Travel is a rough function of the design, so that the last design is seldom the best. Designs count from the first
-    iteration with full gravity on.
+    iteration with full gravity on. Where gradients overflow again and again, the run ends with its best design.
 
     Args:
         robot: What to design.
@@ -190,7 +194,8 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
 
     Raises:
         ValueError: if the folder holds another run (see :class:`RunFolder`).
-        SimulationDiverged: if the simulation breaks down on a design and on those nearer to the last good one.
+        SimulationDiverged: if the simulation breaks down on a design and on those nearer to the last good one, or if
+            gradients overflow again and again and no design is within the limit on C.
     """
     s, field = robot.settings, robot.field
     if s.target.type == "cpu":
@@ -235,7 +240,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                 # Through so rough a motion it overflows and says nothing.
                 lost += 1
                 adam.zero_grad(set_to_none=False)
-                if lost > MOST_LOST:
+                if lost > MOST_LOST and (best is None or best["violation"] > 0):
                     raise SimulationDiverged(
                         step=0,
                         time=0.0,
@@ -255,7 +260,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
-            stopped = event is not None and event.stop and s.gravity_scale(k) == 1.0
+            stopped = lost > MOST_LOST or (event is not None and event.stop and s.gravity_scale(k) == 1.0)
             center = outcome.center.detach()
             run.log(
                 k,
@@ -286,5 +291,6 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             with torch.no_grad():
                 field.phi.copy_(best["phi"])
             field.beta = best["beta"]
-        chosen = None if best is None else best["iteration"]
-        return Optimized(gamma=field().detach(), iteration=chosen, metrics=run.metrics)
+        none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
+        told = {name: (best or none)[name] for name in none}
+        return Optimized(gamma=field().detach(), metrics=run.metrics, **told)

@@ -77,11 +77,17 @@ _CLIMBER_DESK = dataclasses.replace(
     settle=0.0,
     upright=0.0,
     sink=0.008,
-    feet=0.0,
+    # Without, some slide down with the mass ahead of the feet.
+    feet=0.1,
     inflated=0.0,
     lightness=0.0,
     # Between walls, Coulomb friction holds only who presses on them: the first bodies slide down.
     friction="stick",
+    # Thinner limbs lose their hold in some designs and not in others.
+    filter_radius=0.0085,
+    # One start in eight lets go of the walls.
+    starts=2,
+    iterations=100,
     penalty=0.8,
     sharpen=(12, 46),
     counted="body",

@@ -55,6 +55,8 @@ class Settings:
     """Where to compute; auto takes CUDA if there is one."""
     iterations: Count = 400
     """Most iterations; the stopping rule may end earlier."""
+    starts: Count = 1
+    """Designs from initial fields that differ by a millionth, of which the best is delivered; side by side on a CPU."""
 
     size: tuple[_Length, _Length, _Length] = (0.035, 0.035, 0.035)
     """Edges of the body [m]."""
@@ -300,7 +302,7 @@ class Settings:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
-        here = ("out", "resume", "amend", "overwrite", "iterations", "device", "memory")
+        here = ("out", "resume", "amend", "overwrite", "iterations", "starts", "device", "memory")
         return (*here, "picture_every", "shape_every", "frames", "resolution", "fps", "follow", "offset", "port")
 
 

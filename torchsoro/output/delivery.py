@@ -14,10 +14,10 @@ import numpy as np
 import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
-from torchsoro.design.loop import optimize
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.robot import Robot
 from torchsoro.design.settings import Settings
+from torchsoro.design.starts import optimize_starts
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import save_design
 from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
@@ -41,10 +41,10 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
 
     Raises:
-        ValueError: see :func:`torchsoro.design.loop.optimize`; also if the design has no connected body to print.
+        ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body.
     """
     s = robot.settings
-    optimized = optimize(robot, observe)
+    optimized = optimize_starts(robot, observe)
     history = optimized.metrics
     found = {
         **deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
