@@ -15,6 +15,7 @@ from scipy.integrate import quad
 from scipy.optimize import minimize_scalar
 from swings import AXES, EXACT, recorded
 
+from torchsoro.sim2real.inference import evidence
 from torchsoro.sim2real.inference.decision import MATTERS
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
@@ -313,3 +314,12 @@ def test_recordings_cannot_be_changed():
         data.trials[0].position[0] = 0.0
     with pytest.raises(dataclasses.FrozenInstanceError):
         data.noise = 1.0
+
+
+def test_the_range_that_residuals_leave_next_to_a_steep_bound_has_a_probability(monkeypatch):
+    # The log-likelihood falls so steeply, and so unlike a parabola, that a parabola fitted beside the bound misses its top.
+    monkeypatch.setattr(evidence, "_ln_likelihood", lambda data, near, left, x: -1e6 * float(x[0]) ** 3)
+    low, high = np.zeros(3), np.array([5.0, 0.0, 0.0])
+    mass = quad(lambda x: math.exp(-1e6 * x**3), 0, 0.1)[0]
+    found = evidence._ln_occam(None, None, None, np.zeros(3), low, high)
+    assert found == pytest.approx(math.log(mass / 5.0), abs=3)

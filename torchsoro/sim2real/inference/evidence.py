@@ -345,8 +345,9 @@ def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: n
         # Finer steps where the parabola is narrow, so that its top is not missed.
         away = np.linspace(-1, 1, 2001) ** 3 * (high[k] - low[k]) + x[k] - middle
         away = away[(away >= low[k] - middle) & (away <= high[k] - middle)]
-        height = values[1] - top + slope * away + 0.5 * bend * away**2
-        mass = float(np.trapezoid(np.exp(np.minimum(height, 0.0)), away))
+        height = np.minimum(values[1] - top + slope * away + 0.5 * bend * away**2, 0.0)
+        # From its own top: a parabola from beside a steep bound may pass far below that of the residuals.
+        mass = float(np.trapezoid(np.exp(height - height.max()), away))
         found += min(0.0, math.log(mass / (high[k] - low[k])))
     return found
 
