@@ -5,7 +5,7 @@
 
 The name of the folder selects the experiment. Bar and arm are those of Dubied, Michelis, Spielberg, Katzschmann (2022),
 of Dragon Skin 10, recorded by motion capture. The model has the modulus of their repository, fitted to a static
-deflection, and no damping.
+deflection, and no damping. So is the fish tail.
 
 silicone-cantilever-beam: 100 x 30 x 30 mm, clamped at one end, held straight and released under its weight, without and
 with an additional 1.0006 N at the upper free edge, modelled as a dead load. One recording of each kind is to be
@@ -18,12 +18,17 @@ bellows-actuator: the actuator of Caasenbrood, Pogromsky, Nijmeijer (2022), bent
 cross-section is not published: the model is a solid bar of the same length and mass with the published linear
 stiffness, held by a force at its end. The recorded quantity is an angle; the position of the end is that of a circular
 arc. Gravity, whose direction is not reported, is omitted.
+
+pneumatic-fish-tail: clamped at its base, one of two chambers inflated once. Neither the pressure nor the shape of the
+chambers is published: the model has boxes on each side of the middle wall, with walls of 3 mm, and a step to 10 kPa.
+Gravity, whose direction is not reported, is omitted. Its recording is explained; none is left to be held out.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
@@ -96,6 +101,30 @@ BELLOWS_LENGTH, BELLOWS_WIDTH = 0.064, 0.013 * math.pi**0.5  # m; a square of th
 BELLOWS_STIFFNESS, BELLOWS_MASS, BELLOWS_POISSON = 8.25e-4, 0.017, 0.45  # N m2, kg
 BELLOWS_GROWS, BELLOWS_ENDS, BELLOWS_LASTS = 0.26, 0.30, 0.85  # s; two periods, so that what holds leaves no swing
 BELLOWS_RATE = 200.0  # Hz; the file has 10 kHz, interpolated
+
+TAIL_MARKERS = {"tail1": (0.0, -0.01419, 0.05221)}
+TAIL_LASTS = 1.8  # s
+TAIL_PRESSURE, TAIL_FILLS = 10e3, 0.02  # Pa, s
+TAIL_SEEN, TAIL_EVERY = 0.3e-3, 2  # m that the tail has moved when it begins; of the 100 Hz every second frame
+# Within walls of 3 mm; the middle wall is published.
+TAIL_CHAMBERS = {
+    "left": [[-0.012, -0.012, 0.003], [-0.007, 0.012, 0.057]],
+    "right": [[0.005, -0.012, 0.003], [0.012, 0.012, 0.057]],
+}
+TAIL = f"""title = "fish tail, one chamber inflated"
+gravity = [0.0, 0.0, 0.0]
+duration = {TAIL_LASTS}
+start = "rest"
+
+[body]
+shape = "mesh"
+file = "tail.stl"
+scale = 0.001
+
+{MATERIAL}
+[[clamp]]
+box = [[-0.016, -0.026, -0.001], [0.016, 0.026, 0.0001]]
+"""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -218,10 +247,27 @@ noise = 1e-4
     return text, {"released": Files(kept=False, markers=columns)}
 
 
+def tail(options: Options) -> tuple[str, dict[str, Files]]:
+    """Fish tail with one chamber inflated and the other vented."""
+    table = table_of(options.recordings / "fish_tail_tailframe.csv")
+    aside = table["tail1_x_m"]
+    begins = int(np.argmax(np.abs(aside - aside[:2].mean()) > TAIL_SEEN)) - 1
+    time = table["time_s"] - table["time_s"][begins]
+    used = np.flatnonzero((time >= 0) & (time <= TAIL_LASTS))[::TAIL_EVERY]
+    columns = {"time_s": time[used], **moved(table, TAIL_MARKERS, slice(0, begins + 1), used)}
+    supply = {"left_pa": np.array([0.0, TAIL_PRESSURE, TAIL_PRESSURE]), "right_pa": np.zeros(3)}
+    pressure = {"time_s": np.array([0.0, TAIL_FILLS, 2 * TAIL_LASTS]), **supply}
+    chambers = "".join(f'\n[[chamber]]\nname = "{name}"\nbox = {box}\n' for name, box in TAIL_CHAMBERS.items())
+    options.out.mkdir(parents=True, exist_ok=True)
+    shutil.copy(options.recordings / "soft_fish_mm.stl", options.out / "tail.stl")
+    return setup(TAIL + chambers, TAIL_MARKERS), {"inflated": Files(kept=False, markers=columns, pressure=pressure)}
+
+
 MAKERS: dict[str, Callable[[Options], tuple[str, dict[str, Files]]]] = {
     "silicone-cantilever-beam": bar,
     "pneumatic-arm-segment": arm,
     "bellows-actuator": bellows,
+    "pneumatic-fish-tail": tail,
 }
 
 
