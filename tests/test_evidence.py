@@ -317,7 +317,7 @@ def test_recordings_cannot_be_changed():
 
 
 def test_the_range_that_residuals_leave_next_to_a_steep_bound_has_a_probability(monkeypatch):
-    # The log-likelihood falls so steeply, and so unlike a parabola, that a parabola fitted beside the bound misses its top.
+    # The log-likelihood falls so steeply that a parabola fitted beside the bound misses its top.
     monkeypatch.setattr(evidence, "_ln_likelihood", lambda data, near, left, x: -1e6 * float(x[0]) ** 3)
     low, high = np.zeros(3), np.array([5.0, 0.0, 0.0])
     mass = quad(lambda x: math.exp(-1e6 * x**3), 0, 0.1)[0]
