@@ -22,6 +22,7 @@ GROUPS = {
     "youngs_modulus": "material",
     "pressure": "actuation",
     "gravity": "surroundings",
+    "scenarios": "scenarios",
     "dt": "simulation",
     "filter_radius": "optimization",
     "picture_every": "output",

@@ -15,20 +15,23 @@ from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
+from torchsoro.design.scenarios import ScenarioBatch, leaning_gravity, posed, supplied, varied
 from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 from torchsoro.simulation.contact import Plane, ground
 from torchsoro.simulation.formulation import Formulation, formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
+from torchsoro.simulation.loads import PointMass
 from torchsoro.simulation.material_file import read_material
+from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.simulator import Simulator
-from torchsoro.simulation.trajectory import Trajectory
+from torchsoro.simulation.trajectory import Start, Trajectory
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
-    """What one simulation says of a design.
+    """What one simulation says of a design; with scenarios, all but C is of each [S].
 
     Attributes:
         travel: L, Eq. 13 [m].
@@ -110,9 +113,13 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         self.soles = _outermost(self.domain, planes).to(s.target)
+        self.socket = _rear(self.domain, direction).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
         self.full_mass = float(everywhere.mass[~self.domain.gas].sum())
+        if s.scenarios:
+            stiff, light = (torch.tensor([factor]) for factor in (s.modulus_range[1], s.density_range[0]))
+            everywhere = varied(everywhere, ScenarioBatch(count=1, modulus_factor=stiff, density_factor=light))
         s.check_memory(self.simulator(1).step(everywhere, self.prony, duration=s.duration, sample_every=s.sample_every))
 
     def forward(
@@ -123,16 +130,20 @@ class Robot(nn.Module):
         everything: bool = False,
         void: bool = True,
         progress: Callable[[int, int], None] | None = None,
+        scenarios: ScenarioBatch | None = None,
+        dt: float | None = None,
     ) -> Outcome:
         """Simulate a design and judge it.
 
         Args:
-            gamma: Density [N].
+            gamma: Density [N]; or of each scenario [S, N], which all void is simulated with.
             gravity_scale: Share of gravity.
             everything: Record every particle (for pictures) and not only the centre of gravity.
             void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
                 in what is recorded, void then moves with the centre of gravity.
             progress: See :meth:`Simulator.forward`.
+            scenarios: To simulate at once, instead of the settings' own one.
+            dt: Substep [s], which is not halved where the simulation breaks down; the settings' if None.
 
         Returns:
             Travel, intermediate density, mass, centre of gravity, trajectory.
@@ -144,7 +155,7 @@ class Robot(nn.Module):
         body = self.filled(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress)
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress, scenarios, dt)
         end = s.settle + s.duration
 
         def until(moment: float) -> Tensor:
@@ -152,7 +163,7 @@ class Robot(nn.Module):
             return travel(seen, time, start=s.settle, end=moment, direction=self.direction)
 
         closes = s.sample_every * max(1, round(min(s.duty / s.frequency, s.duration) / s.sample_every))
-        height = trajectory.center_of_gravity[:, 2]
+        height = trajectory.center_of_gravity[..., 2]
         return Outcome(
             travel=until(end),
             feet=self.feet(trajectory, gamma, near=False),
@@ -160,7 +171,7 @@ class Robot(nn.Module):
             inflated=until(s.settle + closes),
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(solid),
-            fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
+            fall=torch.relu(height[..., 0] - height.amin(-1) - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
             dt=trajectory.dt,
@@ -178,15 +189,16 @@ class Robot(nn.Module):
             near: Count all of those layers, by exp(-2 h / spacing) at a height h above the touch, instead.
         """
         at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
-        place, probes = trajectory.position[:, at], trajectory.probes[at]
+        place, probes = trajectory.position[..., at, :], trajectory.probes[at]
         first = int((trajectory.time - self.settings.settle).abs().argmin())
         spacing = self.domain.spacing
-        away = [plane.side * (place[-1, :, plane.axis] - float(plane.offset)) for plane in self.planes]
+        end, begin = place[..., -1, :, :], place[..., first, :, :]
+        away = [plane.side * (end[..., plane.axis] - float(plane.offset)) for plane in self.planes]
         height = torch.relu(torch.stack(away).amin(0) - 0.5 * spacing)
         counts = torch.exp(-2 * height / spacing) if near else (height.detach() < 0.25 * spacing).to(height)
-        share = gamma[probes].clamp(min=0) ** 3 * counts
-        moved = (place[-1] - place[first]) @ place.new_tensor(self.direction)
-        return (share * moved).sum() / share.sum().clamp(min=torch.finfo(share.dtype).tiny)
+        share = gamma[..., probes].clamp(min=0) ** 3 * counts
+        moved = (end - begin) @ place.new_tensor(self.direction)
+        return (share * moved).sum(-1) / share.sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
 
     def filled(self, gamma: Tensor) -> Body:
         """The domain filled with a density [N]."""
@@ -209,6 +221,8 @@ class Robot(nn.Module):
         everything: bool,
         void: bool,
         progress: Callable[[int, int], None] | None,
+        scenarios: ScenarioBatch | None,
+        dt: float | None,
     ) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
         s = self.settings
@@ -217,27 +231,67 @@ class Robot(nn.Module):
         if not void:
             body, keep = without_void(body)
             weight, probes = weight[keep], probes[keep[probes]]
-        for halving in range(s.halvings + 1):
+        number = keep.cumsum(0) - 1
+        met = {"body": body, **self._surroundings(gravity_scale)}
+        if scenarios is not None:
+            met |= self.varied(body, scenarios, number[self.socket], gravity_scale)
+        for halving in range(1 if dt else s.halvings + 1):
             try:
-                trajectory = self.simulator(2**halving)(
-                    body,
+                trajectory = self.simulator(2**halving, dt)(
+                    **met,
                     duration=s.settle + s.duration,
                     prony=self.prony,
-                    pressure=self.pressure,
-                    gravity=tuple(gravity_scale * g for g in self.gravity),
-                    planes=self.planes,
                     sample_every=s.sample_every,
                     weight=weight,
-                    probes=(keep.cumsum(0) - 1)[probes],
+                    probes=number[probes],
                     progress=progress,
                 )
                 if everything and not void:
                     return self._with_void(trajectory, rest, keep)
                 return replace(trajectory, probes=probes)
             except SimulationDiverged:
-                if halving == s.halvings:
+                if dt or halving == s.halvings:
                     raise
         raise AssertionError
+
+    def _surroundings(self, gravity_scale: float) -> dict[str, Any]:
+        """What acts on the robot, as the simulator takes it."""
+        gravity = tuple(gravity_scale * g for g in self.gravity)
+        return {"pressure": self.pressure, "gravity": gravity, "planes": self.planes}
+
+    def varied(
+        self, body: Body, scenarios: ScenarioBatch, socket: Tensor, gravity_scale: float = 1.0
+    ) -> dict[str, Any]:
+        """What differs by scenario, as arguments of the simulator; what is not given stays as it is.
+
+        Args:
+            body: Without scenarios.
+            scenarios: [S].
+            socket: Particles of the body from which the tube hangs [n].
+            gravity_scale: Share of gravity.
+        """
+        s, b = self.settings, scenarios
+        found: dict[str, Any] = {"body": varied(body, b), "pressure": supplied(self.pressure, b)}
+        if b.tilt_x is not None or b.tilt_y is not None:
+            found["gravity"] = leaning_gravity(gravity_scale * s.gravity, s.slope, b)
+        if b.friction is not None:
+            found["planes"] = tuple(replace(plane, friction=b.friction) for plane in self.planes)
+        if b.tube_mass is not None:
+            found["loads"] = (PointMass(particles=socket, mass=b.tube_mass),)
+        if b.pitch is not None or b.roll is not None or b.drop is not None:
+            nodes = Lattice.around(body.position, self.domain.cell).node_places
+            moved = posed(nodes, s.size, b).to(body.position)
+            found["start"] = Start(displacement=moved, velocity=torch.zeros_like(moved))
+        if not b.given:  # the results have the leading axis nevertheless
+            found["body"] = replace(body, mass=body.mass.expand(b.count, len(body.position)))
+        return found
+
+    def step(self, gamma: Tensor, scenarios: ScenarioBatch) -> float:
+        """The substep [s] of scenarios, of whichever of them are simulated together."""
+        s = self.settings
+        body, tubes = self.filled(gamma.detach()), replace(scenarios, tube_mass=None)
+        stiff = varied(body, tubes.stiffest())
+        return self.simulator().step(stiff, self.prony, duration=s.settle + s.duration, sample_every=s.sample_every)
 
     def _with_void(self, trajectory: Trajectory, rest: Tensor, keep: Tensor) -> Trajectory:
         """Every particle's motion [S, N, 3]: of void, which was left out, that of the centre of gravity."""
@@ -247,13 +301,13 @@ class Robot(nn.Module):
         probes = torch.arange(len(rest), device=rest.device)
         return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
-    def simulator(self, parts: int = 1) -> Simulator:
-        """A simulator, in whose box it moves, that takes a part of the usual step."""
+    def simulator(self, parts: int = 1, dt: float | None = None) -> Simulator:
+        """A simulator, in whose box it moves, that takes a part of the usual step; or the step ``dt`` [s]."""
         s = self.settings
         half = (s.size[0] / 2, s.size[1] / 2)
         return Simulator(
             cell=self.domain.cell,
-            dt="auto" if s.dt == "auto" else s.dt / parts,
+            dt=dt or ("auto" if s.dt == "auto" else s.dt / parts),
             safety=0.9 / parts,
             low=(-half[0] - s.room, -half[1] - s.room, -s.room),
             high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
@@ -292,6 +346,13 @@ def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
         along = plane.side * place[:, plane.axis]
         faces |= along < along.min() + 0.5 * domain.spacing
     return faces.nonzero().squeeze(1)
+
+
+def _rear(domain: Domain, direction: tuple[float, float, float]) -> Tensor:
+    """Particles of the chamber walls' rearmost layer, against the travel, where the air port is [n]."""
+    along = domain.positions @ domain.positions.new_tensor(direction)
+    first = along[domain.wall].min()
+    return (domain.wall & (along < first + 0.5 * domain.spacing)).nonzero().squeeze(1)
 
 
 def _pressure(s: Settings, modulus: float) -> Waveform:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
+from torchsoro.design.scenarios import LIMITS, Scenarios, check_friction, check_range
 
 if TYPE_CHECKING:
     import torch
@@ -26,6 +27,9 @@ _PARTICLE, _FRAME, _STEP = 1024, 48, 64
 
 _Length = Annotated[float, Field(strict=True, ge=1e-6, le=1e3)]
 _Density = Annotated[float, Field(strict=True, ge=0, le=1)]
+_Friction = Literal["stick"] | AtLeastZero
+_Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+_Range = tuple[_Finite, _Finite]
 
 
 def cuda_available() -> bool:
@@ -122,6 +126,35 @@ class Settings:
     gravity_every: Count = 20
     """Iterations between two steps of gravity."""
 
+    scenarios: CountOrZero = 0
+    """Scenarios in which each design is simulated, drawn from the ranges below; 0 for the settings' own one alone."""
+    risk: str = "mean"
+    """What of the scenarios is maximised: mean, worst, or cvar:0.3 for the mean of the worst three tenths."""
+    fresh: bool = False
+    """Draw other scenarios in every iteration instead of the same ones."""
+    scenario_seed: CountOrZero = 0
+    """Seed of the scenarios; with ``fresh`` that of the first iteration, from which the others count on."""
+    friction_range: tuple[_Friction, _Friction] = (0.3, "stick")
+    """Coulomb coefficient, at even steps of the friction angle."""
+    tilt_range: _Range = (-5.0, 5.0)
+    """Slope of the floor beyond ``slope``, along x and across [degrees]."""
+    pressure_range: _Range = (0.85, 1.15)
+    """Factor of the supply's pressure."""
+    lag_range: _Range = (0.0, 0.0)
+    """Time constant of a line behind the supply [s]."""
+    modulus_range: _Range = (0.8, 1.2)
+    """Factor of Young's modulus."""
+    density_range: _Range = (1.0, 1.0)
+    """Factor of the solid's density."""
+    tube_range: _Range = (0.002, 0.002)
+    """Mass of a supply tube that hangs on the chamber's rear [kg]."""
+    pitch_range: _Range = (0.0, 0.0)
+    """Angle by which the robot leans forward at the start [degrees]."""
+    roll_range: _Range = (0.0, 0.0)
+    """Angle by which it leans to its right at the start [degrees]."""
+    drop_range: _Range = (0.0, 0.0)
+    """Height from which it is dropped at the start [m]."""
+
     dt: Positive | Literal["auto"] = "auto"
     """Substep [s]; auto takes the largest that is stable. The paper's is 1e-5."""
     halvings: Annotated[int, Field(strict=True, ge=0, le=10)] = 2
@@ -198,6 +231,7 @@ class Settings:
         """Refuse values that do not fit together, and such that are most likely in another unit."""
         self._check_units()
         self._check_times()
+        self._check_scenarios()
         parse_resolution(self.resolution)
         if self.fps > 120:
             raise ValueError(f"fps = {self.fps}: wanted at most 120")
@@ -250,6 +284,40 @@ class Settings:
                 f"{_LEAST_SAMPLES} samples of sample_every = {self.sample_every:g} s in each cycle"
             )
 
+    def _check_scenarios(self) -> None:
+        """Refuse bad ranges, a bad risk, and a pose at the start where there is none."""
+        check_friction("friction_range", self.friction_range)
+        for name, (least, most, unit) in LIMITS.items():
+            setting = {"tilt_x": "tilt", "tilt_y": "tilt"}.get(name, name.partition("_")[0])
+            check_range(f"{setting}_range", getattr(self, f"{setting}_range"), least, most, unit)
+        if self.risk != "mean":
+            from torchsoro.design.risk import parse_risk
+
+            parse_risk(self.risk)
+        posed = [name for name in ("pitch_range", "roll_range", "drop_range") if any(getattr(self, name))]
+        if posed and (self.robot != "walker" or self.formulation != "total"):
+            raise ValueError(
+                f"{posed[0]} = {getattr(self, posed[0])}: wanted 0 0, but of a walker in the total-Lagrangian "
+                "formulation, which alone has a pose at the start"
+            )
+
+    @property
+    def distribution(self) -> Scenarios:
+        """Of the scenarios."""
+        return Scenarios(
+            friction=self.friction_range,
+            tilt_x=self.tilt_range,
+            tilt_y=self.tilt_range,
+            pressure_gain=self.pressure_range,
+            lag=self.lag_range,
+            modulus_factor=self.modulus_range,
+            density_factor=self.density_range,
+            tube_mass=self.tube_range,
+            pitch=self.pitch_range,
+            roll=self.roll_range,
+            drop=self.drop_range,
+        )
+
     def check_memory(self, dt: float | None = None) -> None:
         """Refuse a run that the device cannot hold.
 
@@ -261,7 +329,8 @@ class Settings:
         """
         nx, ny, nz = self.particles
         time = self.settle + self.duration
-        need = nx * ny * nz * (_PARTICLE + _FRAME * time / self.sample_every) + (0 if dt is None else _STEP * time / dt)
+        each = nx * ny * nz * (_PARTICLE + _FRAME * time / self.sample_every) + (0 if dt is None else _STEP * time / dt)
+        need = each * max(1, self.scenarios)
         if self.target.type == "cuda":
             import torch
 
