@@ -3,10 +3,14 @@
     python recipes/compare.py walker --out runs/compare            # an archived robot, see recipes/designs
     python recipes/compare.py runs/walker --out runs/compare       # one of your own
     python recipes/compare.py walker --out runs/compare --only design half_cell
+    python recipes/compare.py walker --out runs/robust --scenarios 64    # friction, tilt, pressure, modulus, tube
 
 A row for each check goes to ``compare.json``, and the motion of some to ``motion_<check>.npz``, from which
 ``recipes/validate/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a
 check of a design at the paper's size takes five to fifteen minutes, one at half the cell size hours.
+
+With ``--scenarios`` it is simulated in so many scenarios instead, drawn from the ranges of its settings by a seed that its
+design run did not use: ``scenarios.csv``, a line for each, ``scenarios.json`` and ``scenarios.png``.
 """
 
 from __future__ import annotations
@@ -31,6 +35,12 @@ class Options:
     """Checks to do; all if none are named."""
     iterations: tuple[CountOrZero, ...] = ()
     """Early designs to look at; of 0, 5, 10, 20, 50 and 100 those that were kept if none are named."""
+    scenarios: CountOrZero = 0
+    """Simulate it in so many scenarios instead of the checks."""
+    seed: CountOrZero | None = None
+    """Of these scenarios; one that no iteration of the design run had, if left out."""
+    void: bool = True
+    """Simulate void, too, in the scenarios."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
 
@@ -39,6 +49,19 @@ def main(chosen: Options) -> dict[str, dict[str, Any]]:
     """Perform the checks; see :func:`torchsoro.output.comparison.compare`."""
     from torchsoro.output.comparison import compare  # here, so that --help is there at once
 
+    if chosen.scenarios:
+        from torchsoro.output.robustness import compare_scenarios
+
+        return {
+            "scenarios": compare_scenarios(
+                chosen.robot,
+                chosen.out,
+                count=chosen.scenarios,
+                seed=chosen.seed,
+                void=chosen.void,
+                device=chosen.device,
+            )
+        }
     how = {"only": chosen.only, "iterations": chosen.iterations, "device": chosen.device}
     return compare(chosen.robot, chosen.out, **how)
 

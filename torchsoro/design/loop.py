@@ -12,8 +12,10 @@ from typing import Any
 
 import torch
 
+from torchsoro.design.ensemble import MOST, Ensemble, fallen, overall, shares
 from torchsoro.design.field import DesignField
 from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
+from torchsoro.design.processes import Processes
 from torchsoro.design.robot import Outcome, Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.training import RunFolder
@@ -28,7 +30,9 @@ KEPT = 8  # designs to step back to
 MOST_LOST = 9  # iterations in a row whose gradients are not finite
 
 
-def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[torch.Tensor, Outcome, bool]:
+def simulate(
+    robot: Robot, good: dict[str, Any], gravity_scale: float, ensemble: Ensemble | None = None, iteration: int = 0
+) -> tuple[torch.Tensor, Outcome, bool]:
     """Simulate the robot's design; where it breaks down or falls over, one nearer to the last that did not, ``good``.
 
     Falling counts where it is punished: a fallen robot's gradient says nothing about how to stand. If the last of three
@@ -38,6 +42,8 @@ def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[
         robot: Its field is changed where it has to step back.
         good: Design variable ``phi`` and sharpness ``beta`` of that design.
         gravity_scale: Share of gravity.
+        ensemble: Of the run's scenarios, if it has any.
+        iteration: Whose scenarios.
 
     Returns:
         Density, outcome, and whether they are those of the good design itself.
@@ -48,7 +54,10 @@ def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[
     for left in (3, 2, 1, 0):
         gamma = robot.field()
         try:
-            outcome = robot(gamma, gravity_scale=gravity_scale)
+            if ensemble is None:
+                outcome = robot(gamma, gravity_scale=gravity_scale)
+            else:
+                outcome = ensemble.judge(gamma, iteration, gravity_scale)
             if left == 0 or not fell(robot, outcome):
                 return gamma, outcome, left == 0
         except SimulationDiverged:
@@ -62,13 +71,15 @@ def simulate(robot: Robot, good: dict[str, Any], gravity_scale: float) -> tuple[
 
 
 def fell(robot: Robot, outcome: Outcome) -> bool:
-    """Whether the centre of gravity sank by more than a tenth of the height beyond what is allowed."""
-    s = robot.settings
-    return s.upright > 0 and outcome.fall.item() > 0.1 * s.size[2]
+    """Whether the robot fell; with scenarios, whether more than half of the risk's gradient is by those where it did."""
+    down = fallen(robot, outcome)
+    if robot.settings.upright == 0 or down.ndim == 0:
+        return robot.settings.upright > 0 and bool(down)
+    return float(shares(robot, worths(robot, outcome))[down].sum()) > MOST
 
 
 def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
-    """What an iteration maximises under the limit on C, in cells, as Adam wants gradients of order one.
+    """What an iteration maximises under the limit on C, in cells, as Adam wants gradients of order one; by scenario.
 
     That is travel less falling, and less the mass as a share of the solid body's. A body that stands on one spot has
     next to no gradient by where it ends, whatever its legs; it has one by how far it reaches while it is inflated:
@@ -83,11 +94,16 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
 
 def worth_of(robot: Robot, outcome: Outcome) -> float:
     """What a design is worth, in cells: travel less falling and, where feet count, next to nothing if it leans."""
+    return float(overall(robot, worths(robot, outcome))) / robot.domain.cell
+
+
+def worths(robot: Robot, outcome: Outcome) -> torch.Tensor:
+    """The same in each scenario [...] m, without a gradient."""
     s = robot.settings
     way = outcome.travel - s.upright * outcome.fall
     if s.feet > 0:
         way = way - 100 * leaning(outcome.travel, outcome.feet, 1.01)
-    return float(way.detach()) / robot.domain.cell
+    return way.detach()
 
 
 def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Tensor:
@@ -168,6 +184,17 @@ def restore(
     return bool(state["stopped"]), best, state["good"]
 
 
+def spread(robot: Robot, outcome: Outcome, lost: int) -> dict[str, float]:
+    """How the travel spreads over the scenarios, falls, and gradients that overflowed, by their tags."""
+    travel = outcome.travel.detach().double()
+    quantities = {"min": travel.min(), "tenth": travel.quantile(0.1), "mean": travel.mean(), "max": travel.max()}
+    return {
+        **{f"scenarios/L_{name}": float(value) for name, value in quantities.items()},
+        "scenarios/falls": int(fallen(robot, outcome).sum()),
+        "scenarios/gradients_lost": lost,
+    }
+
+
 def _schedule(s: Settings) -> Lagrangian:
     """The loss under the limit on C."""
     if s.sharpen[1]:
@@ -182,7 +209,7 @@ def _schedule(s: Settings) -> Lagrangian:
     )
 
 
-def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
+def optimize(robot: Robot, observe: Observe | None = None, processes: Processes | None = None) -> Optimized:
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
     Travel is a rough function of the design, so that the last design is seldom the best. Designs count from the first
@@ -191,6 +218,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     Args:
         robot: What to design.
         observe: Called with the run folder, the robot, the density and the iteration, after each has been logged.
+        processes: That share the scenarios; this is number 0.
 
     Raises:
         ValueError: if the folder holds another run (see :class:`RunFolder`).
@@ -209,6 +237,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
     stopped = False
     good: list[dict[str, Any]] = [{"phi": field.phi.detach().clone(), "beta": field.beta}]
     best: dict[str, Any] | None = None
+    ensemble = Ensemble(robot, processes) if s.scenarios else None
     lost = 0  # iterations in a row without a gradient
     folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
     with folder as run:
@@ -222,14 +251,18 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                 lagrangian.demand(s.sharpened(k))
             for group in adam.param_groups:
                 group["lr"] = s.learning_rate * s.beta / field.beta
-            gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k))
-            violation, goal = outcome.intermediate - s.c_max, aim(robot, outcome, k)
+            gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), ensemble, k)
+            violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
+            goal = overall(robot, aims)
             loss = lagrangian(goal.detach(), violation)
             middle = time.perf_counter()
             # Only the gradient of the motion is clipped: beside that of a rough one the price of C would vanish.
             (price,) = torch.autograd.grad(loss, field.phi, retain_graph=True)
             adam.zero_grad()
-            (-goal).backward()
+            if ensemble is None:
+                (-goal).backward()
+            else:
+                field.phi.grad = ensemble.gradient(gamma, aims)
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
             design = {"phi": field.phi.detach().clone(), "beta": field.beta}
             if norm.isfinite():
@@ -265,10 +298,10 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             run.log(
                 k,
                 {
-                    "objective/L": outcome.travel.detach(),
-                    "objective/feet": outcome.feet.detach(),
+                    "objective/L": overall(robot, outcome.travel.detach()),
+                    "objective/feet": overall(robot, outcome.feet.detach()),
                     "constraint/C": outcome.intermediate.detach(),
-                    "objective/fall": outcome.fall.detach(),
+                    "objective/fall": overall(robot, -outcome.fall.detach()).abs(),
                     "mass": outcome.mass.detach(),
                     **{f"cog/{axis}": center[i] for i, axis in enumerate("xyz")},
                     "multiplier/C": lagrangian.multiplier,
@@ -280,8 +313,11 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                     "time/forward": middle - begin,
                     "time/backward": end - middle,
                     "time/iteration": time.perf_counter() - begin,
+                    **({} if ensemble is None else spread(robot, outcome, ensemble.lost)),
                 },
             )
+            if ensemble is not None:
+                run.log_histogram("scenarios/L", outcome.travel.detach(), k)
             if observe is not None:
                 observe(run, robot, gamma.detach(), k)
             run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good)

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import tyro
 
 from torchsoro.command_line import CommandLine, as_called, plain_errors
+from torchsoro.design.processes import take_gpu
 from torchsoro.design.settings import Settings, cuda_available
 
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
@@ -41,6 +42,7 @@ def design_program(
     """
 
     def cli(arguments: Sequence[str] | None = None) -> None:
+        take_gpu()
         with plain_errors():
             main(from_command_line(presets, description=description, arguments=arguments))
 

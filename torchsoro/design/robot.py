@@ -153,8 +153,7 @@ class Robot(nn.Module):
         """
         s = self.settings
         body = self.filled(gamma)
-        solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
-        weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
+        solid, weight = self.weights(body)
         trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress, scenarios, dt)
         end = s.settle + s.duration
 
@@ -176,6 +175,12 @@ class Robot(nn.Module):
             trajectory=trajectory,
             dt=trajectory.dt,
         )
+
+    def weights(self, body: Body) -> tuple[Tensor, Tensor]:
+        """Masses of the solid with the chamber walls, and of what is counted in the travel, each [..., N] kg."""
+        none = torch.zeros_like(body.mass)
+        solid = torch.where(self.design | self.wall, body.mass, none)
+        return solid, solid if self.settings.counted == "body" else torch.where(self.design, body.mass, none)
 
     def feet(self, trajectory: Trajectory, gamma: Tensor, *, near: bool = False) -> Tensor:
         """Travel of the feet since the actuation starts [m]; zero if there are none at the end.

@@ -18,6 +18,7 @@ import torch
 
 from torchsoro.design.field import DesignField
 from torchsoro.design.loop import Observe, Optimized, optimize
+from torchsoro.design.processes import Processes
 from torchsoro.design.robot import Robot
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
@@ -34,7 +35,9 @@ def disturb(field: DesignField, seed: int) -> None:
     field.clamp_()
 
 
-def optimize_starts(robot: Robot, observe: Observe | None = None) -> Optimized:
+def optimize_starts(
+    robot: Robot, observe: Observe | None = None, processes: Processes | None = None
+) -> Optimized:
     """Run the design loop from ``robot.settings.starts`` initial fields, the first the robot's own, and take the best.
 
     That is the one that goes farthest of those within the limit on C; if none is, the one nearest to it. A start whose
@@ -43,6 +46,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None) -> Optimized:
     Args:
         robot: What to design; its field is what the first start begins with, and what the best one ends with.
         observe: See :func:`torchsoro.design.loop.optimize`; called by several threads on a CPU.
+        processes: That share the scenarios of a single start.
 
     Returns:
         The best; with one start what :func:`torchsoro.design.loop.optimize` returns.
@@ -53,7 +57,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None) -> Optimized:
     """
     s = robot.settings
     if s.starts == 1:
-        return optimize(robot, observe)
+        return optimize(robot, observe, processes)
     if (s.out / "settings.json").exists() and not (s.resume or s.overwrite):
         raise ValueError(f"out = {s.out}: already holds a run; wanted another folder, or --resume or --overwrite")
     if s.resume and not any(s.out.glob("start-*/settings.json")):

@@ -176,6 +176,11 @@ class RunFolder:
             raise ValueError(f"image: got {pixels.dtype} of shape {pixels.shape}, wanted uint8 [height, width, 3]")
         self._writer.add_image(tag, pixels, iteration, dataformats="HWC")
 
+    def log_histogram(self, tag: str, values: torch.Tensor, iteration: int) -> None:
+        """Write how values [S] are distributed to TensorBoard."""
+        _check_iteration(iteration)
+        self._writer.add_histogram(tag, values, iteration)
+
     def log_mesh(
         self,
         tag: str,

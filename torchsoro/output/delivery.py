@@ -14,7 +14,9 @@ import numpy as np
 import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
+from torchsoro.design.ensemble import Ensemble, Evaluation, evaluate
 from torchsoro.design.objective import mean_stride
+from torchsoro.design.processes import Processes, joined, world_size
 from torchsoro.design.robot import Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
@@ -41,10 +43,25 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
 
     Raises:
-        ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body.
+        ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, or
+            there are more processes than scenarios.
+        ConnectionError: if another process ends before this one.
     """
     s = robot.settings
-    optimized = optimize_starts(robot, observe)
+    if world_size() > 1:
+        if s.starts > 1:
+            raise ValueError(f"starts = {s.starts}: wanted 1 in several processes, which share scenarios")
+        Processes(world=world_size()).deal(s.scenarios)
+    with joined(s.target.type == "cuda") as processes:
+        if processes.rank:
+            Ensemble(robot, processes).serve()
+            return {}
+        ensemble = Ensemble(robot, processes) if processes.world > 1 else None
+        try:
+            optimized = optimize_starts(robot, observe, processes)
+        finally:
+            if ensemble is not None:
+                ensemble.end()
     history = optimized.metrics
     found = {
         **deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
@@ -71,11 +88,20 @@ def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -
 
 def report(result: Mapping[str, Any], settings: Settings) -> str:
     """What :func:`design` returned, in a few lines."""
+    spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
-        f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}"
+        f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
+
+
+def spread_line(found: Mapping[str, Any], count: int) -> str:
+    """What an evaluation's numbers say of the travel in so many scenarios, in a line."""
+    parts = (("lowest", "L_min"), ("lowest tenth", "L_lowest_tenth"), ("mean", "L_mean"), ("highest", "L_max"))
+    listed = ", ".join(f"{name} {1e3 * found[key]:.2f} mm" for name, key in parts)
+    broken = f", {found['diverged']} broke down" if found["diverged"] else ""
+    return f"{count} scenarios: {listed}; {found['falls']} falls{broken}"
 
 
 def numbers(found: Mapping[str, Any]) -> str:
@@ -128,8 +154,14 @@ def deliver(
     Raises:
         ValueError: if the design has no connected body to print; the design and the movie are written before.
     """
-    gamma = save_design(path / "design.npz", robot.domain, gamma)
-    return show(path, robot, gamma, history=history, chosen=chosen, name=name)[0]
+    s, gamma = robot.settings, save_design(path / "design.npz", robot.domain, gamma)
+    found = None
+    if s.scenarios:
+        with progress_bar(f"{s.scenarios} scenarios") as progress:
+            batch = s.distribution.sample(s.scenarios, s.scenario_seed)
+            found = evaluate(robot, gamma, batch, progress=progress)
+    shown = show(path, robot, gamma, history=history, chosen=chosen, name=name, scenarios=found)[0]
+    return shown if found is None else {**shown, **found.numbers()}
 
 
 @torch.no_grad()
@@ -142,6 +174,7 @@ def show(
     history: Mapping[str, Sequence[float]] | None = None,
     chosen: int | None = None,
     void: bool = True,
+    scenarios: Evaluation | None = None,
 ) -> tuple[dict[str, float], Part]:
     """Simulate a gait with every particle recorded, and write what people look at and print.
 
@@ -156,6 +189,7 @@ def show(
         history: Metrics of its run.
         chosen: Iteration of that run that the design is of; the last if None.
         void: Simulate void, too.
+        scenarios: What the design does in its scenarios, for the summary.
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
@@ -224,6 +258,7 @@ def show(
             period=1 / s.frequency,
             title=title,
             note=numbers(found),
+            scenarios=None if scenarios is None else scenarios.travel,
         )
     part = print_part(robot, density)
     part.save(path / "shape.stl")

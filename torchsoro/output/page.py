@@ -18,7 +18,7 @@ from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from torchsoro.output.levelset import as_array
-from torchsoro.output.scene import FAINT, FULL, INK, PRESSURE, Camera, PlaneTuple, Scene, Shape, bounds_of
+from torchsoro.output.scene import FAINT, FULL, INK, PRESSURE, REST, Camera, PlaneTuple, Scene, Shape, bounds_of
 from torchsoro.storage import atomic_write
 
 if TYPE_CHECKING:
@@ -192,8 +192,10 @@ def last_cycle(motion: DrawnMotion, period: float | None, first: float | None = 
     return start, min(start + period, float(time[-1]))
 
 
-def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float]) -> None:
-    """Travel over time and the path of the centre of gravity."""
+def path_panels(
+    figure: Figure, motion: DrawnMotion, cycle: tuple[float, float], scenarios: np.ndarray | None = None
+) -> None:
+    """Travel over time, and the path of the centre of gravity or the travel in each scenario [S] m."""
     over = figure.add_axes((0.735, 0.74, 0.24, 0.175))
     over.axvspan(*cycle, color="#eef1f4", lw=0)
     over.plot(motion.time, motion.travel, color=INK, lw=1.8)
@@ -208,6 +210,9 @@ def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float])
         beside.set_ylim(0, max(1e-3, 3.0 * motion.pressure.max()))
         beside.set_axis_off()
     path = figure.add_axes((0.735, 0.48, 0.24, 0.175))
+    if scenarios is not None:
+        scenario_panel(path, 1e3 * scenarios)
+        return
     flat = 0 if motion.along == 2 else motion.along
     points = motion.path[:, [flat, 2]]
     value = motion.time if motion.pressure is None else motion.pressure
@@ -235,6 +240,26 @@ def path_panels(figure: Figure, motion: DrawnMotion, cycle: tuple[float, float])
     path.set_ylabel("z [mm]", color=INK)
     plain(path)
     heading(path, "path of the centre of gravity")
+
+
+def scenario_panel(axes: Axes, travel: np.ndarray) -> None:
+    """Travel in each scenario [S] mm, from the least to the largest; a cross where the simulation broke down."""
+    ordered = np.sort(travel)  # NaN last
+    place = np.arange(1, len(ordered) + 1)
+    known = np.isfinite(ordered)
+    axes.bar(place[known], ordered[known], color=REST, width=0.8)
+    axes.plot(place[~known], np.zeros((~known).sum()), "x", color="#a33b3b", ms=6)
+    if known.any():
+        mean = ordered[known].mean()
+        axes.axhline(mean, color=INK, lw=1.2, ls="--")
+        axes.text(0.4, mean, f" mean {mean:.2f}", va="bottom", fontsize=9, color=INK)
+    axes.axhline(0, color=INK, lw=0.8)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlim(0.2, len(ordered) + 0.8)
+    axes.set_xlabel("scenarios, by travel", color=INK)
+    axes.set_ylabel("L [mm]", color=INK)
+    plain(axes)
+    heading(axes, "travel in each scenario")
 
 
 def gait_panels(

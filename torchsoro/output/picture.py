@@ -287,6 +287,7 @@ def summary(
     tilt: float = 0.0,
     level: float = 0.5,
     chosen: int | None = None,
+    scenarios: np.ndarray | None = None,
 ) -> Path:
     """Write the page of a run: shape, histories of L and C, one cycle of the gait, path of the centre of gravity.
 
@@ -311,6 +312,7 @@ def summary(
         tilt: as for a movie [degrees].
         level: density at the surface.
         chosen: iteration that the design is of, counted from 0; the last if None.
+        scenarios: travel in each scenario [S] m, drawn in place of the path; NaN where the simulation broke down.
 
     Returns:
         The path.
@@ -340,7 +342,7 @@ def summary(
     history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density C (dot: this design)", limit, chosen)
     lower.set_xlabel("iteration", color=INK)
     cycle = last_cycle(motion, period, start)
-    path_panels(figure, motion, cycle)
+    path_panels(figure, motion, cycle, scenarios)
     gait_panels(figure, motion, planes, camera, cycle)
     image = Image.fromarray(pixels(canvas))
     with atomic_write(target) as file:

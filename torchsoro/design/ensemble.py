@@ -1,0 +1,268 @@
+"""Scenarios of a design run: simulated in shares, judged together, and their gradients summed in a fixed order.
+
+A scenario's numbers do not depend on which others are simulated beside it: on a CPU every share fills whole groups of
+sixteen lanes, all shares take the same substep, and gradients are kept apart until they are summed in the order of
+scenarios. So they are the same bits for any number of processes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass
+from torchsoro.design.processes import Processes
+from torchsoro.design.risk import CVaR, parse_risk
+from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.scenarios import ScenarioBatch
+from torchsoro.errors import SimulationDiverged
+
+LANES = 16  # simulations that a CPU carries on at a time; fewer are filled up
+JUDGED = ("travel", "feet", "soles", "inflated", "fall")  # what is gathered of every scenario
+# Share of the risk's gradient by scenarios that overflowed, or that fell, above which it says nothing.
+MOST = 0.5
+_END, _JUDGE, _PULL = 0.0, 1.0, 2.0  # what the other processes are told to do
+FALLEN = 0.1  # sinking beyond what is allowed, in heights of the body, from which a robot counts as fallen
+
+
+def overall(robot: Robot, values: Tensor) -> Tensor:
+    """What values count for: with scenarios [S] the risk of them, else the value itself."""
+    return values if values.ndim == 0 else parse_risk(robot.settings.risk)(values)
+
+
+def fallen(robot: Robot, outcome: Outcome) -> Tensor:
+    """Whether the centre of gravity sank by more than a tenth of the height beyond what is allowed, bool [...]."""
+    return outcome.fall.detach() > FALLEN * robot.settings.size[2]
+
+
+def shares(robot: Robot, values: Tensor) -> Tensor:
+    """What part of the risk's gradient is by each value [S], summing to 1."""
+    leaf = values.detach().requires_grad_()
+    with torch.enable_grad():
+        (found,) = torch.autograd.grad(overall(robot, leaf), leaf)
+    return found
+
+
+class Ensemble:
+    """Simulates a robot in its settings' scenarios, by one process or several.
+
+    Args:
+        robot: The robot.
+        processes: Those of the run.
+    """
+
+    def __init__(self, robot: Robot, processes: Processes | None = None) -> None:
+        self.robot = robot
+        self.processes = processes or Processes()
+        self.count = robot.settings.scenarios
+        self.parts = self.processes.deal(self.count)
+        self.own = self.parts[self.processes.rank]
+        spare = -len(self.own) % LANES if robot.formulation.in_lanes(robot.field.phi) else 0
+        self._places = [*self.own, *[self.own[-1]] * spare]
+        self._rows = self._values = self._all = torch.empty(0)
+        self.lost = 0
+
+    def sample(self, iteration: int) -> ScenarioBatch:
+        """The scenarios of an iteration, which a run that is resumed draws again."""
+        s = self.robot.settings
+        return s.distribution.sample(self.count, s.scenario_seed + (iteration if s.fresh else 0))
+
+    def judge(self, gamma: Tensor, iteration: int, gravity_scale: float) -> Outcome:
+        """Simulate a design in the scenarios of an iteration.
+
+        Args:
+            gamma: Density [N], of the robot's field.
+            iteration: Counted from 0.
+            gravity_scale: Share of gravity.
+
+        Returns:
+            Travel, that of feet and soles, what is inflated, and falls of each scenario [S]; the rest of the design
+            itself. Their gradient is that of :meth:`gradient`.
+
+        Raises:
+            SimulationDiverged: if a scenario breaks down even with the smallest step; ``batch`` is its index.
+        """
+        robot, s = self.robot, self.robot.settings
+        batch = self.sample(iteration)
+        dt = robot.step(gamma, batch)
+        for halving in range(s.halvings + 1):
+            step = dt / 2**halving
+            self._tell(_JUDGE, iteration, gravity_scale, step)
+            self.processes.broadcast(gamma.detach())
+            outcome = self._simulated(gamma.detach(), batch, gravity_scale, step)
+            error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
+            if error is None:
+                break
+            if halving == s.halvings:
+                raise error
+        assert isinstance(outcome, Outcome)
+        self._all = self.processes.gather(self._values.detach(), self.parts).requires_grad_()
+        body = robot.filled(gamma)
+        solid, weight = robot.weights(body)
+        return replace(
+            outcome,
+            **dict(zip(JUDGED, self._all.unbind(1), strict=True)),
+            intermediate=intermediate_density(gamma, robot.design),
+            mass=total_mass(solid),
+            center=center_of_gravity(body.position, weight),
+        )
+
+    def gradient(self, gamma: Tensor, aims: Tensor) -> Tensor:
+        """Gradient of minus the risk by the design variable, as of the last :meth:`judge`.
+
+        That of each scenario is limited in norm to its part of ``settings.clip``: a tumble, whose norm is hundreds of
+        times that of a walk, would be all that is left of the sum. Those that overflow are left out and counted in
+        ``lost``; where they are more than half of the risk, the gradient is not finite.
+
+        Args:
+            gamma: Density [N], of the robot's field.
+            aims: What is maximised, of each scenario [S], made of that outcome.
+        """
+        phi, clip = self.robot.field.phi, self.robot.settings.clip
+        part = shares(self.robot, aims)
+        by_motion, by_mass = torch.autograd.grad(
+            -(part * aims).sum(), (self._all, gamma), retain_graph=True, allow_unused=True
+        )
+        self._tell(_PULL)
+        self.processes.broadcast(by_motion)
+        rows = self.processes.gather(self._pulled(by_motion), self.parts)
+        total, self.lost, missing = torch.zeros_like(phi), 0, 0.0
+        for weight, row in zip(part.tolist(), rows, strict=True):
+            if weight == 0:
+                continue
+            row = row if by_mass is None else row + weight * by_mass
+            (one,) = torch.autograd.grad(gamma, phi, row, retain_graph=True)
+            norm = float(one.norm())
+            if not math.isfinite(norm):
+                self.lost, missing = self.lost + 1, missing + weight
+                continue
+            total += one * min(1.0, clip * weight / (norm + 1e-6)) if clip else one
+        return total if missing <= MOST else torch.full_like(total, math.nan)
+
+    def serve(self) -> None:
+        """Simulate what process 0 asks for, until it has no more; of the other processes."""
+        like = self.robot.field.phi
+        while True:
+            task, iteration, gravity_scale, step = self.processes.broadcast(torch.zeros(4, dtype=torch.float64)).tolist()
+            if task == _END:
+                return
+            if task == _PULL:
+                bars = self.processes.broadcast(like.new_empty(self.count, len(JUDGED)))
+                self.processes.gather(self._pulled(bars), self.parts)
+                continue
+            gamma = self.processes.broadcast(like.new_empty(self.robot.domain.count))
+            outcome = self._simulated(gamma, self.sample(int(iteration)), gravity_scale, step)
+            error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
+            if error is None:
+                self.processes.gather(self._values.detach(), self.parts)
+
+    def end(self) -> None:
+        """Let the other processes go."""
+        self._tell(_END)
+
+    def _tell(self, *numbers: float) -> None:
+        """What the other processes are to do next."""
+        told = torch.zeros(4, dtype=torch.float64)
+        told[: len(numbers)] = torch.tensor(numbers, dtype=torch.float64)
+        self.processes.broadcast(told)
+
+    @torch.enable_grad()
+    def _simulated(
+        self, gamma: Tensor, batch: ScenarioBatch, gravity_scale: float, dt: float
+    ) -> Outcome | SimulationDiverged:
+        """Simulate this process's share; keeps what :meth:`_pulled` goes back through."""
+        self._rows = gamma.expand(len(self._places), -1).clone().requires_grad_()
+        try:
+            outcome = self.robot(
+                self._rows, gravity_scale=gravity_scale, scenarios=batch.part(self._places), dt=dt
+            )
+        except SimulationDiverged as error:
+            found = {name: getattr(error, name) for name in ("step", "time", "particle", "quantity", "remedy")}
+            return SimulationDiverged(**found, batch=self._places[error.batch])
+        self._values = torch.stack([getattr(outcome, name) for name in JUDGED], 1)[: len(self.own)]
+        return outcome
+
+    def _pulled(self, bars: Tensor) -> Tensor:
+        """Gradient by the density of this process's scenarios [own, N], from that by what is judged of all [S, 5]."""
+        mine = bars[self.own.start : self.own.stop]
+        (found,) = torch.autograd.grad(self._values, self._rows, mine)
+        self._values = self._values.detach()
+        return found[: len(self.own)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What a design does in scenarios, in SI units, each [S]; NaN where the simulation broke down.
+
+    Attributes:
+        batch: The scenarios.
+        travel: L [m].
+        fall: See :class:`Outcome` [m].
+        fell: Whether it fell, see :func:`fallen`.
+        errors: Of the scenarios that broke down, by index.
+    """
+
+    batch: ScenarioBatch
+    travel: np.ndarray
+    fall: np.ndarray
+    fell: np.ndarray
+    errors: dict[int, str]
+
+    def numbers(self) -> dict[str, float]:
+        """Spread of the travel [m], mean of the lowest tenth included, and numbers of falls and of breakdowns.
+
+        A scenario that broke down counts as one in which the robot stays where it is at best.
+        """
+        least = np.nan_to_num(self.travel, nan=min(0.0, np.nanmin(self.travel, initial=0.0)))
+        tenth = CVaR(0.1)(torch.from_numpy(least))
+        found = {"L_min": least.min(), "L_lowest_tenth": tenth, "L_mean": least.mean(), "L_max": least.max()}
+        return {
+            **{name: float(value) for name, value in found.items()},
+            "falls": int(self.fell.sum()),
+            "diverged": len(self.errors),
+        }
+
+
+@torch.no_grad()
+def evaluate(
+    robot: Robot,
+    gamma: Tensor,
+    batch: ScenarioBatch,
+    *,
+    void: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> Evaluation:
+    """Simulate a design in scenarios, sixteen at a time; one that breaks down takes none with it.
+
+    Args:
+        robot: The robot.
+        gamma: Its density [N].
+        batch: The scenarios.
+        void: Simulate void, too.
+        progress: Called with the scenarios that are done and their number.
+    """
+    travel, fall = np.full(batch.count, np.nan), np.full(batch.count, np.nan)
+    fell, errors = np.zeros(batch.count, dtype=bool), {}
+    waiting = [list(range(first, min(first + LANES, batch.count))) for first in range(0, batch.count, LANES)]
+    done = 0
+    while waiting:
+        some = waiting.pop(0)
+        try:
+            outcome = robot(gamma, scenarios=batch.part(some), void=void)
+        except SimulationDiverged as error:
+            if len(some) > 1:
+                waiting = [[one] for one in some] + waiting
+                continue
+            errors[some[0]] = str(error)
+        else:
+            travel[some], fall[some] = outcome.travel.cpu().numpy(), outcome.fall.cpu().numpy()
+            fell[some] = fallen(robot, outcome).cpu().numpy()
+        done += len(some)
+        if progress is not None:
+            progress(done, batch.count)
+    return Evaluation(batch=batch, travel=travel, fall=fall, fell=fell, errors=errors)
