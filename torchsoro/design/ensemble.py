@@ -92,7 +92,7 @@ class Ensemble:
         dt = robot.step(gamma, batch)
         for halving in range(s.halvings + 1):
             step = dt / 2**halving
-            self._tell(_JUDGE, iteration, gravity_scale, step)
+            _tell(self.processes, _JUDGE, iteration, gravity_scale, step)
             self.processes.broadcast(gamma.detach())
             outcome = self._simulated(gamma.detach(), batch, gravity_scale, step)
             error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
@@ -128,7 +128,7 @@ class Ensemble:
         by_motion, by_mass = torch.autograd.grad(
             -(part * aims).sum(), (self._all, gamma), retain_graph=True, allow_unused=True
         )
-        self._tell(_PULL)
+        _tell(self.processes, _PULL)
         self.processes.broadcast(by_motion)
         rows = self.processes.gather(self._pulled(by_motion), self.parts)
         total, self.lost, missing = torch.zeros_like(phi), 0, 0.0
@@ -148,7 +148,9 @@ class Ensemble:
         """Simulate what process 0 asks for, until it has no more; of the other processes."""
         like = self.robot.field.phi
         while True:
-            task, iteration, gravity_scale, step = self.processes.broadcast(torch.zeros(4, dtype=torch.float64)).tolist()
+            task, iteration, gravity_scale, step = self.processes.broadcast(
+                torch.zeros(4, dtype=torch.float64)
+            ).tolist()
             if task == _END:
                 return
             if task == _PULL:
@@ -161,16 +163,6 @@ class Ensemble:
             if error is None:
                 self.processes.gather(self._values.detach(), self.parts)
 
-    def end(self) -> None:
-        """Let the other processes go."""
-        self._tell(_END)
-
-    def _tell(self, *numbers: float) -> None:
-        """What the other processes are to do next."""
-        told = torch.zeros(4, dtype=torch.float64)
-        told[: len(numbers)] = torch.tensor(numbers, dtype=torch.float64)
-        self.processes.broadcast(told)
-
     @torch.enable_grad()
     def _simulated(
         self, gamma: Tensor, batch: ScenarioBatch, gravity_scale: float, dt: float
@@ -178,9 +170,7 @@ class Ensemble:
         """Simulate this process's share; keeps what :meth:`_pulled` goes back through."""
         self._rows = gamma.expand(len(self._places), -1).clone().requires_grad_()
         try:
-            outcome = self.robot(
-                self._rows, gravity_scale=gravity_scale, scenarios=batch.part(self._places), dt=dt
-            )
+            outcome = self.robot(self._rows, gravity_scale=gravity_scale, scenarios=batch.part(self._places), dt=dt)
         except SimulationDiverged as error:
             found = {name: getattr(error, name) for name in ("step", "time", "particle", "quantity", "remedy")}
             return SimulationDiverged(**found, batch=self._places[error.batch])
@@ -193,6 +183,18 @@ class Ensemble:
         (found,) = torch.autograd.grad(self._values, self._rows, mine)
         self._values = self._values.detach()
         return found[: len(self.own)]
+
+
+def _tell(processes: Processes, *numbers: float) -> None:
+    """Say what the other processes are to do next."""
+    told = torch.zeros(4, dtype=torch.float64)
+    told[: len(numbers)] = torch.tensor(numbers, dtype=torch.float64)
+    processes.broadcast(told)
+
+
+def end(processes: Processes) -> None:
+    """Let the other processes go."""
+    _tell(processes, _END)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,17 +248,21 @@ def evaluate(
         void: Simulate void, too.
         progress: Called with the scenarios that are done and their number.
     """
+    dt = robot.step(gamma, batch)
     travel, fall = np.full(batch.count, np.nan), np.full(batch.count, np.nan)
     fell, errors = np.zeros(batch.count, dtype=bool), {}
-    waiting = [list(range(first, min(first + LANES, batch.count))) for first in range(0, batch.count, LANES)]
+    waiting = [(list(range(k, min(k + LANES, batch.count))), dt) for k in range(0, batch.count, LANES)]
     done = 0
     while waiting:
-        some = waiting.pop(0)
+        some, step = waiting.pop(0)
         try:
-            outcome = robot(gamma, scenarios=batch.part(some), void=void)
+            outcome = robot(gamma, scenarios=batch.part(some), void=void, dt=step)
         except SimulationDiverged as error:
             if len(some) > 1:
-                waiting = [[one] for one in some] + waiting
+                waiting = [([one], dt) for one in some] + waiting
+                continue
+            if step > 1.5 * dt / 2**robot.settings.halvings:
+                waiting.insert(0, (some, step / 2))
                 continue
             errors[some[0]] = str(error)
         else:

@@ -87,6 +87,8 @@ class Processes:
         mine[: len(values)] = values
         found = [torch.empty_like(mine) for _ in parts]
         with _lost():
+            if values.is_cuda:  # NCCL would wait for a process that has died, gloo does not
+                torch.distributed.all_gather([torch.zeros(1) for _ in parts], torch.zeros(1))
             torch.distributed.all_gather(found, mine)
         return torch.cat([one[: len(part)] for one, part in zip(found, parts, strict=True)])
 
@@ -142,6 +144,6 @@ def _lost() -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise ConnectionError(
-            f"a process that shares the scenarios has ended ({str(error).splitlines()[0]}); what was saved is whole: "
-            "start again with --resume, on as many processes as there are"
+            "a process that shares the scenarios has ended or does not answer; every iteration that was saved is whole: "
+            "go on with --resume, on any number of processes up to that of the scenarios"
         ) from error

@@ -283,7 +283,8 @@ class Robot(nn.Module):
             found["planes"] = tuple(replace(plane, friction=b.friction) for plane in self.planes)
         if b.tube_mass is not None:
             found["loads"] = (PointMass(particles=socket, mass=b.tube_mass),)
-        if b.pitch is not None or b.roll is not None or b.drop is not None:
+        pose = [t for t in (b.pitch, b.roll, b.drop) if t is not None]
+        if any(t.requires_grad or bool(t.any()) for t in pose):
             nodes = Lattice.around(body.position, self.domain.cell).node_places
             moved = posed(nodes, s.size, b).to(body.position)
             found["start"] = Start(displacement=moved, velocity=torch.zeros_like(moved))

@@ -35,9 +35,7 @@ def disturb(field: DesignField, seed: int) -> None:
     field.clamp_()
 
 
-def optimize_starts(
-    robot: Robot, observe: Observe | None = None, processes: Processes | None = None
-) -> Optimized:
+def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Processes | None = None) -> Optimized:
     """Run the design loop from ``robot.settings.starts`` initial fields, the first the robot's own, and take the best.
 
     That is the one that goes farthest of those within the limit on C; if none is, the one nearest to it. A start whose

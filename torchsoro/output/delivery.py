@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
-from torchsoro.design.ensemble import Ensemble, Evaluation, evaluate
+from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
 from torchsoro.design.robot import Robot
@@ -56,12 +56,14 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         if processes.rank:
             Ensemble(robot, processes).serve()
             return {}
-        ensemble = Ensemble(robot, processes) if processes.world > 1 else None
         try:
             optimized = optimize_starts(robot, observe, processes)
-        finally:
-            if ensemble is not None:
-                ensemble.end()
+        except (ConnectionError, KeyboardInterrupt):  # the others wait for something else, and notice by themselves
+            raise
+        except Exception:
+            end(processes)
+            raise
+        end(processes)
     history = optimized.metrics
     found = {
         **deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
