@@ -9,8 +9,8 @@ A row for each check goes to ``compare.json``, and the motion of some to ``motio
 ``recipes/validate/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a
 check of a design at the paper's size takes five to fifteen minutes, one at half the cell size hours.
 
-With ``--scenarios`` it is simulated in so many scenarios instead, drawn from the ranges of its settings by a seed that its
-design run did not use: ``scenarios.csv``, a line for each, ``scenarios.json`` and ``scenarios.png``.
+With ``--scenarios`` it is simulated in so many scenarios instead, drawn from the ranges of its settings by a seed that
+its design run did not use: ``scenarios.csv``, a line for each, ``scenarios.json`` and ``scenarios.png``.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from tiny import TINY
 
 from torchsoro.design.reading import from_command_line
 from torchsoro.design.risk import CVaR
-from torchsoro.design.robot import Outcome, Robot, climber, walker
+from torchsoro.design.robot import Outcome, Robot, build, climber, walker
 from torchsoro.design.scenarios import (
     NOMINAL,
     STICK,
@@ -270,13 +270,18 @@ def test_bad_samples_and_batches_are_refused():
         (("--tilt-range", "5", "-5"), r"tilt_range = 5 -5: wanted two increasing"),
         (("--tube-range", "0", "2"), r"tube_range = 0 2: wanted .* kg"),
         (("--friction-range", "stick", "0.3"), r"friction_range = stick 0.3: wanted"),
-        (("--pitch-range", "0", "3", "--formulation", "updated"), r"pitch_range = \(0.0, 3.0\): wanted 0 0, but"),
         (("--scenarios", "-1"), r"scenarios = -1: wanted at least 0"),
     ],
 )
 def test_bad_flags_are_refused_by_name(flags, message):
     with pytest.raises(ValueError, match=message):
         from_command_line({"desk": TINY}, description="", arguments=("--preset", "desk", "--device", "cpu", *flags))
+
+
+@pytest.mark.parametrize("changes", [{"formulation": "updated"}, {"robot": "climber"}])
+def test_a_pose_at_the_start_is_refused_where_there_is_none(changes):
+    with pytest.raises(ValueError, match=r"drop_range = \(0.0, 0.001\): wanted 0 0, but of a walker"):
+        build(dataclasses.replace(TINY, drop_range=(0.0, 1e-3), **changes))
 
 
 def test_a_step_too_long_for_the_stiffest_scenario_is_refused_before_any_simulation():

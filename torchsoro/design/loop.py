@@ -71,7 +71,7 @@ def simulate(
 
 
 def fell(robot: Robot, outcome: Outcome) -> bool:
-    """Whether the robot fell; with scenarios, whether more than half of the risk's gradient is by those where it did."""
+    """Whether the robot fell; with scenarios, whether those where it did make more than half of the risk's gradient."""
     down = fallen(robot, outcome)
     if robot.settings.upright == 0 or down.ndim == 0:
         return robot.settings.upright > 0 and bool(down)

@@ -144,6 +144,6 @@ def _lost() -> Iterator[None]:
         yield
     except RuntimeError as error:
         raise ConnectionError(
-            "a process that shares the scenarios has ended or does not answer; every iteration that was saved is whole: "
-            "go on with --resume, on any number of processes up to that of the scenarios"
+            "a process that shares the scenarios has ended or does not answer; every iteration that was saved is "
+            "whole: go on with --resume, on any number of processes up to that of the scenarios"
         ) from error

@@ -21,8 +21,8 @@ from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
 from torchsoro.simulation.contact import Plane, ground
 from torchsoro.simulation.formulation import Formulation, formulation_of
-from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.loads import PointMass
+from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.simulator import Simulator
@@ -82,6 +82,12 @@ class Robot(nn.Module):
         super().__init__()
         s = self.settings = settings
         s.check_memory()
+        for name in ("pitch_range", "roll_range", "drop_range"):
+            if any(getattr(s, name)) and (s.robot != "walker" or s.formulation != "total"):
+                raise ValueError(
+                    f"{name} = {getattr(s, name)}: wanted 0 0, but of a walker in the total-Lagrangian formulation, "
+                    "which alone has a pose at the start"
+                )
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
         center = (0.0, 0.0, s.size[2] / 2)

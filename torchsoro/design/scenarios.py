@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ STICK = 1e30  # Coulomb coefficient that holds whatever is pressed on a plane, a
 # Largest tilt, pitch and roll [degrees]: a larger one is in another unit, or no floor to walk on.
 STEEPEST = 60.0
 HEAVIEST = 1.0  # largest mass of a tube [kg]: some forty robots of 35 mm; a larger one is in grams
-# Longest step of a supply behind a lag [s]: between samples, the pressure is linear. A third of the lag of a short line.
+# Longest step of a supply behind a lag [s], between which its pressure is linear: a fraction of a short line's lag.
 FINEST = 1e-3
 # Steps per time constant beyond which a lag is none: exp(-500) is zero beside any pressure, and still has a gradient.
 PROMPT = 500.0

@@ -285,7 +285,7 @@ class Settings:
             )
 
     def _check_scenarios(self) -> None:
-        """Refuse bad ranges, a bad risk, and a pose at the start where there is none."""
+        """Refuse bad ranges and a bad risk."""
         check_friction("friction_range", self.friction_range)
         for name, (least, most, unit) in LIMITS.items():
             setting = {"tilt_x": "tilt", "tilt_y": "tilt"}.get(name, name.partition("_")[0])
@@ -294,12 +294,6 @@ class Settings:
             from torchsoro.design.risk import parse_risk
 
             parse_risk(self.risk)
-        posed = [name for name in ("pitch_range", "roll_range", "drop_range") if any(getattr(self, name))]
-        if posed and (self.robot != "walker" or self.formulation != "total"):
-            raise ValueError(
-                f"{posed[0]} = {getattr(self, posed[0])}: wanted 0 0, but of a walker in the total-Lagrangian "
-                "formulation, which alone has a pose at the start"
-            )
 
     @property
     def distribution(self) -> Scenarios:
