@@ -295,3 +295,20 @@ def test_lanes_are_as_many_as_a_cpu_carries():
     from torchsoro.simulation.kernels.lanes import LANES
 
     assert torchsoro.design.ensemble.LANES == LANES
+
+
+@pytest.mark.gpu
+def test_a_scenario_on_a_gpu_has_the_same_bits_and_gradient_in_any_share(cuda):
+    made = robot_of(device="cuda")
+    batch, gamma = Ensemble(made).sample(0), made.field().detach()
+    dt = made.step(gamma, batch)
+
+    def of(part: list[int]) -> tuple[torch.Tensor, torch.Tensor]:
+        rows = gamma.expand(len(part), -1).clone().requires_grad_()
+        travel = made(rows, scenarios=batch.part(part), dt=dt).travel
+        return travel.detach(), torch.autograd.grad(travel.sum(), rows)[0]
+
+    whole = of([0, 1, 2, 3, 4])
+    for part in ([0, 1, 2], [3, 4], [2]):
+        for found, wanted in zip(of(part), whole, strict=True):
+            assert torch.equal(found, wanted[part])
