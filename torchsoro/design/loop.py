@@ -251,7 +251,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                 lagrangian.demand(s.sharpened(k))
             for group in adam.param_groups:
                 group["lr"] = s.learning_rate * s.beta / field.beta
-            gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), ensemble, k)
+            among: dict[str, Any] = {} if ensemble is None else {"ensemble": ensemble, "iteration": k}
+            gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), **among)
             violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
             goal = overall(robot, aims)
             loss = lagrangian(goal.detach(), violation)
