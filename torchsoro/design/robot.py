@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -14,10 +13,11 @@ from torchsoro.design.density import fill, without_void
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
-from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
-from torchsoro.design.settings import Settings, check_pressure
+from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel, yaw
+from torchsoro.design.settings import Settings
+from torchsoro.design.supply import supply_of
 from torchsoro.errors import SimulationDiverged
-from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
+from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane, ground
 from torchsoro.simulation.formulation import Formulation, formulation_of
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
@@ -35,6 +35,8 @@ class Outcome:
         feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
         soles: The same with all soles, the less the farther off they are, which has a gradient by what touches [m].
         inflated: Travel of the centre of gravity when the valve closes for the first time [m].
+        turn: Angle by which the soles turned about z since the actuation starts, positive to the left [rad].
+        turn_inflated: The same when the valve closes for the first time [rad].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
         fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
@@ -47,6 +49,8 @@ class Outcome:
     feet: Tensor
     soles: Tensor
     inflated: Tensor
+    turn: Tensor
+    turn_inflated: Tensor
     intermediate: Tensor
     mass: Tensor
     fall: Tensor
@@ -56,7 +60,7 @@ class Outcome:
 
 
 class Robot(nn.Module):
-    """A cube with a gas chamber, to be designed; everything follows from the settings.
+    """A cube with one or several gas chambers, to be designed; everything follows from the settings.
 
     Args:
         settings: See :class:`Settings`.
@@ -82,14 +86,15 @@ class Robot(nn.Module):
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
         center = (0.0, 0.0, s.size[2] / 2)
-        inside: dict[str, Any] = {"center": center, "size": s.chamber}
+        chambers = chambers_of(s, center)
         if s.chamber_mesh is not None:
-            inside = {"shape": read_surface(s.chamber_mesh, UNITS[s.mesh_unit])}
+            cavity = read_surface(s.chamber_mesh, UNITS[s.mesh_unit])
+            chambers = (Chamber(name="chamber", wall=s.wall, shape=cavity),)
         self.domain = Domain(
             size=s.size,
             particles=s.particles,
             origin=(-half[0], -half[1], 0.0),
-            chambers=(Chamber(name="chamber", wall=s.wall, **inside),),
+            chambers=chambers,
             body=None if s.body_mesh is None else read_surface(s.body_mesh, UNITS[s.mesh_unit]),
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
@@ -103,7 +108,7 @@ class Robot(nn.Module):
         if s.material is not None:
             found = read_material(s.material)
             self.solid, self.prony = found.solid, found.prony
-        self.pressure = _pressure(s, float(self.solid.youngs_modulus))
+        self.supply = supply_of(s, float(self.solid.youngs_modulus))
         angle = math.atan(s.slope)
         # Uphill along +x, with the ground kept level: gravity leans back instead.
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
@@ -122,6 +127,7 @@ class Robot(nn.Module):
         gravity_scale: float = 1.0,
         everything: bool = False,
         void: bool = True,
+        pressure: Waveform | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> Outcome:
         """Simulate a design and judge it.
@@ -132,6 +138,7 @@ class Robot(nn.Module):
             everything: Record every particle (for pictures) and not only the centre of gravity.
             void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
                 in what is recorded, void then moves with the centre of gravity.
+            pressure: Of the chambers, from the start of the simulation; the supply's own if None.
             progress: See :meth:`Simulator.forward`.
 
         Returns:
@@ -144,7 +151,8 @@ class Robot(nn.Module):
         body = self.filled(gamma)
         solid = torch.where(self.design | self.wall, body.mass, torch.zeros_like(body.mass))
         weight = solid if s.counted == "body" else torch.where(self.design, body.mass, torch.zeros_like(body.mass))
-        trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress)
+        supplied = self.pressure if pressure is None else pressure
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void, supplied, progress)
         end = s.settle + s.duration
 
         def until(moment: float) -> Tensor:
@@ -158,6 +166,8 @@ class Robot(nn.Module):
             feet=self.feet(trajectory, gamma, near=False),
             soles=self.feet(trajectory, gamma, near=True),
             inflated=until(s.settle + closes),
+            turn=self.turned(trajectory, gamma, end),
+            turn_inflated=self.turned(trajectory, gamma, s.settle + closes),
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(solid),
             fall=torch.relu(height[0] - height.min() - s.sink * s.size[2]),
@@ -177,9 +187,8 @@ class Robot(nn.Module):
             gamma: Density [N].
             near: Count all of those layers, by exp(-2 h / spacing) at a height h above the touch, instead.
         """
-        at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
-        place, probes = trajectory.position[:, at], trajectory.probes[at]
-        first = int((trajectory.time - self.settings.settle).abs().argmin())
+        place, probes = self._soles(trajectory)
+        first = self._sample(trajectory, self.settings.settle)
         spacing = self.domain.spacing
         away = [plane.side * (place[-1, :, plane.axis] - float(plane.offset)) for plane in self.planes]
         height = torch.relu(torch.stack(away).amin(0) - 0.5 * spacing)
@@ -187,6 +196,35 @@ class Robot(nn.Module):
         share = gamma[probes].clamp(min=0) ** 3 * counts
         moved = (place[-1] - place[first]) @ place.new_tensor(self.direction)
         return (share * moved).sum() / share.sum().clamp(min=torch.finfo(share.dtype).tiny)
+
+    def turned(self, trajectory: Trajectory, gamma: Tensor, moment: float) -> Tensor:
+        """Angle by which the soles turned about z from the start of the actuation to a moment [rad].
+
+        That is the rotation that fits them best (see :func:`torchsoro.design.objective.yaw`); they count by the cube of
+        their density.
+
+        Args:
+            trajectory: With the soles among its probes.
+            gamma: Density [N].
+            moment: Time, s.
+        """
+        place, probes = self._soles(trajectory)
+        first, last = (self._sample(trajectory, t) for t in (self.settings.settle, moment))
+        return yaw(place[first], place[last], gamma[probes].clamp(min=0) ** 3)
+
+    def _soles(self, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
+        """Positions over time [S, n, 3] m of the layers that face a plane, and their particles [n]."""
+        at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
+        return trajectory.position[:, at], trajectory.probes[at]
+
+    def _sample(self, trajectory: Trajectory, moment: float) -> int:
+        """The sample nearest to a time [s]."""
+        return int((trajectory.time - moment).abs().argmin())
+
+    @property
+    def pressure(self) -> Waveform:
+        """What the supply gives now, from the start of the simulation, with a gradient by a timing that is designed."""
+        return self.supply()
 
     def filled(self, gamma: Tensor) -> Body:
         """The domain filled with a density [N]."""
@@ -208,6 +246,7 @@ class Robot(nn.Module):
         gravity_scale: float,
         everything: bool,
         void: bool,
+        pressure: Waveform,
         progress: Callable[[int, int], None] | None,
     ) -> Trajectory:
         """Simulate; a design on which the step is too long is simulated again with half the step."""
@@ -223,7 +262,7 @@ class Robot(nn.Module):
                     body,
                     duration=s.settle + s.duration,
                     prony=self.prony,
-                    pressure=self.pressure,
+                    pressure=pressure,
                     gravity=tuple(gravity_scale * g for g in self.gravity),
                     planes=self.planes,
                     sample_every=s.sample_every,
@@ -264,7 +303,7 @@ class Robot(nn.Module):
 
 def build(settings: Settings) -> Robot:
     """The robot that the settings name."""
-    return {"walker": walker, "climber": climber}[settings.robot](settings)
+    return {"walker": walker, "climber": climber, "turner": turner}[settings.robot](settings)
 
 
 def walker(settings: Settings) -> Robot:
@@ -285,6 +324,52 @@ def climber(settings: Settings) -> Robot:
     return Robot(settings, planes=planes, direction=(0.0, 0.0, 1.0), symmetry=("x", "y"))
 
 
+def turner(settings: Settings) -> Robot:
+    """A walker whose chambers lie side by side in y, mirror images of each other, and which is to turn to the left.
+
+    The body is symmetric: with the supply mirrored it turns as far to the right.
+
+    Raises:
+        ValueError: for a supply that works both sides alike, on which a symmetric body goes straight on.
+    """
+    s = settings
+    if s.chambers < 2 or s.chamber_axis != "y":
+        raise ValueError(
+            f"chambers = {s.chambers}, chamber_axis = {s.chamber_axis!r}: wanted at least 2 along 'y' to turn"
+        )
+    lists = (s.amplitudes, s.phases, s.duties)
+    if all(values == values[::-1] for values in lists):
+        raise ValueError(
+            f"amplitudes, phases, duties = {', '.join(map(str, lists))}: "
+            "wanted some that differ from left to right, or the robot goes straight on"
+        )
+    return walker(settings)
+
+
+def chambers_of(s: Settings, center: tuple[float, float, float]) -> tuple[Chamber, ...]:
+    """The chambers of the settings around a place: one box, or several side by side along an axis.
+
+    Each of several has its share of the cavity's length and a wall of its own all around, so that together they hold
+    the air of the one, and their box is longer by two walls for each that is added. The lattice checks their places.
+    """
+    if s.chambers == 1:
+        return (Chamber(name="chamber", center=center, size=s.chamber, wall=s.wall),)
+    axis = "xyz".index(s.chamber_axis)
+    each = (s.chamber[axis] - 2 * s.wall) / s.chambers + 2 * s.wall
+    size = tuple(each if a == axis else edge for a, edge in enumerate(s.chamber))
+    made = []
+    for k in range(s.chambers):
+        shift = (k - (s.chambers - 1) / 2) * each
+        place = tuple(c + shift * (a == axis) for a, c in enumerate(center))
+        made.append(Chamber(name=f"chamber {k + 1}", center=_triple(place), size=_triple(size), wall=s.wall))
+    return tuple(made)
+
+
+def _triple(values: tuple[float, ...]) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z
+
+
 def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
     """Particles of the layers that face a plane [n]."""
     place, faces = domain.positions, torch.zeros(domain.count, dtype=torch.bool)
@@ -292,28 +377,3 @@ def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
         along = plane.side * place[:, plane.axis]
         faces |= along < along.min() + 0.5 * domain.spacing
     return faces.nonzero().squeeze(1)
-
-
-def _pressure(s: Settings, modulus: float) -> Waveform:
-    """Gauge pressure from the start of the simulation: at rest while it settles, then measured or modelled."""
-    if s.pressure_file is None:
-        if s.material is not None:
-            check_pressure("pressure", s.pressure, modulus)
-        return square_wave(
-            amplitude=s.pressure,
-            frequency=s.frequency,
-            duty=s.duty,
-            rise=s.rise,
-            fall=s.fall,
-            start=s.settle,
-            end=s.settle + s.duration,
-        )
-    measured = read_pressure_csv(s.pressure_file)
-    begin, end = float(measured.time[0]), float(measured.time[-1])
-    if abs(begin) > s.sample_every or end < s.duration - s.sample_every:
-        raise ValueError(
-            f"pressure_file = {s.pressure_file}: from {begin:g} to {end:g} s, wanted times that begin with the "
-            f"actuation, at 0, and last for its duration of {s.duration:g} s"
-        )
-    check_pressure(f"pressure_file = {s.pressure_file}, largest", float(measured.pressure.abs().max()), modulus)
-    return Waveform(time=measured.time - measured.time[0] + s.settle, pressure=measured.pressure)
