@@ -1,4 +1,4 @@
-"""The design loop: simulate, judge, step; Adam on design field and timing, an augmented Lagrangian for the limit on C."""
+"""The design loop: simulate, judge, step; Adam on field and timing, an augmented Lagrangian for the limit on C."""
 
 from __future__ import annotations
 
@@ -82,8 +82,8 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
 
     That is travel less falling, and less the mass as a share of the solid body's. A body that stands on one spot has
     next to no gradient by where it ends, whatever its legs; it has one by how far it reaches while it is inflated:
-    ``settings.inflated`` of that counts at first, and nothing once the projection is sharp. What a turner travels is the
-    arc of half its width, :func:`arc`.
+    ``settings.inflated`` of that counts at first, and nothing once the projection is sharp. What a turner
+    travels is the arc of half its width, :func:`arc`.
     """
     s = robot.settings
     early = 1 - min(1.0, iteration / s.sharpen[1]) if s.sharpen[1] else 1.0
@@ -265,10 +265,10 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
             adam.zero_grad()
             (-goal).backward()
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
-            if timing:  # by itself: its few numbers have far larger gradients than each of the field's many
-                norm = norm + 0 * torch.nn.utils.clip_grad_norm_(timing, s.clip or math.inf).to(norm)
+            # By itself: a designed timing's few numbers have far larger gradients than each of the field's many.
+            timing_norm = torch.nn.utils.clip_grad_norm_(timing, s.clip or math.inf)
             design = design_of(robot)
-            if norm.isfinite():
+            if norm.isfinite() and timing_norm.isfinite():
                 lost = 0
                 if not (back or fell(robot, outcome)):
                     good = [*good[1 - KEPT :], design]
@@ -292,6 +292,7 @@ def optimize(robot: Robot, observe: Observe | None = None) -> Optimized:
                 best = {"iteration": k, "worth": worth, "violation": excess, **design}
             end = time.perf_counter()
             timed = {f"supply/{name}": value for name, value in supply.numbers().items()} if timing else {}
+            timed |= {"grad_norm/supply": timing_norm} if timing else {}
             adam.step()
             field.clamp_()
             supply.clamp_()

@@ -116,8 +116,8 @@ class Settings:
     """First opening of the valve of each of several chambers, in cycles after the start; all 0 if left out."""
     duties: tuple[Share, ...] = ()
     """Part of a cycle with the valve open, of each of several chambers; ``duty`` if left out."""
-    timing: Literal["given", "designed"] = "given"
-    """Whether amplitude, phase and duty of each chamber are as given, or designed with the body, beginning there."""
+    timing: tuple[Literal["amplitude", "phase", "duty"], ...] = ()
+    """What of each chamber's valve is designed with the body, beginning with what is given; nothing if left out."""
     timing_rate: Positive = 0.02
     """Learning rate of a designed timing, whose numbers are shares of pressure and cycle."""
     pressure_file: Path | None = None
@@ -246,8 +246,8 @@ class Settings:
                 raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers")
         if self.chambers > 1 and self.chamber_mesh is not None:
             raise ValueError(f"chambers = {self.chambers}: wanted 1 with a chamber_mesh, which is a single chamber")
-        if self.timing == "designed" and self.pressure_file is not None:
-            raise ValueError("timing = 'designed': wanted 'given' with a pressure_file, whose pressure is measured")
+        if "phase" in self.timing and self.chambers == 1:
+            raise ValueError(f"timing = {self.timing}: wanted no phase for a single chamber, which would only wait")
 
     def _check_units(self) -> None:
         """Refuse what is far from any elastomer and any slope that is walked on."""

@@ -1,4 +1,4 @@
-"""The supply of the chambers: a valve for each, whose amplitude, phase and duty are given, or designed with the body."""
+"""The supply of the chambers: a valve for each, with amplitude, phase and duty that are given or designed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torchsoro.design.settings import Settings, check_pressure
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, side_by_side, square_wave
 
-# Part of a cycle that a designed valve is open, at least and at most [1]: at 5 Hz a tenth of a cycle is 20 ms, about the
-# time constant of filling, and a shorter pulse would hardly be felt.
+# Part of a cycle that a designed valve is open, at least and at most [1]: at 5 Hz a tenth of a cycle is 20 ms, about
+# the time constant of filling, and a shorter pulse would hardly be felt.
 DUTY = (0.1, 0.9)
 BOUNDS = {"amplitude": (0.0, 1.0), "phase": (0.0, 1.0), "duty": DUTY}
 
@@ -40,13 +40,12 @@ class Supply(nn.Module):
         amplitude: Largest pressure of each chamber as a share of the supply's, 0 to 1; as long as the chambers.
         phase: First opening of each valve after ``start``, in periods, 0 to 1; all 0 if empty.
         duty: Part of a period that each valve is open, in (0, 1), designed ones within ``DUTY``; all a half if empty.
-        designed: Whether the three require gradients; of a single chamber, whose phase would be a mere delay, the phase
-            does not.
+        designed: Names of those of the three that are designed: they require gradients.
         measured: Pressure [S] of every chamber instead of valves, from the start of the simulation.
 
     Raises:
-        ValueError: Not as many values as chambers, a value out of its range, or a measured pressure with designed
-            valves.
+        ValueError: Not as many values as chambers, a value out of its range, a name that is none of the three, or a
+            measured pressure with valves that are designed.
     """
 
     def __init__(
@@ -61,26 +60,26 @@ class Supply(nn.Module):
         amplitude: Sequence[float] = (1.0,),
         phase: Sequence[float] = (),
         duty: Sequence[float] = (),
-        designed: bool = False,
+        designed: Sequence[str] = (),
         measured: Waveform | None = None,
     ) -> None:
         super().__init__()
         self.pressure, self.frequency, self.rise, self.fall = pressure, frequency, rise, fall
         self.start, self.end, self.measured = start, end, measured
         chambers = len(amplitude)
+        if unknown := sorted(set(designed) - set(BOUNDS)):
+            raise ValueError(f"designed = {', '.join(unknown)}: wanted some of {', '.join(BOUNDS)}")
         if measured is not None and designed:
-            raise ValueError("designed = True with a measured pressure: wanted one of them")
+            raise ValueError(f"designed = {tuple(designed)}: wanted none with a pressure that is measured")
         given = {"amplitude": amplitude, "phase": phase or (0.0,) * chambers, "duty": duty or (0.5,) * chambers}
         for name, values in given.items():
-            low, high = BOUNDS[name] if designed or name != "duty" else (0.0, 1.0)
+            low, high = BOUNDS[name] if name in designed or name != "duty" else (0.0, 1.0)
             value = torch.tensor(tuple(values), dtype=torch.float64)
             inside = (value >= low) & (value <= high) & ((name != "duty") | ((value > 0) & (value < 1)))
             if len(value) != chambers or not chambers or not bool(inside.all()):
-                raise ValueError(
-                    f"{name} = {tuple(values)}: wanted one for each of the {chambers} chambers, from {low:g} to {high:g}"
-                )
-            free = designed and (name != "phase" or chambers > 1)
-            self.register_parameter(name, nn.Parameter(value, requires_grad=free))
+                wanted = f"one for each of the {chambers} chambers, from {low:g} to {high:g}"
+                raise ValueError(f"{name} = {tuple(values)}: wanted {wanted}")
+            self.register_parameter(name, nn.Parameter(value, requires_grad=name in designed))
         self.amplitude: nn.Parameter
         self.phase: nn.Parameter
         self.duty: nn.Parameter
@@ -92,7 +91,7 @@ class Supply(nn.Module):
         return len(self.amplitude)
 
     def designed(self) -> list[nn.Parameter]:
-        """The parameters that are designed; none where they are given."""
+        """The parameters that are designed; none where all are given."""
         return [one for one in self.parameters() if one.requires_grad]
 
     def forward(self, *, mirrored: bool = False) -> Waveform:
@@ -157,7 +156,7 @@ class Supply(nn.Module):
 
 
 def supply_of(s: Settings, modulus: float) -> Supply:
-    """The supply that the settings name: at rest while the robot settles, then valves, or the pressure that was measured.
+    """The supply of the settings: at rest while the robot settles, then valves, or the pressure that was measured.
 
     Args:
         s: The settings.
@@ -179,7 +178,7 @@ def supply_of(s: Settings, modulus: float) -> Supply:
         amplitude=s.amplitudes or (1.0,) * s.chambers,
         phase=s.phases,
         duty=s.duties or (s.duty,) * s.chambers,
-        designed=s.timing == "designed",
+        designed=s.timing,
         measured=measured,
     )
 
