@@ -40,8 +40,9 @@ def changed(name: str, held: Any, kind: Any) -> tuple[str, ...]:
     """What to write after a flag so that its setting changes and stays in range."""
     special = {"friction": "0.4", "dt": "0.0000125", "air_density": "2.5", "settle": "0.5"}
     special |= {"out": "elsewhere", "resolution": "1280x720"}
-    if name == "sharpen":
-        return "10", "20"
+    several = {"sharpen": ("10", "20"), "amplitudes": ("0.5", "1"), "phases": ("0", "0.5"), "duties": ("0.4", "0.5")}
+    if name in several or name == "timing":
+        return several.get(name, ("phase", "duty"))
     if name in special:
         return (special[name],)
     if typing.get_origin(kind) is typing.Literal:

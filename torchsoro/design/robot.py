@@ -88,6 +88,8 @@ class Robot(nn.Module):
         center = (0.0, 0.0, s.size[2] / 2)
         chambers = chambers_of(s, center)
         if s.chamber_mesh is not None:
+            if s.chambers > 1:
+                raise ValueError(f"chambers = {s.chambers}: wanted 1 with a chamber_mesh, which is a single chamber")
             cavity = read_surface(s.chamber_mesh, UNITS[s.mesh_unit])
             chambers = (Chamber(name="chamber", wall=s.wall, shape=cavity),)
         self.domain = Domain(

@@ -244,8 +244,6 @@ class Settings:
                 raise ValueError(f"{name} = {values}: wanted none for a single chamber, or several chambers (chambers)")
             if values and len(values) != self.chambers:
                 raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers")
-        if self.chambers > 1 and self.chamber_mesh is not None:
-            raise ValueError(f"chambers = {self.chambers}: wanted 1 with a chamber_mesh, which is a single chamber")
         if "phase" in self.timing and self.chambers == 1:
             raise ValueError(f"timing = {self.timing}: wanted no phase for a single chamber, which would only wait")
 

@@ -114,16 +114,18 @@ class Supply(nn.Module):
         return waves[0] if len(waves) == 1 else side_by_side(waves)
 
     def _wave(self, amplitude: Tensor, phase: Tensor, duty: Tensor) -> Waveform:
-        delay = phase / self.frequency
+        period = 1 / self.frequency
+        # Beyond the end by the longest delay: no valve opens after its last sample, and no sample moves with a phase but
+        # by its own valve's opening.
+        end = self.end if self.chambers == 1 else self.end + period
         return square_wave(
             amplitude=self.pressure * amplitude,
             frequency=self.frequency,
             duty=duty,
             rise=self.rise,
             fall=self.fall,
-            start=self.start + delay,
-            # Each valve works for as long as the others, so that one that opens after the end is none that is refused.
-            end=self.end + delay.item(),
+            start=self.start + phase * period,
+            end=end,
         )
 
     @torch.no_grad()
