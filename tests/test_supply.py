@@ -100,7 +100,7 @@ def test_pressures_of_own_times_are_those_of_each_alone_and_a_batch_of_gains_sca
         side_by_side([both])
     with pytest.raises(ValueError, match=r"time: got shape \(2, 3\), want"):
         Waveform(time=both.time, pressure=vector(0.0, 1.0, 2.0))
-    with pytest.raises(ValueError, match="time: got 0.5 s in sample 2 after 0.5 s"):
+    with pytest.raises(ValueError, match=r"time: got 0\.5 s in sample 2 after 0.5 s"):
         Waveform(time=torch.stack([vector(0.0, 1.0, 2.0), vector(0.0, 0.5, 0.5)]), pressure=both.pressure)
 
 
@@ -144,10 +144,7 @@ def test_equal_valves_move_a_body_as_one_pressure_in_both_chambers():
 def test_mirrored_valves_move_a_symmetric_body_as_its_mirror_image():
     supply = Supply(**VALVE, **TWO)
     with torch.no_grad():
-        one, other = (
-            DOMAIN.lattice(simulated(supply(mirrored=flag), symmetry=("y",)).T)
-            for flag in (False, True)
-        )
+        one, other = (DOMAIN.lattice(simulated(supply(mirrored=flag), symmetry=("y",)).T) for flag in (False, True))
     image = one.flip(2) * vector(1.0, -1.0, 1.0).reshape(3, 1, 1, 1)  # over y
     torch.testing.assert_close(other, image, rtol=0, atol=1e-12)
     assert float((other - one).abs().max()) > 1e-6  # m
@@ -343,5 +340,5 @@ def test_a_measured_pressure_is_that_of_every_chamber_and_has_no_timing(tmp_path
     file.write_text("time_s,pressure_pa\n0,0\n0.01,50e3\n0.02,10e3\n")
     both = walker(tiny(tmp_path, chambers=2, pressure_file=file)).pressure
     assert both.at(vector(0.02)).tolist() == [[50e3], [50e3]]
-    with pytest.raises(ValueError, match="designed = .*: wanted none with a pressure that is measured"):
+    with pytest.raises(ValueError, match=r"designed = .*: wanted none with a pressure that is measured"):
         walker(tiny(tmp_path, chambers=2, pressure_file=file, timing=("phase",)))

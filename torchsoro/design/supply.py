@@ -115,8 +115,8 @@ class Supply(nn.Module):
 
     def _wave(self, amplitude: Tensor, phase: Tensor, duty: Tensor) -> Waveform:
         period = 1 / self.frequency
-        # Beyond the end by the longest delay: no valve opens after its last sample, and no sample moves with a phase but
-        # by its own valve's opening.
+        # Beyond the end by the longest delay, whatever the phase: each valve opens before its last sample, and samples
+        # move with the opening of their valve only.
         end = self.end if self.chambers == 1 else self.end + period
         return square_wave(
             amplitude=self.pressure * amplitude,

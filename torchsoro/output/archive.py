@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,7 +40,9 @@ def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None
         raise ValueError(f"gamma: got shape {tuple(gamma.shape)}, wanted one density per particle, ({domain.count},)")
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = gamma.detach().float()
-    timing = {} if supply is None else {name: one.detach().numpy() for name, one in supply.named_parameters()}
+    timing: dict[str, Any] = {}
+    if supply is not None:
+        timing = {name: one.detach().numpy() for name, one in supply.named_parameters()}
     with atomic_write(path) as file:
         np.savez_compressed(
             file,
