@@ -31,7 +31,7 @@ def main(settings: Settings) -> dict[str, float]:
         ValueError: for the settings of another robot.
     """
     if settings.robot != "climber":
-        raise ValueError(f"robot = {settings.robot!r}: wanted 'climber'; recipes/walker.py designs a walker")
+        raise ValueError(f"robot = {settings.robot!r}: wanted 'climber'; recipes/{settings.robot}.py designs that")
     from torchsoro.design.robot import climber
     from torchsoro.output.delivery import design
 

@@ -92,6 +92,7 @@ def main(chosen: Options) -> dict[str, float]:
     out = chosen.out or Path("runs/replay") / folder.name
     check_folder("out", out, (f"{folder.name}.mp4", "motion.npz", "motion.html", "shape.stl", "shape.json"))
     gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
+    archive.load_supply(folder / "design.npz", robot.supply)
     out.mkdir(parents=True, exist_ok=True)
     if robot.settings.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work

@@ -3,6 +3,7 @@
     python recipes/walker.py                                  # coarse, on a laptop
     python recipes/walker.py --preset paper                   # the paper's size; chosen by itself on a GPU
     python recipes/walker.py --slope 0.3 --out runs/uphill    # uphill, in a folder of its own
+    python recipes/walker.py --chambers 2 --timing phase duty  # two chambers, whose timing is designed, too
     python recipes/walker.py --resume                         # go on after Ctrl-C or a kill
     python recipes/walker.py --resume --amend --learning-rate 0.01    # go on with another setting, which is noted
     tensorboard --logdir runs                                 # watch it
@@ -32,7 +33,7 @@ def main(settings: Settings) -> dict[str, float]:
         ValueError: for the settings of another robot.
     """
     if settings.robot != "walker":
-        raise ValueError(f"robot = {settings.robot!r}: wanted 'walker'; recipes/climber.py designs a climber")
+        raise ValueError(f"robot = {settings.robot!r}: wanted 'walker'; recipes/{settings.robot}.py designs that")
     from torchsoro.design.robot import walker
     from torchsoro.output.delivery import design
 

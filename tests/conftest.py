@@ -64,7 +64,7 @@ def cuda() -> torch.device:
 @pytest.fixture(scope="session")
 def recipes() -> dict[str, ModuleType]:
     """The recipes around a run, as modules."""
-    names = ("walker", "climber", "replay", "compare", "material_checks")
+    names = ("walker", "climber", "turner", "replay", "compare", "material_checks")
     return {name: importlib.import_module(name) for name in names}
 
 

@@ -49,6 +49,9 @@ def assert_same_run(one: Path, other: Path) -> None:
     assert metrics(one) == metrics(other)
     found = [torch.load(path / "checkpoint.pt", weights_only=True)["items"] for path in (one, other)]
     assert torch.equal(found[0]["field"]["phi"], found[1]["field"]["phi"])
+    assert found[0].keys() == found[1].keys()
+    for name, value in found[0].get("supply", {}).items():
+        assert torch.equal(value, found[1]["supply"][name])
     assert found[0]["best"]["iteration"] == found[1]["best"]["iteration"]
 
 
@@ -75,7 +78,7 @@ def test_a_gradient_is_the_sum_over_scenarios_of_the_gradients_of_single_runs():
     gamma = made.field()
     outcome = ensemble.judge(gamma, 3, 1.0)
     aims = loop.aim(made, outcome, 3)
-    found = ensemble.gradient(gamma, aims)
+    (found,) = ensemble.gradient(gamma, aims)
     batch = ensemble.sample(3)
     # Sixteen times the same, so that a scenario is in a lane, with the same bits, whatever it is beside.
     singles = [made(made.field(), scenarios=batch.part([k] * 16)) for k in range(5)]
@@ -86,21 +89,39 @@ def test_a_gradient_is_the_sum_over_scenarios_of_the_gradients_of_single_runs():
     assert torch.equal(found, found.flip(1))
 
 
+def test_two_chambers_with_a_designed_timing_in_three_scenarios_have_the_gradients_of_single_runs():
+    timing = {"chambers": 2, "timing": ("amplitude", "phase", "duty"), "phases": (0.0, 0.2), "amplitudes": (0.9, 0.8)}
+    made = robot_of(**timing, scenarios=3, clip=0.0, dt=1e-4, lag_range=(0.0, 0.003))
+    ensemble, designed = Ensemble(made), made.supply.designed()
+    gamma = made.field()
+    aims = loop.aim(made, ensemble.judge(gamma, 1, 1.0), 1)
+    found = ensemble.gradient(gamma, aims)
+    batch = ensemble.sample(1)
+    singles = [made(made.field(), scenarios=batch.part([k] * 16)) for k in range(3)]
+    values = torch.cat([loop.aim(made, one, 1)[:1] for one in singles])
+    assert torch.equal(aims, values)
+    wanted = torch.autograd.grad(-overall(made, values), (made.field.phi, *designed))
+    assert [one.shape for one in found] == [one.shape for one in wanted]
+    for one, other in zip(found, wanted, strict=True):
+        assert float(other.abs().min()) > 0 or other is wanted[0]
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-5 * float(other.abs().max()))
+
+
 def test_each_scenario_counts_with_its_part_of_the_clip_and_what_overflows_is_counted(monkeypatch):
     made = robot_of(risk="mean", clip=0.01)
     ensemble = Ensemble(made)
     gamma = made.field()
     aims = loop.aim(made, ensemble.judge(gamma, 0, 1.0), 0)
     real = Ensemble._pulled
-    pulled = real(ensemble, torch.autograd.grad(-aims.mean(), ensemble._all, retain_graph=True)[0])
+    (pulled,) = real(ensemble, torch.autograd.grad(-aims.mean(), ensemble._all, retain_graph=True)[0])
     for factor, lost in (
         ([1.0, 1e6, 1.0, 1.0, 1.0], 0),
         ([1.0, np.inf, 1.0, 1.0, 1.0], 1),
         ([np.nan] * 3 + [1.0] * 2, 3),
     ):
         rows = pulled * torch.tensor(factor)[:, None]
-        monkeypatch.setattr(Ensemble, "_pulled", lambda self, bars, rows=rows: rows)
-        found = ensemble.gradient(gamma, aims)
+        monkeypatch.setattr(Ensemble, "_pulled", lambda self, bars, rows=rows: [rows])
+        (found,) = ensemble.gradient(gamma, aims)
         assert ensemble.lost == lost
         assert bool(found.isfinite().all()) == (lost < 3)
         if lost < 3:
@@ -109,7 +130,7 @@ def test_each_scenario_counts_with_its_part_of_the_clip_and_what_overflows_is_co
 
 def outcome_of(fall: list[float], travel: list[float]) -> Outcome:
     values = {name: torch.tensor(travel) for name in ("travel", "feet", "soles", "inflated")}
-    rest: Any = dict.fromkeys(("intermediate", "mass", "center", "trajectory", "dt"))
+    rest: Any = dict.fromkeys(("turn", "turn_inflated", "intermediate", "mass", "center", "trajectory", "dt"))
     return Outcome(**values, fall=torch.tensor(fall), **rest)
 
 
@@ -243,12 +264,13 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(RECIPES.p
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(recipes, tmp_path):
+@pytest.mark.parametrize("more", [{}, {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)}])
+def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(recipes, tmp_path, more):
     path = tmp_path / "two"
     begin = time.monotonic()
     with (
         (tmp_path / "log").open("w") as log,
-        subprocess.Popen(torchrun(2, path, iterations=40), env=ENVIRONMENT, stdout=log, stderr=log) as run,
+        subprocess.Popen(torchrun(2, path, **more, iterations=40), env=ENVIRONMENT, stdout=log, stderr=log) as run,
     ):
         while not (path / "checkpoint.pt").exists() and run.poll() is None and time.monotonic() < begin + 300:
             time.sleep(0.01)
@@ -262,11 +284,11 @@ def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(reci
     assert saved < 39 and not list(path.glob("*.tmp")) and not (path / "result.json").exists()
     last = saved + 3
     done = subprocess.run(
-        torchrun(2, path, iterations=last - 1, resume=True), env=ENVIRONMENT, capture_output=True, text=True
+        torchrun(2, path, **more, iterations=last - 1, resume=True), env=ENVIRONMENT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    recipes["walker"].main(tiny(path, **MANY, iterations=last, resume=True))
-    recipes["walker"].main(tiny(tmp_path / "one", **MANY, iterations=last))
+    recipes["walker"].main(tiny(path, **MANY, **more, iterations=last, resume=True))
+    recipes["walker"].main(tiny(tmp_path / "one", **MANY, **more, iterations=last))
     assert_same_run(path, tmp_path / "one")
 
 

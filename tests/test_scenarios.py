@@ -23,6 +23,7 @@ from torchsoro.design.scenarios import (
     supplied,
     varied,
 )
+from torchsoro.design.supply import Supply
 from torchsoro.simulation.actuation import Waveform, square_wave
 
 WIDE = Scenarios(
@@ -141,7 +142,7 @@ def test_a_lagging_supply_is_the_closed_form_and_a_lag_of_zero_none():
     found = supplied(ramp, ScenarioBatch(count=4, lag=tau, pressure_gain=2 * torch.ones_like(tau)))
     t = found.time
     assert float(t.diff().max()) <= 1.0001e-3
-    assert torch.equal(found.pressure[0, 0], 2 * ramp.at(t))
+    torch.testing.assert_close(found.pressure[0, 0], 2 * ramp.at(t), rtol=1e-12, atol=1e-9)
     for k in (1, 2, 3):
         T = float(tau[k])
         rising = 2e5 * (t - T * (1 - torch.exp(-t / T)))
@@ -156,6 +157,29 @@ def test_every_chamber_has_the_gain_and_the_lag():
     assert found.pressure.shape == (3, 2, len(found.time))
     torch.testing.assert_close(found.pressure[:, 1], -2 * found.pressure[:, 0])
     assert supplied(wave, batch(tilt_x=[1.0])) is wave
+
+
+def test_lagging_valves_of_several_chambers_have_gradients_by_the_timing_of_each_scenario():
+    valves = {"pressure": 2e4, "frequency": 100.0, "rise": 5e-4, "fall": 5e-4, "start": 5e-3, "end": 2e-2}
+    names = ("amplitude", "phase", "duty")
+    supply = Supply(**valves, amplitude=(0.9, 0.6), designed=names)
+    t = torch.linspace(4e-3, 1.9e-2, 7, dtype=torch.float64)
+    lag = torch.tensor([0.0, 0.002, 0.001], dtype=torch.float64)
+
+    def pressures(*values: torch.Tensor) -> torch.Tensor:
+        each = supply.each(dict(zip(names, values, strict=True)))
+        return 1e-4 * supplied(each, ScenarioBatch(count=3, lag=lag)).at(t)
+
+    rows = ([0.9, 0.6], [0.0031, 0.2127], [0.4, 0.55])
+    values = [torch.tensor([row] * 3, dtype=torch.float64, requires_grad=True) for row in rows]
+    assert pressures(*values).shape == (3, 2, 7)
+    assert torch.autograd.gradcheck(pressures, values, atol=1e-7, rtol=1e-5)
+    with torch.no_grad():
+        for name, row in zip(names, rows, strict=True):
+            getattr(supply, name).copy_(torch.tensor(row, dtype=torch.float64))
+        behind = supplied(supply(), ScenarioBatch(count=3, lag=lag)).at(t)
+    torch.testing.assert_close(1e4 * pressures(*values).detach(), behind, rtol=1e-12, atol=1e-9)
+    assert float((behind[1] - behind[0]).abs().max()) > 100.0  # Pa
 
 
 def test_gradients_of_a_lagging_supply_are_central_differences():

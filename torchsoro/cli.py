@@ -19,7 +19,7 @@ from types import ModuleType
 
 from torchsoro.version import VERSION
 
-COMMANDS = ("view", "walker", "climber", "replay", "compare", "material", "explain", "convert", "benchmark")
+COMMANDS = ("view", "walker", "climber", "turner", "replay", "compare", "material", "explain", "convert", "benchmark")
 """Recipes in the order of ``--help``; a recipe that is not there is left out."""
 
 

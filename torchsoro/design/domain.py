@@ -207,6 +207,11 @@ class Domain:
             chamber[torch.from_numpy(self._masks(one)[1])] = index
         return chamber.flatten()
 
+    def shell(self, index: int) -> Tensor:
+        """Which particles are the wall of the chamber of this index, bool [N]."""
+        whole, cavity = self._masks(self.chambers[index])
+        return torch.from_numpy(whole & ~cavity).flatten()
+
     @cached_property
     def design(self) -> Tensor:
         """Which particles are designed, bool [N]."""

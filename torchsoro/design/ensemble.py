@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,8 @@ from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.errors import SimulationDiverged
 
 LANES = 16  # simulations that a CPU carries on at a time; fewer are filled up
-JUDGED = ("travel", "feet", "soles", "inflated", "fall")  # what is gathered of every scenario
+JUDGED = ("travel", "feet", "soles", "inflated", "fall")  # what is gathered of every scenario,
+TURNS = ("turn", "turn_inflated")  # and of a turner
 # Share of the risk's gradient by scenarios that overflowed, or that fell, above which it says nothing.
 MOST = 0.5
 _END, _JUDGE, _PULL = 0.0, 1.0, 2.0  # what the other processes are told to do
@@ -49,7 +51,7 @@ def shares(robot: Robot, values: Tensor) -> Tensor:
 
 
 class Ensemble:
-    """Simulates a robot in its settings' scenarios, by one process or several.
+    """Simulates a robot in its settings' scenarios, by one process or several, with a timing that is designed, too.
 
     Args:
         robot: The robot.
@@ -64,7 +66,10 @@ class Ensemble:
         self.own = self.parts[self.processes.rank]
         spare = -len(self.own) % LANES if robot.formulation.in_lanes(robot.field.phi) else 0
         self._places = [*self.own, *[self.own[-1]] * spare]
-        self._rows = self._values = self._all = torch.empty(0)
+        self.judged = JUDGED + (TURNS if robot.settings.robot == "turner" else ())
+        self._timing = {name: one for name, one in robot.supply.named_parameters() if one.requires_grad}
+        self._inputs: tuple[Tensor, ...] = ()  # density, and what is designed of the timing, of each place
+        self._values = self._all = torch.empty(0)
         self.lost = 0
 
     def sample(self, iteration: int) -> ScenarioBatch:
@@ -81,8 +86,8 @@ class Ensemble:
             gravity_scale: Share of gravity.
 
         Returns:
-            Travel, that of feet and soles, what is inflated, and falls of each scenario [S]; the rest of the design
-            itself. Their gradient is that of :meth:`gradient`.
+            Travel, that of feet and soles, what is inflated, falls and a turner's angles of each scenario [S] (those of
+            others have no numbers); the rest of the design itself. Their gradient is that of :meth:`gradient`.
 
         Raises:
             SimulationDiverged: if a scenario breaks down even with the smallest step; ``batch`` is its index.
@@ -93,7 +98,7 @@ class Ensemble:
         for halving in range(s.halvings + 1):
             step = dt / 2**halving
             _tell(self.processes, _JUDGE, iteration, gravity_scale, step)
-            self.processes.broadcast(gamma.detach())
+            self._share(gamma.detach())
             outcome = self._simulated(gamma.detach(), batch, gravity_scale, step)
             error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
             if error is None:
@@ -104,24 +109,29 @@ class Ensemble:
         self._all = self.processes.gather(self._values.detach(), self.parts).requires_grad_()
         body = robot.filled(gamma)
         solid, weight = robot.weights(body)
+        none = self._all.new_full((self.count,), math.nan)
+        found = {**dict.fromkeys(TURNS, none), **dict(zip(self.judged, self._all.unbind(1), strict=True))}
         return replace(
             outcome,
-            **dict(zip(JUDGED, self._all.unbind(1), strict=True)),
+            **found,
             intermediate=intermediate_density(gamma, robot.design),
             mass=total_mass(solid),
             center=center_of_gravity(body.position, weight),
         )
 
-    def gradient(self, gamma: Tensor, aims: Tensor) -> Tensor:
-        """Gradient of minus the risk by the design variable, as of the last :meth:`judge`.
+    def gradient(self, gamma: Tensor, aims: Tensor) -> list[Tensor]:
+        """Gradient of minus the risk by the design variable and a designed timing, as of the last :meth:`judge`.
 
-        That of each scenario is limited in norm to its part of ``settings.clip``: a tumble, whose norm is hundreds of
-        times that of a walk, would be all that is left of the sum. Those that overflow are left out and counted in
-        ``lost``; where they are more than half of the risk, the gradient is not finite.
+        That of each scenario is limited in norm to its part of ``settings.clip``, by field and timing each: a tumble,
+        whose norm is hundreds of times that of a walk, would be all that is left of the sum. Those that overflow are
+        left out and counted in ``lost``; where they are more than half of the risk, the gradient is not finite.
 
         Args:
             gamma: Density [N], of the robot's field.
             aims: What is maximised, of each scenario [S], made of that outcome.
+
+        Returns:
+            By ``phi``, and by each parameter of ``robot.supply.designed()``.
         """
         phi, clip = self.robot.field.phi, self.robot.settings.clip
         part = shares(self.robot, aims)
@@ -130,19 +140,24 @@ class Ensemble:
         )
         _tell(self.processes, _PULL)
         self.processes.broadcast(by_motion)
-        rows = self.processes.gather(self._pulled(by_motion), self.parts)
-        total, self.lost, missing = torch.zeros_like(phi), 0, 0.0
-        for weight, row in zip(part.tolist(), rows, strict=True):
+        by_gamma, *by_timing = (self.processes.gather(rows, self.parts) for rows in self._pulled(by_motion))
+        totals = [torch.zeros_like(one) for one in (phi, *self._timing.values())]
+        self.lost, missing = 0, 0.0
+        for k, weight in enumerate(part.tolist()):
             if weight == 0:
                 continue
-            row = row if by_mass is None else row + weight * by_mass
-            (one,) = torch.autograd.grad(gamma, phi, row, retain_graph=True)
-            norm = float(one.norm())
-            if not math.isfinite(norm):
+            row = by_gamma[k] if by_mass is None else by_gamma[k] + weight * by_mass
+            (by_phi,) = torch.autograd.grad(gamma, phi, row, retain_graph=True)
+            groups = [[by_phi], [rows[k] for rows in by_timing]]
+            norms = [float(torch.cat([one.flatten() for one in group]).norm()) if group else 0.0 for group in groups]
+            if not all(map(math.isfinite, norms)):
                 self.lost, missing = self.lost + 1, missing + weight
                 continue
-            total += one * min(1.0, clip * weight / (norm + 1e-6)) if clip else one
-        return total if missing <= MOST else torch.full_like(total, math.nan)
+            limits = [min(1.0, clip * weight / (norm + 1e-6)) if clip else 1.0 for norm in norms]
+            scaled = [one * limit for group, limit in zip(groups, limits, strict=True) for one in group]
+            for total, one in zip(totals, scaled, strict=True):
+                total += one
+        return totals if missing <= MOST else [torch.full_like(total, math.nan) for total in totals]
 
     def serve(self) -> None:
         """Simulate what process 0 asks for, until it has no more; of the other processes."""
@@ -154,35 +169,47 @@ class Ensemble:
             if task == _END:
                 return
             if task == _PULL:
-                bars = self.processes.broadcast(like.new_empty(self.count, len(JUDGED)))
-                self.processes.gather(self._pulled(bars), self.parts)
+                bars = self.processes.broadcast(like.new_empty(self.count, len(self.judged)))
+                for rows in self._pulled(bars):
+                    self.processes.gather(rows, self.parts)
                 continue
-            gamma = self.processes.broadcast(like.new_empty(self.robot.domain.count))
+            gamma = self._share(like.new_empty(self.robot.domain.count))
             outcome = self._simulated(gamma, self.sample(int(iteration)), gravity_scale, step)
             error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
             if error is None:
                 self.processes.gather(self._values.detach(), self.parts)
+
+    @torch.no_grad()
+    def _share(self, gamma: Tensor) -> Tensor:
+        """The design of process 0: its density [N]; its timing is put into the robot."""
+        for one in self._timing.values():
+            one.copy_(self.processes.broadcast(one.detach()))
+        return self.processes.broadcast(gamma)
 
     @torch.enable_grad()
     def _simulated(
         self, gamma: Tensor, batch: ScenarioBatch, gravity_scale: float, dt: float
     ) -> Outcome | SimulationDiverged:
         """Simulate this process's share; keeps what :meth:`_pulled` goes back through."""
-        self._rows = gamma.expand(len(self._places), -1).clone().requires_grad_()
+        one = (gamma, *(one.detach() for one in self._timing.values()))
+        self._inputs = tuple(value.expand(len(self._places), -1).clone().requires_grad_() for value in one)
+        rows, timing = self._inputs[0], dict(zip(self._timing, self._inputs[1:], strict=True))
+        pressure = self.robot.supply.each(timing) if timing else None
+        how: dict[str, Any] = {"gravity_scale": gravity_scale, "pressure": pressure, "dt": dt}
         try:
-            outcome = self.robot(self._rows, gravity_scale=gravity_scale, scenarios=batch.part(self._places), dt=dt)
+            outcome = self.robot(rows, scenarios=batch.part(self._places), **how)
         except SimulationDiverged as error:
             found = {name: getattr(error, name) for name in ("step", "time", "particle", "quantity", "remedy")}
             return SimulationDiverged(**found, batch=self._places[error.batch])
-        self._values = torch.stack([getattr(outcome, name) for name in JUDGED], 1)[: len(self.own)]
+        self._values = torch.stack([getattr(outcome, name) for name in self.judged], 1)[: len(self.own)]
         return outcome
 
-    def _pulled(self, bars: Tensor) -> Tensor:
-        """Gradient by the density of this process's scenarios [own, N], from that by what is judged of all [S, 5]."""
+    def _pulled(self, bars: Tensor) -> list[Tensor]:
+        """By density and timing of this process's scenarios [own, ...], from the gradient by what is judged [S, n]."""
         mine = bars[self.own.start : self.own.stop]
-        (found,) = torch.autograd.grad(self._values, self._rows, mine)
+        found = torch.autograd.grad(self._values, self._inputs, mine)
         self._values = self._values.detach()
-        return found[: len(self.own)]
+        return [one[: len(self.own)] for one in found]
 
 
 def _tell(processes: Processes, *numbers: float) -> None:

@@ -1,4 +1,4 @@
-"""The design loop: simulate, judge, step; Adam on the design field, an augmented Lagrangian for the limit on C."""
+"""The design loop: simulate, judge, step; Adam on field and timing, an augmented Lagrangian for the limit on C."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from typing import Any
 import torch
 
 from torchsoro.design.ensemble import MOST, Ensemble, fallen, overall, shares
-from torchsoro.design.field import DesignField
 from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
 from torchsoro.design.processes import Processes
 from torchsoro.design.robot import Outcome, Robot
@@ -39,8 +38,8 @@ def simulate(
     steps back still falls, that is what is returned.
 
     Args:
-        robot: Its field is changed where it has to step back.
-        good: Design variable ``phi`` and sharpness ``beta`` of that design.
+        robot: Its field, and a timing that is designed, are changed where it has to step back.
+        good: Of that design (see :func:`design_of`).
         gravity_scale: Share of gravity.
         ensemble: Of the run's scenarios, if it has any.
         iteration: Whose scenarios.
@@ -64,10 +63,21 @@ def simulate(
             if left == 0:
                 raise
         with torch.no_grad():
-            robot.field.phi.lerp_(good["phi"].to(robot.field.phi), 0.5 if left > 1 else 1.0)
+            back = 0.5 if left > 1 else 1.0
+            robot.field.phi.lerp_(good["phi"].to(robot.field.phi), back)
+            if "supply" in good:
+                robot.supply.blend_(good["supply"], back)
         if left == 1:
             robot.field.beta = good["beta"]
     raise AssertionError
+
+
+def design_of(robot: Robot) -> dict[str, Any]:
+    """A copy of the present design: design variable ``phi``, sharpness ``beta``, and ``supply`` if that is designed."""
+    held: dict[str, Any] = {"phi": robot.field.phi.detach().clone(), "beta": robot.field.beta}
+    if robot.supply.designed():
+        held["supply"] = {name: one.detach().clone() for name, one in robot.supply.state_dict().items()}
+    return held
 
 
 def fell(robot: Robot, outcome: Outcome) -> bool:
@@ -83,12 +93,17 @@ def aim(robot: Robot, outcome: Outcome, iteration: int) -> torch.Tensor:
 
     That is travel less falling, and less the mass as a share of the solid body's. A body that stands on one spot has
     next to no gradient by where it ends, whatever its legs; it has one by how far it reaches while it is inflated:
-    ``settings.inflated`` of that counts at first, and nothing once the projection is sharp.
+    ``settings.inflated`` of that counts at first, and nothing once the projection is sharp. What a turner
+    travels is the arc of half its width, :func:`arc`.
     """
     s = robot.settings
     early = 1 - min(1.0, iteration / s.sharpen[1]) if s.sharpen[1] else 1.0
-    whole = torch.lerp(outcome.travel, outcome.soles, s.feet) - s.feet * leaning(outcome.travel, outcome.soles, 1.1)
-    way = torch.lerp(whole, outcome.inflated, s.inflated * early) - s.upright * outcome.fall
+    if s.robot == "turner":
+        whole, inflated = arc(robot, outcome.turn), arc(robot, outcome.turn_inflated)
+    else:
+        whole = torch.lerp(outcome.travel, outcome.soles, s.feet) - s.feet * leaning(outcome.travel, outcome.soles, 1.1)
+        inflated = outcome.inflated
+    way = torch.lerp(whole, inflated, s.inflated * early) - s.upright * outcome.fall
     return way / robot.domain.cell - s.lightness * outcome.mass / robot.full_mass
 
 
@@ -100,10 +115,16 @@ def worth_of(robot: Robot, outcome: Outcome) -> float:
 def worths(robot: Robot, outcome: Outcome) -> torch.Tensor:
     """The same in each scenario [...] m, without a gradient."""
     s = robot.settings
-    way = outcome.travel - s.upright * outcome.fall
-    if s.feet > 0:
+    turns = s.robot == "turner"
+    way = (arc(robot, outcome.turn) if turns else outcome.travel) - s.upright * outcome.fall
+    if s.feet > 0 and not turns:
         way = way - 100 * leaning(outcome.travel, outcome.feet, 1.01)
     return way.detach()
+
+
+def arc(robot: Robot, angle: torch.Tensor) -> torch.Tensor:
+    """Way [m] of a point half a body's width off the axis of a turn by an angle [rad]."""
+    return 0.5 * robot.settings.size[1] * angle
 
 
 def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Tensor:
@@ -146,17 +167,17 @@ class Optimized:
 
 def restore(
     state: dict[str, Any],
-    field: DesignField,
+    robot: Robot,
     adam: torch.optim.Adam,
     lagrangian: Lagrangian,
     path: Path,
 ) -> tuple[bool, dict[str, Any] | None, list[dict[str, Any]]]:
-    """Put a checkpoint's state into field, optimizer and schedule.
+    """Put a checkpoint's state into field, designed timing, optimizer and schedule.
 
     Args:
         state: As saved by :func:`optimize`.
-        field: The design field.
-        adam: The optimizer of its parameter.
+        robot: Whose field and supply are designed.
+        adam: The optimizer of their parameters.
         lagrangian: The schedule.
         path: Folder of the run, for messages.
 
@@ -167,16 +188,28 @@ def restore(
         ValueError: if a part is missing, or of another shape than the lattice.
     """
     where = f"path: {path / 'checkpoint.pt'}"
-    wanted = ("field", "adam", "lagrangian", "stopped", "best", "good")
+    field, timing = robot.field, robot.supply.designed()
+    wanted = ("field", "adam", "lagrangian", "stopped", "best", "good", *(["supply"] if timing else []))
     if missing := [name for name in wanted if name not in state]:
         raise ValueError(f"{where} lacks {', '.join(missing)}, wanted the state of a design run; start another folder")
     try:
-        moments = [value for own in state["adam"]["state"].values() for value in own.values() if value.ndim]
+        moments = [
+            (value, wanted)
+            for own, wanted in zip(state["adam"]["state"].values(), (field.phi, *timing), strict=False)
+            for value in own.values()
+            if value.ndim
+        ]
         best = state["best"]
-        designs = [one["phi"] for one in (state["field"], *state["good"], best) if one is not None] + moments
-        if wrong := [tuple(one.shape) for one in designs if one.shape != field.phi.shape]:
-            raise ValueError(f"a design of shape {wrong[0]}, wanted {tuple(field.phi.shape)}")
+        designs = [one for one in (state["field"], *state["good"], best) if one is not None]
+        pairs = [(one["phi"], field.phi) for one in designs] + moments
+        if timing:
+            supplies = [state["supply"], *(one["supply"] for one in designs[1:])]
+            pairs += [(one[name], own) for one in supplies for name, own in robot.supply.named_parameters()]
+        if wrong := [(tuple(one.shape), tuple(own.shape)) for one, own in pairs if one.shape != own.shape]:
+            raise ValueError(f"a design of shape {wrong[0][0]}, wanted {wrong[0][1]}")
         field.load_state_dict(state["field"])
+        if timing:
+            robot.supply.load_state_dict(state["supply"])
         adam.load_state_dict(state["adam"])
         lagrangian.load_state_dict(state["lagrangian"])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -225,32 +258,33 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
         SimulationDiverged: if the simulation breaks down on a design and on those nearer to the last good one, or if
             gradients overflow again and again and no design is within the limit on C.
     """
-    s, field = robot.settings, robot.field
+    s, field, supply = robot.settings, robot.field, robot.supply
+    timing = supply.designed()
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
     def new_adam() -> torch.optim.Adam:
-        return torch.optim.Adam(field.parameters(), lr=s.learning_rate)
+        groups: list[dict[str, Any]] = [{"params": list(field.parameters()), "lr": s.learning_rate}]
+        return torch.optim.Adam(groups + ([{"params": timing, "lr": s.timing_rate}] if timing else []))
 
     adam = new_adam()
     lagrangian = _schedule(s)
     stopped = False
-    good: list[dict[str, Any]] = [{"phi": field.phi.detach().clone(), "beta": field.beta}]
+    good: list[dict[str, Any]] = [design_of(robot)]
     best: dict[str, Any] | None = None
     ensemble = Ensemble(robot, processes) if s.scenarios else None
     lost = 0  # iterations in a row without a gradient
     folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
     with folder as run:
         if state := run.load():
-            stopped, best, good = restore(state, field, adam, lagrangian, run.path)
+            stopped, best, good = restore(state, robot, adam, lagrangian, run.path)
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             # Steps shrink as the projection sharpens, so that they change the density as before.
             field.beta = s.sharpness(k)
             if isinstance(lagrangian, ExactPenalty):
                 lagrangian.demand(s.sharpened(k))
-            for group in adam.param_groups:
-                group["lr"] = s.learning_rate * s.beta / field.beta
+            adam.param_groups[0]["lr"] = s.learning_rate * s.beta / field.beta
             among: dict[str, Any] = {} if ensemble is None else {"ensemble": ensemble, "iteration": k}
             gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), **among)
             violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
@@ -263,10 +297,13 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             if ensemble is None:
                 (-goal).backward()
             else:
-                field.phi.grad = ensemble.gradient(gamma, aims)
+                for one, gradient in zip((field.phi, *timing), ensemble.gradient(gamma, aims), strict=True):
+                    one.grad = gradient
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
-            design = {"phi": field.phi.detach().clone(), "beta": field.beta}
-            if norm.isfinite():
+            # By itself: a designed timing's few numbers have far larger gradients than each of the field's many.
+            timing_norm = torch.nn.utils.clip_grad_norm_(timing, s.clip or math.inf)
+            design = design_of(robot)
+            if norm.isfinite() and timing_norm.isfinite():
                 lost = 0
                 if not (back or fell(robot, outcome)):
                     good = [*good[1 - KEPT :], design]
@@ -289,8 +326,11 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):
                 best = {"iteration": k, "worth": worth, "violation": excess, **design}
             end = time.perf_counter()
+            timed = {f"supply/{name}": value for name, value in supply.numbers().items()} if timing else {}
+            timed |= {"grad_norm/supply": timing_norm} if timing else {}
             adam.step()
             field.clamp_()
+            supply.clamp_()
             event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
@@ -310,6 +350,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                     "grad_norm/phi": norm,
                     "field/beta": field.beta,
                     "field/gamma_mean": gamma.detach().mean(),
+                    **({"objective/turn": overall(robot, outcome.turn.detach())} if s.robot == "turner" else {}),
+                    **timed,
                     "simulation/dt": outcome.dt,
                     "time/forward": middle - begin,
                     "time/backward": end - middle,
@@ -321,13 +363,16 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                 run.log_histogram("scenarios/L", outcome.travel.detach(), k)
             if observe is not None:
                 observe(run, robot, gamma.detach(), k)
-            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good)
+            more = {"supply": supply} if timing else {}
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good, **more)
             if stopped:
                 break
         if best is not None:
             with torch.no_grad():
                 field.phi.copy_(best["phi"])
             field.beta = best["beta"]
+            if timing:
+                supply.load_state_dict(best["supply"])
         none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
         told = {name: (best or none)[name] for name in none}
         return Optimized(gamma=field().detach(), metrics=run.metrics, **told)

@@ -129,6 +129,33 @@ def mean_stride(way: np.ndarray, time: np.ndarray, *, start: float, period: floa
     return float(last - first) / cycles
 
 
+def yaw(rest: Tensor, place: Tensor, weight: Tensor) -> Tensor:
+    """Angle of the rotation about z that maps points to where they are later with the least weighted square error.
+
+    Kabsch's problem in the plane has the closed form, with x and y relative to their weighted means,
+
+        theta = atan2( sum_p w_p (x_p y'_p - y_p x'_p) , sum_p w_p (x_p x'_p + y_p y'_p) ) .
+
+    Args:
+        rest: Positions at first, m, [..., P, 3].
+        place: Positions later, m, of the same shape.
+        weight: Weights of the points, at least 0, [..., P]; need not add up to one.
+
+    Returns:
+        Angle in (-pi, pi], rad, [...]; positive from x to y, to the left seen from above.
+
+    Raises:
+        ValueError: Shapes do not fit.
+    """
+    if rest.ndim < 2 or rest.shape[-1] != 3 or place.shape != rest.shape or weight.shape[-1:] != rest.shape[-2:-1]:
+        shapes = ", ".join(str(tuple(one.shape)) for one in (rest, place, weight))
+        raise ValueError(f"rest, place, weight: got shapes {shapes}, want [..., P, 3] twice and [..., P]")
+    share = (weight / weight.sum(-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)).unsqueeze(-1)
+    (x, y), (u, v) = ((p - (share * p).sum(-2, keepdim=True)).unbind(-1)[:2] for p in (rest, place))
+    across, along = x * v - y * u, x * u + y * v
+    return torch.atan2((weight * across).sum(-1), (weight * along).sum(-1))
+
+
 def intermediate_density(gamma: Tensor, design: Tensor) -> Tensor:
     """Mean of ``gamma (1 - gamma)`` over the design domain, C of Eq. 15: 0 for black and white, at most 0.25.
 

@@ -95,5 +95,19 @@ _CLIMBER_DESK = dataclasses.replace(
     gravity_every=4,
 )
 
+# Turns to the left with the phases that are designed and to the right with those the other way round.
+_TURNING = {
+    "robot": "turner",
+    "out": Path("runs/turner"),
+    "chambers": 2,
+    "chamber_axis": "y",
+    "timing": ("phase",),
+    # A quarter of a cycle apart: alike, both sides would push a symmetric body straight on, with no gradient to a side.
+    "phases": (0.0, 0.25),
+}
+_TURNER_PAPER = dataclasses.replace(_WALKER_PAPER, **_TURNING)
+_TURNER_DESK = dataclasses.replace(_WALKER_DESK, **_TURNING)
+
 WALKER = {"desk": _WALKER_DESK, "paper": _WALKER_PAPER}
 CLIMBER = {"desk": _CLIMBER_DESK, "paper": _CLIMBER_PAPER}
+TURNER = {"desk": _TURNER_DESK, "paper": _TURNER_PAPER}

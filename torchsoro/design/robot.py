@@ -10,15 +10,17 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchsoro.design.chambers import chambers_of, port_direction, sockets
 from torchsoro.design.density import fill, without_void
-from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
-from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel
+from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel, yaw
 from torchsoro.design.scenarios import ScenarioBatch, leaning_gravity, posed, supplied, varied
-from torchsoro.design.settings import Settings, check_pressure
+from torchsoro.design.settings import Settings
+from torchsoro.design.supply import supply_of
 from torchsoro.errors import SimulationDiverged
-from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
+from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane, ground
 from torchsoro.simulation.formulation import Formulation, formulation_of
 from torchsoro.simulation.loads import PointMass
@@ -38,6 +40,8 @@ class Outcome:
         feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
         soles: The same with all soles, the less the farther off they are, which has a gradient by what touches [m].
         inflated: Travel of the centre of gravity when the valve closes for the first time [m].
+        turn: Angle by which the soles turned about z since the actuation starts, positive to the left [rad].
+        turn_inflated: The same when the valve closes for the first time [rad].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
         fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
@@ -50,6 +54,8 @@ class Outcome:
     feet: Tensor
     soles: Tensor
     inflated: Tensor
+    turn: Tensor
+    turn_inflated: Tensor
     intermediate: Tensor
     mass: Tensor
     fall: Tensor
@@ -59,7 +65,7 @@ class Outcome:
 
 
 class Robot(nn.Module):
-    """A cube with a gas chamber, to be designed; everything follows from the settings.
+    """A cube with one or several gas chambers, to be designed; everything follows from the settings.
 
     Args:
         settings: See :class:`Settings`.
@@ -90,15 +96,11 @@ class Robot(nn.Module):
                 )
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
-        center = (0.0, 0.0, s.size[2] / 2)
-        inside: dict[str, Any] = {"center": center, "size": s.chamber}
-        if s.chamber_mesh is not None:
-            inside = {"shape": read_surface(s.chamber_mesh, UNITS[s.mesh_unit])}
         self.domain = Domain(
             size=s.size,
             particles=s.particles,
             origin=(-half[0], -half[1], 0.0),
-            chambers=(Chamber(name="chamber", wall=s.wall, **inside),),
+            chambers=chambers_of(s, (0.0, 0.0, s.size[2] / 2)),
             body=None if s.body_mesh is None else read_surface(s.body_mesh, UNITS[s.mesh_unit]),
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
@@ -112,14 +114,15 @@ class Robot(nn.Module):
         if s.material is not None:
             found = read_material(s.material)
             self.solid, self.prony = found.solid, found.prony
-        self.pressure = _pressure(s, float(self.solid.youngs_modulus))
+        self.supply = supply_of(s, float(self.solid.youngs_modulus))
         angle = math.atan(s.slope)
         # Uphill along +x, with the ground kept level: gravity leans back instead.
         self.gravity = (-s.gravity * math.sin(angle), 0.0, -s.gravity * math.cos(angle))
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         self.soles = _outermost(self.domain, planes).to(s.target)
-        self.socket = _rear(self.domain, direction).to(s.target)
+        self.port = port_direction(s, direction)
+        self.socket = sockets(self.domain, self.port).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
         self.full_mass = float(everywhere.mass[~self.domain.gas].sum())
@@ -135,6 +138,7 @@ class Robot(nn.Module):
         gravity_scale: float = 1.0,
         everything: bool = False,
         void: bool = True,
+        pressure: Waveform | None = None,
         progress: Callable[[int, int], None] | None = None,
         scenarios: ScenarioBatch | None = None,
         dt: float | None = None,
@@ -147,6 +151,7 @@ class Robot(nn.Module):
             everything: Record every particle (for pictures) and not only the centre of gravity.
             void: Simulate void, too. Without it a finished design takes half the time, for a slightly different motion;
                 in what is recorded, void then moves with the centre of gravity.
+            pressure: Of the chambers, from the start of the simulation; the supply's own if None.
             progress: See :meth:`Simulator.forward`.
             scenarios: To simulate at once, instead of the settings' own one.
             dt: Substep [s], which is not halved where the simulation breaks down; the settings' if None.
@@ -160,7 +165,8 @@ class Robot(nn.Module):
         s = self.settings
         body = self.filled(gamma)
         solid, weight = self.weights(body)
-        trajectory = self._simulate(body, weight, gravity_scale, everything, void, progress, scenarios, dt)
+        pressure = self.pressure if pressure is None else pressure
+        trajectory = self._simulate(body, weight, gravity_scale, everything, void, pressure, progress, scenarios, dt)
         end = s.settle + s.duration
 
         def until(moment: float) -> Tensor:
@@ -174,6 +180,8 @@ class Robot(nn.Module):
             feet=self.feet(trajectory, gamma, near=False),
             soles=self.feet(trajectory, gamma, near=True),
             inflated=until(s.settle + closes),
+            turn=self.turned(trajectory, gamma, end),
+            turn_inflated=self.turned(trajectory, gamma, s.settle + closes),
             intermediate=intermediate_density(gamma, self.design),
             mass=total_mass(solid),
             fall=torch.relu(height[..., 0] - height.amin(-1) - s.sink * s.size[2]),
@@ -199,9 +207,8 @@ class Robot(nn.Module):
             gamma: Density [N].
             near: Count all of those layers, by exp(-2 h / spacing) at a height h above the touch, instead.
         """
-        at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
-        place, probes = trajectory.position[..., at, :], trajectory.probes[at]
-        first = int((trajectory.time - self.settings.settle).abs().argmin())
+        place, probes = self._soles(trajectory)
+        first = self._sample(trajectory, self.settings.settle)
         spacing = self.domain.spacing
         end, begin = place[..., -1, :, :], place[..., first, :, :]
         away = [plane.side * (end[..., plane.axis] - float(plane.offset)) for plane in self.planes]
@@ -210,6 +217,35 @@ class Robot(nn.Module):
         share = gamma[..., probes].clamp(min=0) ** 3 * counts
         moved = (end - begin) @ place.new_tensor(self.direction)
         return (share * moved).sum(-1) / share.sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
+
+    def turned(self, trajectory: Trajectory, gamma: Tensor, moment: float) -> Tensor:
+        """Angle by which the soles turned about z from the start of the actuation to a moment [rad].
+
+        That is the rotation that fits them best (see :func:`torchsoro.design.objective.yaw`); they count by the cube of
+        their density.
+
+        Args:
+            trajectory: With the soles among its probes.
+            gamma: Density [N].
+            moment: Time, s.
+        """
+        place, probes = self._soles(trajectory)
+        first, last = (self._sample(trajectory, t) for t in (self.settings.settle, moment))
+        return yaw(place[..., first, :, :], place[..., last, :, :], gamma[..., probes].clamp(min=0) ** 3)
+
+    def _soles(self, trajectory: Trajectory) -> tuple[Tensor, Tensor]:
+        """Positions over time [..., S, n, 3] m of the layers that face a plane, and their particles [n]."""
+        at = torch.isin(trajectory.probes, self.soles.to(trajectory.probes))
+        return trajectory.position[..., at, :], trajectory.probes[at]
+
+    def _sample(self, trajectory: Trajectory, moment: float) -> int:
+        """The sample nearest to a time [s]."""
+        return int((trajectory.time - moment).abs().argmin())
+
+    @property
+    def pressure(self) -> Waveform:
+        """What the supply gives now, from the start of the simulation, with a gradient by a timing that is designed."""
+        return self.supply()
 
     def filled(self, gamma: Tensor) -> Body:
         """The domain filled with a density [N]."""
@@ -231,6 +267,7 @@ class Robot(nn.Module):
         gravity_scale: float,
         everything: bool,
         void: bool,
+        pressure: Waveform,
         progress: Callable[[int, int], None] | None,
         scenarios: ScenarioBatch | None,
         dt: float | None,
@@ -243,9 +280,10 @@ class Robot(nn.Module):
             body, keep = without_void(body)
             weight, probes = weight[keep], probes[keep[probes]]
         number = keep.cumsum(0) - 1
-        met = {"body": body, **self._surroundings(gravity_scale)}
+        gravity = tuple(gravity_scale * g for g in self.gravity)
+        met: dict[str, Any] = {"body": body, "pressure": pressure, "gravity": gravity, "planes": self.planes}
         if scenarios is not None:
-            met |= self.varied(body, scenarios, number[self.socket], gravity_scale)
+            met |= self.varied(body, scenarios, number[self.socket], pressure, gravity_scale)
         for halving in range(1 if dt else s.halvings + 1):
             try:
                 trajectory = self.simulator(2**halving, dt)(
@@ -265,13 +303,8 @@ class Robot(nn.Module):
                     raise
         raise AssertionError
 
-    def _surroundings(self, gravity_scale: float) -> dict[str, Any]:
-        """What acts on the robot, as the simulator takes it."""
-        gravity = tuple(gravity_scale * g for g in self.gravity)
-        return {"pressure": self.pressure, "gravity": gravity, "planes": self.planes}
-
     def varied(
-        self, body: Body, scenarios: ScenarioBatch, socket: Tensor, gravity_scale: float = 1.0
+        self, body: Body, scenarios: ScenarioBatch, socket: Tensor, pressure: Waveform, gravity_scale: float = 1.0
     ) -> dict[str, Any]:
         """What differs by scenario, as arguments of the simulator; what is not given stays as it is.
 
@@ -279,10 +312,11 @@ class Robot(nn.Module):
             body: Without scenarios.
             scenarios: [S].
             socket: Particles of the body from which the tube hangs [n].
+            pressure: Of the supply.
             gravity_scale: Share of gravity.
         """
         s, b = self.settings, scenarios
-        found: dict[str, Any] = {"body": varied(body, b), "pressure": supplied(self.pressure, b)}
+        found: dict[str, Any] = {"body": varied(body, b), "pressure": supplied(pressure, b)}
         if b.tilt_x is not None or b.tilt_y is not None:
             found["gravity"] = leaning_gravity(gravity_scale * s.gravity, s.slope, b)
         if b.friction is not None:
@@ -330,7 +364,7 @@ class Robot(nn.Module):
 
 def build(settings: Settings) -> Robot:
     """The robot that the settings name."""
-    return {"walker": walker, "climber": climber}[settings.robot](settings)
+    return {"walker": walker, "climber": climber, "turner": turner}[settings.robot](settings)
 
 
 def walker(settings: Settings) -> Robot:
@@ -351,6 +385,28 @@ def climber(settings: Settings) -> Robot:
     return Robot(settings, planes=planes, direction=(0.0, 0.0, 1.0), symmetry=("x", "y"))
 
 
+def turner(settings: Settings) -> Robot:
+    """A walker whose chambers lie side by side in y, mirror images of each other, and which is to turn to the left.
+
+    The body is symmetric: with the supply mirrored it turns as far to the right.
+
+    Raises:
+        ValueError: for a supply that works both sides alike, on which a symmetric body goes straight on.
+    """
+    s = settings
+    if s.chambers < 2 or s.chamber_axis != "y":
+        raise ValueError(
+            f"chambers = {s.chambers}, chamber_axis = {s.chamber_axis!r}: wanted at least 2 along 'y' to turn"
+        )
+    lists = (s.amplitudes, s.phases, s.duties)
+    if all(values == values[::-1] for values in lists):
+        raise ValueError(
+            f"amplitudes, phases, duties = {', '.join(map(str, lists))}: "
+            "wanted some that differ from left to right, or the robot goes straight on"
+        )
+    return walker(settings)
+
+
 def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
     """Particles of the layers that face a plane [n]."""
     place, faces = domain.positions, torch.zeros(domain.count, dtype=torch.bool)
@@ -358,35 +414,3 @@ def _outermost(domain: Domain, planes: tuple[Plane, ...]) -> Tensor:
         along = plane.side * place[:, plane.axis]
         faces |= along < along.min() + 0.5 * domain.spacing
     return faces.nonzero().squeeze(1)
-
-
-def _rear(domain: Domain, direction: tuple[float, float, float]) -> Tensor:
-    """Particles of the chamber walls' rearmost layer, against the travel, where the air port is [n]."""
-    along = domain.positions @ domain.positions.new_tensor(direction)
-    first = along[domain.wall].min()
-    return (domain.wall & (along < first + 0.5 * domain.spacing)).nonzero().squeeze(1)
-
-
-def _pressure(s: Settings, modulus: float) -> Waveform:
-    """Gauge pressure from the start of the simulation: at rest while it settles, then measured or modelled."""
-    if s.pressure_file is None:
-        if s.material is not None:
-            check_pressure("pressure", s.pressure, modulus)
-        return square_wave(
-            amplitude=s.pressure,
-            frequency=s.frequency,
-            duty=s.duty,
-            rise=s.rise,
-            fall=s.fall,
-            start=s.settle,
-            end=s.settle + s.duration,
-        )
-    measured = read_pressure_csv(s.pressure_file)
-    begin, end = float(measured.time[0]), float(measured.time[-1])
-    if abs(begin) > s.sample_every or end < s.duration - s.sample_every:
-        raise ValueError(
-            f"pressure_file = {s.pressure_file}: from {begin:g} to {end:g} s, wanted times that begin with the "
-            f"actuation, at 0, and last for its duration of {s.duration:g} s"
-        )
-    check_pressure(f"pressure_file = {s.pressure_file}, largest", float(measured.pressure.abs().max()), modulus)
-    return Waveform(time=measured.time - measured.time[0] + s.settle, pressure=measured.pressure)

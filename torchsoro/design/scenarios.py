@@ -70,7 +70,7 @@ class ScenarioBatch:
         lag: Time constant of a line behind the supply [s].
         modulus_factor: Factor of the solid's Young's modulus, Maxwell elements included.
         density_factor: Factor of the solid's density.
-        tube_mass: Hangs on the chamber's rear, with inertia and weight [kg].
+        tube_mass: Hangs where the chambers have their air ports, with inertia and weight [kg].
         pitch: Angle about y by which the robot leans forward at the start [degrees].
         roll: Angle about x by which it leans to its right, -y, at the start [degrees].
         drop: Height of its lowest corner at the start, above where the settings put it [m].
@@ -237,7 +237,7 @@ def supplied(supply: Waveform, batch: ScenarioBatch) -> Waveform:
     The lag is tau p' = p_supply - p with p = p_supply at first, exact for a supply that is linear between its samples.
 
     Args:
-        supply: Of the robot, [T] for one chamber or [chambers, T] Pa.
+        supply: Of the robot, [T] for one chamber, [chambers, T], or of each scenario [S, chambers, T] Pa.
         batch: The scenarios.
 
     Returns:
@@ -249,19 +249,17 @@ def supplied(supply: Waveform, batch: ScenarioBatch) -> Waveform:
 
     if batch.pressure_gain is None and batch.lag is None:
         return supply
-    time, pressure = supply.time, supply.pressure
-    if batch.lag is not None:
-        time = _refined(time)
-        pressure = supply.at(time)
+    wave = supply if batch.lag is None else _refined(supply)
+    time, pressure = wave.time, wave.pressure
     pressure = pressure if pressure.ndim > 1 else pressure.unsqueeze(0)
     if batch.pressure_gain is not None:
         pressure = pressure * batch.pressure_gain.to(pressure)[:, None, None]
     if batch.lag is not None:
         pressure = pressure.expand(batch.count, *pressure.shape[-2:])
-        step, tau = time.diff(), batch.lag.to(time)[:, None]
+        step, tau = time.diff(), batch.lag.to(time)[:, None, None]
         keep = torch.exp(-step / torch.maximum(tau, step / PROMPT))
-        early = tau / step * (1 - keep)
-        keep, early = keep.unsqueeze(1).to(pressure), early.unsqueeze(1).to(pressure)
+        early = (tau / step * (1 - keep)).to(pressure)
+        keep = keep.to(pressure)
         push = (early - keep) * pressure[..., :-1] + (1 - early) * pressure[..., 1:]
         first = pressure[..., :1]
         # p' = p - p_supply(0), which begins with zero, so that the recursion has no first value.
@@ -270,16 +268,22 @@ def supplied(supply: Waveform, batch: ScenarioBatch) -> Waveform:
     return Waveform(time=time, pressure=pressure)
 
 
-def _refined(time: Tensor) -> Tensor:
-    """Times with some in between, where they are further apart than ``FINEST``."""
+def _refined(supply: Waveform) -> Waveform:
+    """The same with samples in between, where some chamber's are further apart than ``FINEST``."""
     import torch
 
-    parts = (time.detach().diff() / FINEST - 1e-6).ceil().clamp(min=1).long()
+    steps = supply.time.detach().diff()
+    parts = (steps.reshape(-1, steps.shape[-1]).amax(0) / FINEST - 1e-6).ceil().clamp(min=1).long()
     if bool((parts == 1).all()):
-        return time
+        return supply
     at = torch.repeat_interleave(torch.arange(len(parts)), parts)
-    share = (torch.arange(len(at)) - (parts.cumsum(0) - parts)[at]).to(time) / parts[at]
-    return torch.cat([torch.lerp(time[at], time[at + 1], share), time[-1:]])
+    share = (torch.arange(len(at)) - (parts.cumsum(0) - parts)[at]).to(supply.time) / parts[at]
+
+    def between(values: Tensor) -> Tensor:
+        weight = share.to(values)
+        return torch.cat([torch.lerp(values[..., at], values[..., at + 1], weight), values[..., -1:]], -1)
+
+    return replace(supply, time=between(supply.time), pressure=between(supply.pressure))
 
 
 def _recursion(keep: Tensor, push: Tensor) -> Tensor:

@@ -43,8 +43,8 @@ def cuda_available() -> bool:
 class Settings:
     """Settings of a design run; SI units, z up. The defaults are the paper's walker."""
 
-    robot: Literal["walker", "climber"] = "walker"
-    """On the ground, or between two walls; what the recipe is named after."""
+    robot: Literal["walker", "climber", "turner"] = "walker"
+    """On the ground, between two walls, or turning on the spot; what the recipe is named after."""
     preset: Literal["desk", "paper"] = "paper"
     """Where the other numbers come from before they are overridden: coarse, or the paper's size."""
     out: Path = Path("runs/walker")
@@ -70,6 +70,10 @@ class Settings:
     """Outer edges of the air chamber in the middle [m]."""
     wall: _Length = 0.00175
     """Thickness of the chamber wall [m]."""
+    chambers: Annotated[int, Field(strict=True, ge=1, le=16)] = 1
+    """Chambers side by side in the middle, each with a wall of its own; together they hold the air of the one."""
+    chamber_axis: Literal["x", "y", "z"] = "x"
+    """Axis along which several chambers lie, the first at its lower end."""
     body_mesh: Path | None = None
     """Closed surface of the body within ``size``, whose lower face is at z = 0 and centred at x = y = 0: STL or MSH."""
     chamber_mesh: Path | None = None
@@ -110,6 +114,16 @@ class Settings:
     """Time constant of filling [s]."""
     fall: Positive = 0.025
     """Time constant of venting [s]."""
+    amplitudes: tuple[_Density, ...] = ()
+    """Largest pressure of each of several chambers, as a share of ``pressure``; all 1 if left out."""
+    phases: tuple[_Density, ...] = ()
+    """First opening of the valve of each of several chambers, in cycles after the start; all 0 if left out."""
+    duties: tuple[Share, ...] = ()
+    """Part of a cycle with the valve open, of each of several chambers; ``duty`` if left out."""
+    timing: tuple[Literal["amplitude", "phase", "duty"], ...] = ()
+    """What of each chamber's valve is designed with the body, beginning with what is given; nothing if left out."""
+    timing_rate: Positive = 0.02
+    """Learning rate of a designed timing, whose numbers are shares of pressure and cycle."""
     pressure_file: Path | None = None
     """Measured pressure instead: CSV with columns time_s and pressure_pa, from the start of the actuation."""
 
@@ -147,7 +161,7 @@ class Settings:
     density_range: _Range = (1.0, 1.0)
     """Factor of the solid's density."""
     tube_range: _Range = (0.002, 0.002)
-    """Mass of a supply tube that hangs on the chamber's rear [kg]."""
+    """Mass of a supply tube that hangs on the air ports, in equal parts on those of several chambers [kg]."""
     pitch_range: _Range = (0.0, 0.0)
     """Angle by which the robot leans forward at the start [degrees]."""
     roll_range: _Range = (0.0, 0.0)
@@ -241,7 +255,10 @@ class Settings:
             raise ValueError(
                 f"offset = {self.offset:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
             )
-        cavity = min(self.chamber) - 2 * self.wall
+        self._check_chambers()
+        edges = [edge - 2 * self.wall for edge in self.chamber]
+        edges["xyz".index(self.chamber_axis)] /= self.chambers
+        cavity = min(edges)
         if self.chamber_mesh is None and self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
             low = 0.05 * cavity
             raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
@@ -252,6 +269,17 @@ class Settings:
                 raise ValueError(f"{' and '.join(flags)}: wanted one of them, to go on with a run or to start again")
         if self.device == "cuda" and not cuda_available():
             raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
+
+    def _check_chambers(self) -> None:
+        """Refuse a timing without several chambers, or of another number of them."""
+        for name in ("amplitudes", "phases", "duties"):
+            values = getattr(self, name)
+            if values and self.chambers == 1:
+                raise ValueError(f"{name} = {values}: wanted none for a single chamber, or several chambers (chambers)")
+            if values and len(values) != self.chambers:
+                raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers")
+        if "phase" in self.timing and self.chambers == 1:
+            raise ValueError(f"timing = {self.timing}: wanted no phase for a single chamber, which would only wait")
 
     def _check_units(self) -> None:
         """Refuse what is far from any elastomer and any slope that is walked on."""

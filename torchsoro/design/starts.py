@@ -42,7 +42,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     simulation breaks down is left out as long as another one ends.
 
     Args:
-        robot: What to design; its field is what the first start begins with, and what the best one ends with.
+        robot: What to design; its field and supply are what the first start begins with, and what the best ends with.
         observe: See :func:`torchsoro.design.loop.optimize`; called by several threads on a CPU.
         processes: That share the scenarios of a single start.
 
@@ -94,6 +94,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     best = max(found, key=lambda k: (-max(found[k].violation, 0.0), found[k].worth))
     robot.field.load_state_dict(robots[best].field.state_dict())
     robot.field.beta = robots[best].field.beta
+    robot.supply.load_state_dict(robots[best].supply.state_dict())
     with RunFolder(s.out, dataclasses.asdict(s), overwrite=True) as run:
         for row in _rows(found[best].metrics):
             run.log(int(row.pop("iteration")), row)

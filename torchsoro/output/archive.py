@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,18 +14,21 @@ from torch import Tensor
 
 from torchsoro.design.domain import Domain
 from torchsoro.design.reading import read_settings
+from torchsoro.design.supply import Supply
 from torchsoro.storage import atomic_write
 
 DESIGNS = Path(__file__).resolve().parents[1] / "designs"  # robots that come with the package
 
 
-def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
-    """Write a density with its lattice.
+def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None = None) -> Tensor:
+    """Write a density with its lattice, and the timing of its chambers.
 
     Args:
         path: An .npz file, written as a whole; its folder is made if it is missing.
         domain: The lattice.
         gamma: Density [N], 0 (void) to 1 (material).
+        supply: Whose amplitude [share of the pressure], phase [cycles] and duty [1] of each chamber are part of the
+            design; none if they are not.
 
     Returns:
         The density as it is stored, in float32, in the type and on the device it came in: what to judge and to show.
@@ -36,6 +40,9 @@ def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
         raise ValueError(f"gamma: got shape {tuple(gamma.shape)}, wanted one density per particle, ({domain.count},)")
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = gamma.detach().float()
+    timing: dict[str, Any] = {}
+    if supply is not None:
+        timing = {name: one.detach().numpy() for name, one in supply.named_parameters()}
     with atomic_write(path) as file:
         np.savez_compressed(
             file,
@@ -43,6 +50,7 @@ def save_design(path: Path, domain: Domain, gamma: Tensor) -> Tensor:
             shape=np.array(domain.shape),
             spacing=domain.spacing,
             origin=np.array(domain.origin),
+            **timing,
         )
     return stored.to(gamma)
 
@@ -81,6 +89,30 @@ def load_design(path: Path, domain: Domain) -> Tensor:
             f"path: {path} is on {shape} particles {spacing:g} m apart, wanted {domain.shape} at {domain.spacing:g} m"
         )
     return torch.from_numpy(gamma.astype(np.float32))
+
+
+@torch.no_grad()
+def load_supply(path: Path, supply: Supply) -> None:
+    """Put the timing of a design into a supply whose timing is designed; nothing to do for another.
+
+    Args:
+        path: What :func:`save_design` wrote.
+        supply: Its amplitude, phase and duty are changed.
+
+    Raises:
+        ValueError: if there is no such file, or it lacks the timing of so many chambers.
+    """
+    if not supply.designed():
+        return
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            timing = {name: torch.from_numpy(stored[name]) for name, _ in supply.named_parameters()}
+        if not all(bool(one.isfinite().all()) for one in timing.values()):
+            raise ValueError("numbers that are not finite")
+        supply.load_state_dict(timing)
+    except Exception as error:  # a damaged archive can fail in any way
+        chambers = f"amplitude, phase and duty of {supply.chambers} chambers"
+        raise ValueError(f"path: {path} has no timing ({error}), wanted an .npz with {chambers}") from error
 
 
 def kept_iterations(folder: Path) -> list[int]:

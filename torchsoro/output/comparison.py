@@ -19,7 +19,8 @@ from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Outcome, Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
-from torchsoro.output.archive import find, kept_iterations, load_design, load_shape
+from torchsoro.output.archive import find, kept_iterations, load_design, load_shape, load_supply
+from torchsoro.output.delivery import mean_pressure
 from torchsoro.storage import atomic_write, check_folder, read_json
 
 LONG = 2.0  # s of actuation, where a robot is watched for an extended time
@@ -111,6 +112,7 @@ def perform(folder: Path, base: Settings, check: Check, stage: str) -> tuple[Rob
     robot, coarse = build(s), build(dataclasses.replace(base, device="cpu")).domain
     at = check.iteration
     gamma = load_design(folder / "design.npz", coarse) if at is None else load_shape(folder, coarse, at)
+    load_supply(folder / "design.npz", robot.supply)  # of early designs, too, whose own was not kept
     gamma = finer(gamma, base.particles, check.finer).to(s.target)
     with torch.no_grad(), progress_bar(stage) as progress:
         return robot, gamma, robot(gamma, everything=check.motion, void=check.void, progress=progress)
@@ -130,6 +132,7 @@ def row(robot: Robot, outcome: Outcome, base: Settings, check: Check, seconds: f
         "stride": number(stride),
         "speed": number(stride * s.frequency),
         "fall": float(outcome.fall),
+        **({"turn": float(outcome.turn)} if s.robot == "turner" else {}),
         "dt": outcome.dt,
         "seconds": seconds,
         "time": [round(t, 7) for t in instants.tolist()],
@@ -156,7 +159,7 @@ def keep_motion(path: Path, robot: Robot, gamma: torch.Tensor, outcome: Outcome,
     chosen = sorted({int(np.abs(instants - t).argmin()) for t in wanted})
     rest = robot.domain.positions.to(trajectory.position)
     moved = 1e3 * (trajectory.position[chosen] - rest)
-    supply = robot.pressure.at(trajectory.time[chosen].cpu().to(robot.pressure.time)).numpy().reshape(-1)
+    supply = mean_pressure(robot, trajectory.time[chosen])
     with atomic_write(path) as file:
         np.savez_compressed(
             file,

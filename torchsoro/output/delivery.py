@@ -20,6 +20,7 @@ from torchsoro.design.processes import Processes, joined, world_size
 from torchsoro.design.robot import Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
+from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import save_design
 from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
@@ -72,6 +73,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         "forward": statistics.median(history["time/forward"]),
         "backward": statistics.median(history["time/backward"]),
         "seconds": sum(history["time/iteration"]),
+        **(robot.supply.numbers() if designed_supply(robot) is not None else {}),
     }
     with atomic_write(s.out / "result.json") as file:
         plain = {name: None if math.isnan(value) else value for name, value in found.items()}
@@ -86,6 +88,11 @@ def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -
         show_shape(run, robot, gamma, iteration)
     if iteration % robot.settings.shape_every == 0:
         save_design(run.path / "shapes" / f"{iteration:05d}.npz", robot.domain, gamma)
+
+
+def designed_supply(robot: Robot) -> Supply | None:
+    """The robot's supply if its timing is part of the design."""
+    return robot.supply if robot.supply.designed() else None
 
 
 def report(result: Mapping[str, Any], settings: Settings) -> str:
@@ -113,6 +120,9 @@ def numbers(found: Mapping[str, Any]) -> str:
         stride = f"stride {1e3 * found['stride']:.2f} mm (mean of whole cycles)"
     limit = f"limit {found['C_limit']:g}{'' if found['C_within_limit'] else ' NOT MET'}"
     feet = f"feet {1e3 * found['feet']:.2f} mm, " if found.get("feet") is not None else ""
+    if found.get("turn_left") is not None:
+        left, right = (math.degrees(found[f"turn_{side}"]) for side in ("left", "right"))
+        feet = f"turns {left:.1f} degrees to the left, {right:.1f} to the right, {feet}"
     return f"{feet}{stride}, C = {found['C']:.4f} ({limit}), mass {1e3 * found['mass']:.2f} g"
 
 
@@ -156,7 +166,8 @@ def deliver(
     Raises:
         ValueError: if the design has no connected body to print; the design and the movie are written before.
     """
-    s, gamma = robot.settings, save_design(path / "design.npz", robot.domain, gamma)
+    s = robot.settings
+    gamma = save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot))
     found = None
     if s.scenarios:
         with progress_bar(f"{s.scenarios} scenarios") as progress:
@@ -195,7 +206,8 @@ def show(
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
-        whether it is met, mass [kg]; and the printable part.
+        whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
+        [rad]; and the printable part.
 
     Raises:
         ValueError: if the design has no connected body to print; movie and motion are written before.
@@ -218,9 +230,13 @@ def show(
         "C_within_limit": bool(outcome.intermediate <= s.c_max * (1 + 1e-4)),
         "mass": float(outcome.mass),
     }
+    if s.robot == "turner":
+        with progress_bar(f"simulating {name}, supply mirrored") as progress:
+            other = robot(gamma, void=void, pressure=robot.supply(mirrored=True), progress=progress)
+        found |= {"turn_left": float(outcome.turn), "turn_right": -float(other.turn)}
     begin = np.array([np.interp(s.settle, time, component) for component in center.T])
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
-    supply = robot.pressure.at(trajectory.time.cpu().to(robot.pressure.time)).numpy().reshape(-1)
+    supply = mean_pressure(robot, trajectory.time)
     width, height = parse_resolution(s.resolution)
     shown = {
         "domain": robot.domain,
@@ -230,7 +246,10 @@ def show(
         "tilt": math.degrees(math.atan(s.slope)),
     }
     print(f"writing {path / name}.mp4", file=sys.stderr, flush=True)
-    title = f"{name}: travel L = {1e3 * found['L']:.2f} mm in {s.duration:g} s"
+    way = f"travel L = {1e3 * found['L']:.2f} mm"
+    if s.robot == "turner":
+        way = f"turns by {math.degrees(found['turn_left']):.1f} degrees to the left"
+    title = f"{name}: {way} in {s.duration:g} s"
     movie(
         path / f"{name}.mp4",
         **shown,
@@ -269,6 +288,13 @@ def show(
     return found, part
 
 
+@torch.no_grad()
+def mean_pressure(robot: Robot, time: torch.Tensor) -> np.ndarray:
+    """Gauge pressure of the supply at some times [S] Pa, the mean over the chambers."""
+    pressure = robot.pressure
+    return pressure.at(time.cpu().to(pressure.time)).reshape(-1, len(time)).mean(0).numpy()
+
+
 def record(
     path: Path,
     name: str,
@@ -299,9 +325,8 @@ def record(
 
 
 def print_part(robot: Robot, density: np.ndarray) -> Part:
-    """The printable part, with an air port at the rear: against the travel, or downward for a climber."""
+    """The printable part, with the robot's air ports."""
     s = robot.settings
-    rear = tuple(-d for d in robot.direction)
     cavity = min(c - 2 * s.wall for c in robot.domain.chambers[0].size)
-    port = AirPort(direction=(rear[0], rear[1], rear[2]), diameter=s.port or 0.4 * cavity)
+    port = AirPort(direction=robot.port, diameter=s.port or 0.4 * cavity)
     return fabricate(robot.domain, density, density=s.density, offset=s.offset, port=port)

@@ -19,7 +19,7 @@ from torchsoro.design.ensemble import Evaluation, evaluate
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.design.scenarios import LIMITS, NOMINAL
-from torchsoro.output.archive import find, load_design
+from torchsoro.output.archive import find, load_design, load_supply
 from torchsoro.output.delivery import spread_line
 from torchsoro.output.page import canvas_of, heading, pixels, plain, scenario_panel
 from torchsoro.output.scene import INK, REST
@@ -76,6 +76,7 @@ def compare_scenarios(
     step: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
     built = build(dataclasses.replace(s, **step))
     gamma = load_design(folder / "design.npz", built.domain).to(s.target)
+    load_supply(folder / "design.npz", built.supply)
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # the threads of the kernels do the work
     chosen = s.scenario_seed + UNSEEN if seed is None else seed

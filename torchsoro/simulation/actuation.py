@@ -9,6 +9,7 @@ import csv
 import dataclasses
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -22,7 +23,8 @@ class Waveform:
     """Pressure samples, linear in between and constant before the first and after the last.
 
     Args:
-        time: Sample times, s, strictly increasing, floating point [S] with S >= 2.
+        time: Sample times, s, strictly increasing, floating point [S] with S >= 2; or [chambers, S], of each chamber
+            its own, or [batch, chambers, S].
         pressure: Gauge pressure at these times, Pa, floating point [..., S]; leading axes are, for example, chambers.
             May require a gradient.
 
@@ -39,11 +41,15 @@ class Waveform:
             if not isinstance(value, Tensor) or not value.is_floating_point():
                 kind = value.dtype if isinstance(value, Tensor) else type(value).__name__
                 raise ValueError(f"{name}: got {kind}, want a floating-point tensor")
-        if self.time.ndim != 1 or len(self.time) < 2:
-            raise ValueError(f"time: got shape {tuple(self.time.shape)}, want [S] with at least 2 samples")
-        if self.pressure.ndim == 0 or self.pressure.shape[-1] != len(self.time):
+        own = self.time.ndim in (2, 3) and self.pressure.shape[-self.time.ndim :] == self.time.shape
+        if not (self.time.ndim == 1 or own) or self.time.shape[-1] < 2:
             raise ValueError(
-                f"pressure: got shape {tuple(self.pressure.shape)}, want [..., {len(self.time)}] as in time"
+                f"time: got shape {tuple(self.time.shape)}, want [S] with at least 2 samples, or [chambers, S] as in "
+                "pressure"
+            )
+        if self.pressure.ndim == 0 or self.pressure.shape[-1] != self.time.shape[-1]:
+            raise ValueError(
+                f"pressure: got shape {tuple(self.pressure.shape)}, want [..., {self.time.shape[-1]}] as in time"
             )
         if self.pressure.device != self.time.device:
             raise ValueError(f"pressure: got device {self.pressure.device}, want {self.time.device} as in time")
@@ -52,8 +58,9 @@ class Waveform:
                 raise ValueError(f"{name}: got a value that is not finite, want finite numbers")
         steps = self.time.detach().diff()
         if not bool((steps > 0.0).all()):
-            sample = int((steps <= 0.0).nonzero()[0]) + 1
-            before, after = self.time[sample - 1].item(), self.time[sample].item()
+            *row, sample = (steps <= 0.0).nonzero()[0].tolist()
+            sample, times = sample + 1, self.time[tuple(row)]
+            before, after = times[sample - 1].item(), times[sample].item()
             raise ValueError(
                 f"time: got {after:.9g} s in sample {sample} after {before:.9g} s, want strictly increasing times"
             )
@@ -73,12 +80,45 @@ class Waveform:
         if not isinstance(t, Tensor) or not t.is_floating_point() or t.ndim != 1:
             seen = f"{t.dtype} {tuple(t.shape)}" if isinstance(t, Tensor) else repr(t)
             raise ValueError(f"t: got {seen}, want a floating-point tensor [T]")
-        after = torch.searchsorted(self.time.detach(), t.detach().to(self.time.dtype), right=True)
-        after = after.clamp(1, len(self.time) - 1)
-        begin, end = self.time[after - 1], self.time[after]
+        wanted = t.detach().to(self.time.dtype).expand(*self.time.shape[:-1], len(t)).contiguous()
+        after = torch.searchsorted(self.time.detach().contiguous(), wanted, right=True)
+        after = after.clamp(1, self.time.shape[-1] - 1)
+        begin, end = _samples(self.time, after - 1), _samples(self.time, after)
         weight = ((t - begin) / (end - begin)).clamp(0.0, 1.0).to(self.pressure.dtype)
         # lerp is exact at both ends, which p0 + w (p1 - p0) is not.
-        return torch.lerp(self.pressure[..., after - 1], self.pressure[..., after], weight)
+        return torch.lerp(_samples(self.pressure, after - 1), _samples(self.pressure, after), weight)
+
+
+def _samples(values: Tensor, index: Tensor) -> Tensor:
+    """Samples [..., T] of values [..., S] at indices [T], or at those of each chamber [chambers, T]."""
+    if index.ndim == 1:
+        return values[..., index]
+    return values.gather(-1, index.expand(*values.shape[:-1], index.shape[-1]))
+
+
+def side_by_side(waveforms: Sequence[Waveform]) -> Waveform:
+    """Waveforms of one chamber each, [S], as one of all chambers, [chambers, S], each with its own sample times.
+
+    A shorter one goes on with its last pressure, which it has after its last sample anyway: every millisecond, which is
+    no coarser than a lag behind it is computed with.
+
+    Args:
+        waveforms: One for each chamber.
+
+    Raises:
+        ValueError: There is none, or one has the pressures of several chambers.
+    """
+    if not waveforms or any(one.pressure.ndim != 1 for one in waveforms):
+        shapes = [tuple(one.pressure.shape) for one in waveforms]
+        raise ValueError(f"waveforms: got pressures of shapes {shapes}, want at least one, each [S]")
+    longest = max(len(one.time) for one in waveforms)
+    times, pressures = [], []
+    for one in waveforms:
+        more = longest - len(one.time)
+        later = 1e-3 * (1 + torch.arange(more, dtype=one.time.dtype, device=one.time.device))  # s after the last
+        times.append(torch.cat([one.time, one.time[-1].detach() + later]))
+        pressures.append(torch.cat([one.pressure, one.pressure[-1].expand(more)]))
+    return Waveform(time=torch.stack(times), pressure=torch.stack(pressures))
 
 
 def square_wave(

@@ -1,0 +1,61 @@
+"""The chambers of a robot: where they lie in the body, where their air ports leave it, what hangs there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.mesh import UNITS, read_surface
+from torchsoro.design.settings import Settings
+
+
+def chambers_of(s: Settings, center: tuple[float, float, float]) -> tuple[Chamber, ...]:
+    """The chambers of the settings around a place: a surface, one box, or several side by side along an axis.
+
+    Each of several has its share of the cavity's length and a wall of its own all around, so that together they hold
+    the air of the one, and their box is longer by two walls for each that is added. The lattice checks their places.
+
+    Raises:
+        ValueError: for several chambers of a surface.
+    """
+    if s.chamber_mesh is not None:
+        if s.chambers > 1:
+            raise ValueError(f"chambers = {s.chambers}: wanted 1 with a chamber_mesh, which is a single chamber")
+        return (Chamber(name="chamber", wall=s.wall, shape=read_surface(s.chamber_mesh, UNITS[s.mesh_unit])),)
+    if s.chambers == 1:
+        return (Chamber(name="chamber", center=center, size=s.chamber, wall=s.wall),)
+    axis = "xyz".index(s.chamber_axis)
+    each = (s.chamber[axis] - 2 * s.wall) / s.chambers + 2 * s.wall
+    size = tuple(each if a == axis else edge for a, edge in enumerate(s.chamber))
+    made = []
+    for k in range(s.chambers):
+        shift = (k - (s.chambers - 1) / 2) * each
+        place = tuple(c + shift * (a == axis) for a, c in enumerate(center))
+        made.append(Chamber(name=f"chamber {k + 1}", center=_triple(place), size=_triple(size), wall=s.wall))
+    return tuple(made)
+
+
+def port_direction(s: Settings, travel: tuple[float, float, float]) -> tuple[float, float, float]:
+    """From each chamber to its air port: to the rear, which is against the travel, or downward for a climber.
+
+    Where one of several chambers is behind the others, the ports go upward instead, or sideways.
+    """
+    if s.chambers > 1 and travel["xyz".index(s.chamber_axis)]:
+        return (0.0, 1.0, 0.0) if s.chamber_axis == "z" else (0.0, 0.0, 1.0)
+    return _triple(tuple(-d for d in travel))
+
+
+def sockets(domain: Domain, direction: tuple[float, float, float]) -> Tensor:
+    """Particles of each chamber wall's outermost layer in the direction of the air port, where tubes hang [n]."""
+    along = domain.positions @ domain.positions.new_tensor(direction)
+    found = torch.zeros_like(domain.wall)
+    for index in range(len(domain.chambers)):
+        shell = domain.shell(index)
+        found |= shell & (along > along[shell].max() - 0.5 * domain.spacing)
+    return found.nonzero().squeeze(1)
+
+
+def _triple(values: tuple[float, ...]) -> tuple[float, float, float]:
+    x, y, z = values
+    return x, y, z
