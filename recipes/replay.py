@@ -90,7 +90,8 @@ def main(chosen: Options) -> dict[str, float]:
     settle = chosen.settle if base.settle > 0 else 0.0
     robot = build(dataclasses.replace(base, duration=duration, settle=settle))
     out = chosen.out or Path("runs/replay") / folder.name
-    check_folder("out", out, (f"{folder.name}.mp4", "motion.npz", "motion.html", "shape.stl", "shape.json"))
+    written = ("motion.npz", "motion.html", "shape.stl", "shape.3mf", "shape.json")
+    check_folder("out", out, (f"{folder.name}.mp4", *written))
     gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
     archive.load_supply(folder / "design.npz", robot.supply)
     out.mkdir(parents=True, exist_ok=True)

@@ -69,6 +69,7 @@ def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run
         "motion.npz",
         "motion.html",
         "shape.stl",
+        "shape.3mf",
         "shape.json",
     }
     assert json.loads((tmp_path / "shape.json").read_text())["mass_g"] == part.report.mass_g

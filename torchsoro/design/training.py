@@ -52,7 +52,16 @@ _ABSENT = "absent"
 _EVENTS = "events.out.tfevents.*"
 _WRITTEN = ("settings.json", "metrics.csv", "checkpoint.pt", "amendments.json", _EVENTS)
 # What is delivered and kept of a run beside that, to be deleted before another one.
-_DELIVERED = ("result.json", "design.npz", "summary.png", "shape.stl", "shape.json", "motion.npz", "motion.html")
+_DELIVERED = (
+    "result.json",
+    "design.npz",
+    "summary.png",
+    "shape.stl",
+    "shape.3mf",
+    "shape.json",
+    "motion.npz",
+    "motion.html",
+)
 _DELIVERED += ("walker.mp4", "climber.mp4", "turner.mp4")
 _PARTS = {"iteration": int, "settings": dict, "rng_cpu": torch.Tensor, "rng_cuda": list, "items": dict}
 

@@ -23,10 +23,12 @@ from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import save_design
-from torchsoro.output.fabricate import AirPort, Part, fabricate, surface
+from torchsoro.output.fabricate import fabricate, surface
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
+from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
+from torchsoro.output.port import AirPort
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
 from torchsoro.storage import atomic_write
@@ -192,7 +194,8 @@ def show(
     """Simulate a gait with every particle recorded, and write what people look at and print.
 
     Files: ``<name>.mp4``, ``motion.npz`` and ``motion.html`` (the motion, for recipes/view.py and for a browser), with
-    a history ``summary.png``, and ``shape.stl`` with ``shape.json`` (what the part weighs and how thin it gets).
+    a history ``summary.png``, and ``shape.stl`` and ``shape.3mf`` with ``shape.json`` (what the part weighs and how
+    thin it gets).
 
     Args:
         path: Folder to write to.
@@ -207,7 +210,7 @@ def show(
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
         whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
-        [rad]; and the printable part.
+        [rad], thinnest wall and gap of the part [m] (NaN if there is none); and the printable part.
 
     Raises:
         ValueError: if the design has no connected body to print; movie and motion are written before.
@@ -282,7 +285,10 @@ def show(
             scenarios=None if scenarios is None else scenarios.travel,
         )
     part = print_part(robot, density)
+    found["thinnest_wall"] = 1e-3 * part.report.thinnest_wall_mm
+    found["thinnest_gap"] = 1e-3 * part.report.thinnest_gap_mm
     part.save(path / "shape.stl")
+    part.save(path / "shape.3mf")
     with atomic_write(path / "shape.json") as file:
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
     return found, part

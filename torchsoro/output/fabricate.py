@@ -13,145 +13,18 @@ spacing outside of the outermost particle centres.
 from __future__ import annotations
 
 import math
-import os
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
 from scipy import ndimage
 
-from torchsoro.output import levelset
+from torchsoro.output import levelset, thickness
 from torchsoro.output.levelset import as_array
-from torchsoro.storage import atomic_write
+from torchsoro.output.part import Part, PartReport
+from torchsoro.output.port import AirPort, away_from_ports, check_port, with_sleeve
 
 if TYPE_CHECKING:
-    from torchsoro.design.domain import Chamber, Domain
-
-_SUFFIXES = (".stl", ".ply", ".obj")
-_AXES = "x, y, z of the simulation; z up"
-
-
-@dataclass(frozen=True, kw_only=True)
-class AirPort:
-    """A straight round hole from the middle of each chamber to the outside.
-
-    Attributes:
-        direction: unit vector along a coordinate axis, from the chamber outwards; (-1, 0, 0) is the rear of the walker.
-        diameter: of the hole [m].
-    """
-
-    direction: tuple[float, float, float] = (-1.0, 0.0, 0.0)
-    diameter: float
-
-    def __post_init__(self) -> None:
-        """Refuse what is not an axis or not a hole."""
-        if sorted(abs(float(c)) for c in self.direction) != [0.0, 0.0, 1.0]:
-            raise ValueError(f"direction: got {self.direction}, want a unit vector along an axis, such as (-1, 0, 0)")
-        if not (math.isfinite(self.diameter) and self.diameter > 0):
-            raise ValueError(f"diameter: got {self.diameter} m, want a positive length")
-
-    @property
-    def axis(self) -> int:
-        """The coordinate axis of the hole (0, 1 or 2)."""
-        return int(np.argmax(np.abs(self.direction)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class PartReport:
-    """What the printer's operator wants to know about a part.
-
-    Attributes:
-        mass_g: volume times density [g].
-        volume_mm3: volume of the material [mm^3].
-        size_mm: edge lengths of the bounding box [mm].
-        cavity_volume_mm3: volume of the chambers' cavities at rest, without the port [mm^3].
-        port_open: whether air can flow from every cavity to the outside.
-        islands_removed: volumes of the isolated pieces that were left out, largest first [mm^3].
-        enclosed_voids: volumes of other hollows without an opening, which would trap resin, largest first [mm^3].
-        thinnest_wall_mm: the thinnest wall by ray casting [mm]: from each surface triangle straight inwards to the
-            next surface. Only
-            pairs of surfaces within 45 degrees of parallel count (a sharp rim is not a wall), and the thinnest 0.1 %
-            of the area are left out as noise of the triangulation. NaN if nothing counts.
-        thickness_percentiles_mm: the same thickness by surface area: percent to mm.
-        watertight: every edge has two triangles.
-        manifold: watertight, consistently wound and with positive volume.
-        bodies: number of separate solid pieces.
-        euler_number: of the surface; 2 for a body that is a ball or a bottle, 2 more for each closed hollow, 2 less
-            for each handle.
-        voxel_mm: edge length of the grid that the surface was extracted on [mm].
-        units: of the mesh.
-        axes: of the mesh.
-    """
-
-    mass_g: float
-    volume_mm3: float
-    size_mm: tuple[float, float, float]
-    cavity_volume_mm3: float
-    port_open: bool
-    islands_removed: tuple[float, ...]
-    enclosed_voids: tuple[float, ...]
-    thinnest_wall_mm: float
-    thickness_percentiles_mm: dict[int, float]
-    watertight: bool
-    manifold: bool
-    bodies: int
-    euler_number: int
-    voxel_mm: float
-    units: str = "mm"
-    axes: str = _AXES
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, for a JSON file."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        """A few lines for the terminal."""
-        islands = ", ".join(f"{v:.3g}" for v in self.islands_removed) or "none"
-        lines = [
-            f"{' x '.join(f'{s:.2f}' for s in self.size_mm)} {self.units} ({self.axes})",
-            f"mass {self.mass_g:.2f} g, material {self.volume_mm3:.0f} mm3, cavity {self.cavity_volume_mm3:.0f} mm3",
-            f"thinnest wall {self.thinnest_wall_mm:.2f} mm (ray casting)",
-            f"isolated pieces removed [mm3]: {islands}",
-            f"watertight: {self.watertight}, manifold: {self.manifold}, bodies: {self.bodies}, "
-            f"air port open: {self.port_open}",
-        ]
-        if self.enclosed_voids:
-            lines.append(f"closed hollows that trap resin [mm3]: {', '.join(f'{v:.3g}' for v in self.enclosed_voids)}")
-        return "\n".join(lines)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Part:
-    """A printable part.
-
-    Attributes:
-        mesh: closed surface in mm, z up, in the coordinates of the simulation.
-        report: mass, thickness and what was checked.
-    """
-
-    mesh: trimesh.Trimesh = field(repr=False)
-    report: PartReport
-
-    def save(self, path: str | os.PathLike[str]) -> Path:
-        """Write the mesh as .stl (binary, units in the header), .ply or .obj; the file is there whole or not at all.
-
-        Raises:
-            ValueError: for another suffix or a folder that does not exist.
-        """
-        path = Path(path)
-        if path.suffix.lower() not in _SUFFIXES:
-            raise ValueError(f"path: got {str(path)!r}, want a suffix among {', '.join(_SUFFIXES)}")
-        if not path.parent.is_dir():
-            raise ValueError(f"path: got {str(path)!r}, want a folder that exists")
-        data: Any = (
-            _stl(self.mesh) if path.suffix.lower() == ".stl" else self.mesh.export(file_type=path.suffix[1:].lower())
-        )
-        data = data.encode() if isinstance(data, str) else data
-        with atomic_write(path) as file:
-            file.write(data)
-        return path
+    from torchsoro.design.domain import Domain
 
 
 def fabricate(
@@ -199,7 +72,7 @@ def fabricate(
     if refine is not None and not (isinstance(refine, int) and 2 <= refine <= 32):
         raise ValueError(f"refine: got {refine}, want a whole number from 2 to 32")
     if port is not None:
-        _check_port(domain, port)
+        check_port(domain, port)
     spacing = float(domain.spacing)
     if refine is None:
         refine = max(2, math.ceil(60 / max(domain.particles)))
@@ -219,11 +92,13 @@ def fabricate(
     _check_design(domain, values, level, body, refine, pad)
     if offset > 0:
         body = levelset.grow(body, offset, step)
+    if port is not None and port.sleeve > 0:
+        body = with_sleeve(domain, port, body, start, step)
     # Equal and opposite on both sides of the cavity's planes, so that the surface lies on them.
     rim = ndimage.binary_dilation(gas, np.ones((3, 3, 3), dtype=bool)) & ~gas
     shape = np.where(gas, -step / 2, np.where(rim, np.minimum(body, step / 2), body))
     if port is not None:
-        shape = np.minimum(shape, _port(domain, port, shape.shape, start, step))
+        shape = np.minimum(shape, away_from_ports(domain, port, shape.shape, start, step))
         shape, cut = levelset.keep_connected(shape, fine & ~(shape < 0), step)  # the hole may have cut off a rim
         islands = islands + cut
 
@@ -234,8 +109,9 @@ def fabricate(
         raise ValueError(f"port: got {port}, want one that opens every cavity to the outside")
     hollows = np.bincount(empty.ravel())
     known = {0, int(empty[0, 0, 0]), *np.unique(empty[gas]).tolist()}
-    thickness, area = levelset.thickness_by_rays(mesh, shape, start, step)
-    thinnest = levelset.quantile(thickness, area, 0.001)
+    lengths, area = thickness.walls(mesh, shape, start, step)
+    thinnest = thickness.thinnest(lengths, area, step)
+    gap = thickness.thinnest(*thickness.gaps(mesh, shape, start, step), step)
     if minimum_thickness is not None and thinnest < minimum_thickness * 1e3 * (1 - 1e-6):
         raise ValueError(
             f"minimum_thickness: got a thinnest wall of {thinnest * 1e-3:.3g} m, "
@@ -256,11 +132,13 @@ def fabricate(
             sorted((float(n) * (step * 1e3) ** 3 for i, n in enumerate(hollows) if i not in known), reverse=True)
         ),
         thinnest_wall_mm=thinnest,
-        thickness_percentiles_mm={p: levelset.quantile(thickness, area, p / 100) for p in (1, 5, 25, 50, 75, 95)},
+        thinnest_gap_mm=gap,
+        thickness_percentiles_mm={p: thickness.quantile(lengths, area, p / 100) for p in (1, 5, 25, 50, 75, 95)},
         watertight=watertight,
         manifold=watertight and bool(mesh.is_winding_consistent) and volume > 0,
         bodies=sum(1 for shell in shells if shell.volume > 0),
         euler_number=int(mesh.euler_number),
+        port=None if port is None else str(port),
         voxel_mm=step * 1e3,
     )
     if not report.manifold or report.bodies != 1:
@@ -318,30 +196,6 @@ def _density(domain: Domain, gamma: Any) -> np.ndarray:
     return np.where(as_array(domain.outside), 0.0, values)
 
 
-def _check_port(domain: Domain, port: AirPort) -> None:
-    if not domain.chambers:
-        raise ValueError("port: got one for a domain without a chamber, want None")
-    across = [a for a in range(3) if a != port.axis]
-    for chamber in domain.chambers:
-        room = min(chamber.size[a] for a in across) - 2 * chamber.wall
-        if port.diameter > room:
-            raise ValueError(
-                f"port.diameter: got {port.diameter} m, want at most {room:.4g} m, the cavity of {chamber.name!r}"
-            )
-        for other in domain.chambers:
-            if other is not chamber and _runs_into(chamber, other, port):
-                raise ValueError(
-                    f"port.direction: got {port.direction}, by which the port of {chamber.name!r} "
-                    f"runs into chamber {other.name!r}"
-                )
-
-
-def _runs_into(chamber: Chamber, other: Chamber, port: AirPort) -> bool:
-    apart = [abs(other.center[a] - chamber.center[a]) for a in range(3)]
-    beside = any(apart[a] > (other.size[a] + port.diameter) / 2 for a in range(3) if a != port.axis)
-    return not beside and (other.center[port.axis] - chamber.center[port.axis]) * port.direction[port.axis] > 0
-
-
 def _check_design(domain: Domain, values: np.ndarray, level: float, body: np.ndarray, refine: int, pad: int) -> None:
     """Refuse a design of which nothing hangs on the chamber wall (or, without a chamber, a design that is nothing)."""
     design = as_array(domain.design)
@@ -356,24 +210,3 @@ def _check_design(domain: Domain, values: np.ndarray, level: float, body: np.nda
             f"gamma: got no connected body: of {int((design & (values >= level)).sum())} design particles at or above "
             f"level {level} none {place}, want a design that hangs together (more iterations, or a lower level)"
         )
-
-
-def _port(domain: Domain, port: AirPort, shape: tuple[int, ...], start: np.ndarray, step: float) -> np.ndarray:
-    """Distance to the ports, positive outside of them [m]."""
-    result = np.full(shape, np.inf)
-    axes = [start[a] + step * np.arange(shape[a]) for a in range(3)]
-    for chamber in domain.chambers:
-        x = np.meshgrid(*[axes[a] - chamber.center[a] for a in range(3)], indexing="ij", sparse=True)
-        radial = np.sqrt(sum(x[a] ** 2 for a in range(3) if a != port.axis)) - port.diameter / 2
-        ahead = x[port.axis] * port.direction[port.axis] >= 0
-        result = np.minimum(result, np.where(ahead, radial, np.inf))
-    return result
-
-
-def _stl(mesh: trimesh.Trimesh) -> bytes:
-    """Binary STL with units and axes in its header."""
-    record = np.zeros(len(mesh.faces), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    record["normal"] = mesh.face_normals
-    record["corners"] = mesh.triangles
-    header = f"torchsoro; units mm; axes {_AXES}".encode("ascii").ljust(80)
-    return header + np.uint32(len(record)).astype("<u4").tobytes() + record.tobytes()

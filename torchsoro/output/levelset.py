@@ -8,7 +8,6 @@ points.
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -123,50 +122,3 @@ def march(values: np.ndarray, start: np.ndarray, step: float) -> trimesh.Trimesh
     # Lorensen's table: skimage's Lewiner variant leaves open edges where voxels touch diagonally.
     vertices, faces, _, _ = marching_cubes(values, 0.0, method="lorensen", gradient_direction="ascent")
     return trimesh.Trimesh((vertices * step + start) * 1e3, faces, process=False)
-
-
-def thickness_by_rays(
-    mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Ray casting from each triangle inwards to the opposite surface.
-
-    Returns the thicknesses [mm] between surfaces within 45 degrees of parallel, and the areas [mm^2] that have them.
-    """
-    at = (np.asarray(mesh.triangles_center) * 1e-3 - start) / step
-    inward = -np.asarray(mesh.face_normals)
-    stride = 0.5  # grid points
-    limited = np.clip(shape, -step, step) / step
-    thickness = np.full(len(at), np.nan)
-    alive = np.flatnonzero(np.asarray(mesh.area_faces) > 0)
-    before = np.ones(len(alive))
-    for k in range(1, 1 + int(np.linalg.norm(shape.shape) / stride)):
-        if not len(alive):
-            break
-        value = ndimage.map_coordinates(limited, (at[alive] + (k * stride) * inward[alive]).T, order=1, mode="nearest")
-        out = (value < 0) & (k > 1)
-        share = np.clip(before[out] / np.maximum(before[out] - value[out], 1e-12), 0, 1)
-        thickness[alive[out]] = stride * (k - 1 + share)
-        before, alive = np.maximum(value[~out], 1e-9), alive[~out]
-    hit = np.flatnonzero(np.isfinite(thickness))
-    where = at[hit] + thickness[hit, None] * inward[hit]
-    ends = [0.5 * np.eye(3)[a] for a in range(3)]
-    slope = np.stack(
-        [
-            ndimage.map_coordinates(limited, (where + e).T, order=1, mode="nearest")
-            - ndimage.map_coordinates(limited, (where - e).T, order=1, mode="nearest")
-            for e in ends
-        ],
-        axis=1,
-    )
-    slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-    facing = -(slope * inward[hit]).sum(axis=1) >= math.cos(math.pi / 4)
-    return thickness[hit][facing] * step * 1e3, np.asarray(mesh.area_faces)[hit][facing]
-
-
-def quantile(values: np.ndarray, weights: np.ndarray, share: float) -> float:
-    """The value below which this share of the weight lies; NaN without values."""
-    if not len(values):
-        return math.nan
-    order = np.argsort(values)
-    total = np.cumsum(weights[order])
-    return float(values[order][min(int(np.searchsorted(total, share * total[-1])), len(order) - 1)])
