@@ -45,6 +45,8 @@ class Options:
     """Pictures of the movie per second."""
     follow: bool = False
     """Let the movie's camera follow the robot."""
+    min_wall: AtLeastZero | None = None
+    """Thickness up to which thin walls are mended [m]; as in the robot's settings if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute."""
     archive: Path | None = None
@@ -68,7 +70,7 @@ def main(chosen: Options) -> dict[str, float]:
     from torchsoro.design.reading import read_settings
     from torchsoro.design.robot import build
     from torchsoro.output import archive
-    from torchsoro.output.delivery import numbers, show
+    from torchsoro.output.delivery import mending_line, numbers, show
     from torchsoro.storage import check_folder
 
     if chosen.archive is not None:
@@ -88,11 +90,13 @@ def main(chosen: Options) -> dict[str, float]:
     # At least one sample, so that even a small part of a cycle can be simulated.
     duration = max(1, round(chosen.cycles / base.frequency / base.sample_every)) * base.sample_every
     settle = chosen.settle if base.settle > 0 else 0.0
-    robot = build(dataclasses.replace(base, duration=duration, settle=settle))
+    min_wall = base.min_wall if chosen.min_wall is None else chosen.min_wall
+    robot = build(dataclasses.replace(base, duration=duration, settle=settle, min_wall=min_wall))
     out = chosen.out or Path("runs/replay") / folder.name
     written = ("motion.npz", "motion.html", "shape.stl", "shape.3mf", "shape.json")
     check_folder("out", out, (f"{folder.name}.mp4", *written))
-    gamma = archive.load_design(folder / "design.npz", robot.domain).to(robot.settings.target)
+    # Mended anew, for a part and a motion of the same walls.
+    gamma = archive.load_design(folder / "design.npz", robot.domain, mended=False).to(robot.settings.target)
     archive.load_supply(folder / "design.npz", robot.supply)
     out.mkdir(parents=True, exist_ok=True)
     if robot.settings.target.type == "cpu":
@@ -101,6 +105,7 @@ def main(chosen: Options) -> dict[str, float]:
     print(f"{folder.name}, {chosen.cycles:g} cycles: travel {1e3 * found['L']:.2f} mm; {numbers(found)}")
     if (then := designed.get("stride")) is not None:
         print(f"in the design run, over all of its cycles and with void: stride {1e3 * then:.2f} mm")
+    print(mending_line(found), end="")
     print(f"printable part: {part.report}\nmovie and STL are in {out}")
     return found
 

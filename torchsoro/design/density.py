@@ -32,6 +32,20 @@ def simp(gamma: Tensor, *, epsilon: Number = 1e-5, power: Number = 3.0) -> Tenso
     return (1 - epsilon) * gamma**power + epsilon
 
 
+def thickened(gamma: Tensor, added: Tensor, power: float) -> Tensor:
+    """The density of a design to which solid is added, so that its mass grows by that of the solid.
+
+    Args:
+        gamma: Density in [0, 1] [N].
+        added: Share of each particle's cell that is filled with solid [N].
+        power: Of :func:`simp`.
+
+    Returns:
+        Density [N], at most 1: (gamma^power + added)^(1 / power), and ``gamma`` itself where nothing is added.
+    """
+    return torch.where(added > 0, (gamma**power + added).clamp(max=1) ** (1 / power), gamma)
+
+
 VOID_DRAG = 1e3  # drag over mass of void, and of the air in a chamber [1/s]
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
+from torchsoro.design.limits import check_pressure, points_across
 from torchsoro.design.scenarios import LIMITS, Scenarios, check_friction, check_range
 
 if TYPE_CHECKING:
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 _SOFTEST = 1e3  # Pa; below the softest gels, so that a smaller modulus is one in another unit
 _STEEPEST = 2.0  # rise over run, 63 degrees; a larger slope is one in percent or degrees
-_LEAST_STRAIN = 1e-3  # pressure over modulus, below which nothing moves that could be seen
 _LEAST_SAMPLES = 2  # of a cycle
 # Memory of a run, for an estimate [bytes]: of a particle (state, density filter, fields), of a recorded position and
 # velocity and what is drawn from them, of a substep (times, pressure, gravity).
@@ -238,6 +238,8 @@ class Settings:
     """Let the movie's camera follow the robot."""
     offset: AtLeastZero = 0.0
     """Thickness added to the outer surface of the printed part [m]."""
+    min_wall: AtLeastZero = 0.0
+    """Thickness up to which thin walls of the printed part are mended [m]; 0 leaves them as they are designed."""
     port: AtLeastZero = 0.0
     """Diameter of the air port [m]; 0 for two fifths of the cavity's edge."""
 
@@ -255,6 +257,12 @@ class Settings:
             raise ValueError(
                 f"offset = {self.offset:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
             )
+        if self.min_wall > 0.25 * min(self.size):
+            raise ValueError(
+                f"min_wall = {self.min_wall:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
+            )
+        if self.min_wall > 0:
+            points_across(self.min_wall, self.size[0] / self.particles[0], max(self.particles))
         self._check_chambers()
         edges = [edge - 2 * self.wall for edge in self.chamber]
         edges["xyz".index(self.chamber_axis)] /= self.chambers
@@ -394,23 +402,15 @@ class Settings:
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
         here = ("out", "resume", "amend", "overwrite", "iterations", "starts", "device", "memory")
-        return (*here, "picture_every", "shape_every", "frames", "resolution", "fps", "follow", "offset", "port")
-
-
-def check_pressure(name: str, largest: float, modulus: float) -> None:
-    """Refuse a pressure that does not deform the body, or that no elastomer of this modulus would stand.
-
-    Args:
-        name: How to call it in the message.
-        largest: Largest magnitude of the pressure [Pa].
-        modulus: Young's modulus of the solid [Pa].
-
-    Raises:
-        ValueError: if pressure over modulus is below 0.001 or above 100.
-    """
-    low, high = _LEAST_STRAIN * modulus, 100 * modulus
-    if not low <= largest <= high:
-        raise ValueError(
-            f"{name} = {largest:g} Pa: wanted from {low:.3g} to {high:.3g} Pa on a Young's modulus of {modulus:g} Pa; "
-            "80 kPa is 80000, 0.44 MPa is 440000"
+        return (
+            *here,
+            "picture_every",
+            "shape_every",
+            "frames",
+            "resolution",
+            "fps",
+            "follow",
+            "offset",
+            "min_wall",
+            "port",
         )

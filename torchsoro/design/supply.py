@@ -8,7 +8,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from torchsoro.design.settings import Settings, check_pressure
+from torchsoro.design.limits import check_pressure
+from torchsoro.design.settings import Settings
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, side_by_side, square_wave
 
 # Part of a cycle that a designed valve is open, at least and at most [1]: at 5 Hz a tenth of a cycle is 20 ms, about

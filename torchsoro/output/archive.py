@@ -20,8 +20,10 @@ from torchsoro.storage import atomic_write
 DESIGNS = Path(__file__).resolve().parents[1] / "designs"  # robots that come with the package
 
 
-def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None = None) -> Tensor:
-    """Write a density with its lattice, and the timing of its chambers.
+def save_design(
+    path: Path, domain: Domain, gamma: Tensor, supply: Supply | None = None, mended: Tensor | None = None
+) -> Tensor:
+    """Write a density with its lattice, the timing of its chambers, and the density with thin walls mended.
 
     Args:
         path: An .npz file, written as a whole; its folder is made if it is missing.
@@ -29,6 +31,7 @@ def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None
         gamma: Density [N], 0 (void) to 1 (material).
         supply: Whose amplitude [share of the pressure], phase [cycles] and duty [1] of each chamber are part of the
             design; none if they are not.
+        mended: Density [N] of the part that is delivered, if its walls have been mended.
 
     Returns:
         The density as it is stored, in float32, in the type and on the device it came in: what to judge and to show.
@@ -40,9 +43,11 @@ def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None
         raise ValueError(f"gamma: got shape {tuple(gamma.shape)}, wanted one density per particle, ({domain.count},)")
     path.parent.mkdir(parents=True, exist_ok=True)
     stored = gamma.detach().float()
-    timing: dict[str, Any] = {}
+    more: dict[str, Any] = {}
     if supply is not None:
-        timing = {name: one.detach().numpy() for name, one in supply.named_parameters()}
+        more = {name: one.detach().numpy() for name, one in supply.named_parameters()}
+    if mended is not None:
+        more["mended"] = mended.detach().float().cpu().numpy()
     with atomic_write(path) as file:
         np.savez_compressed(
             file,
@@ -50,17 +55,18 @@ def save_design(path: Path, domain: Domain, gamma: Tensor, supply: Supply | None
             shape=np.array(domain.shape),
             spacing=domain.spacing,
             origin=np.array(domain.origin),
-            **timing,
+            **more,
         )
     return stored.to(gamma)
 
 
-def load_design(path: Path, domain: Domain) -> Tensor:
+def load_design(path: Path, domain: Domain, *, mended: bool = True) -> Tensor:
     """Read what :func:`save_design` wrote.
 
     Args:
         path: The file.
         domain: The lattice that it has to be on.
+        mended: The density of the part that is delivered, if its walls have been mended.
 
     Returns:
         Density [N], float32; files of float16, as they were once written, are read as well.
@@ -72,7 +78,8 @@ def load_design(path: Path, domain: Domain) -> Tensor:
         raise ValueError(f"path: there is no file {path}, wanted a design (.npz)")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            gamma, shape = stored["gamma"], tuple(int(n) for n in stored["shape"])
+            gamma = stored["mended" if mended and "mended" in stored else "gamma"]
+            shape = tuple(int(n) for n in stored["shape"])
             spacing = float(stored["spacing"])
         if gamma.dtype not in (np.float16, np.float32, np.float64):
             raise ValueError(f"densities of type {gamma.dtype}")

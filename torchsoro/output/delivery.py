@@ -14,10 +14,11 @@ import numpy as np
 import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
+from torchsoro.design.density import thickened
 from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
-from torchsoro.design.objective import mean_stride
+from torchsoro.design.objective import intermediate_density, mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
-from torchsoro.design.robot import Robot
+from torchsoro.design.robot import Outcome, Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
@@ -101,7 +102,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     """What :func:`design` returned, in a few lines."""
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
-        f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n"
+        f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -170,13 +171,33 @@ def deliver(
     """
     s = robot.settings
     gamma = save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot))
+    part, delivered = mended(robot, gamma)
+    if part is not None:
+        save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot), delivered)
     found = None
     if s.scenarios:
         with progress_bar(f"{s.scenarios} scenarios") as progress:
             batch = s.distribution.sample(s.scenarios, s.scenario_seed)
-            found = evaluate(robot, gamma, batch, progress=progress)
-    shown = show(path, robot, gamma, history=history, chosen=chosen, name=name, scenarios=found)[0]
+            found = evaluate(robot, delivered, batch, progress=progress)
+    shown = show(path, robot, gamma, history=history, chosen=chosen, name=name, scenarios=found, part=part)[0]
     return shown if found is None else {**shown, **found.numbers()}
+
+
+def mended(robot: Robot, gamma: torch.Tensor, part: Part | None = None) -> tuple[Part | None, torch.Tensor]:
+    """The printable part of a design whose settings ask for a least wall, and the density of that part.
+
+    Args:
+        robot: The robot.
+        gamma: Density of the design [N].
+        part: The part, if it has been made already.
+
+    Returns:
+        None and the design's density, where no least wall is asked for.
+    """
+    if not robot.settings.min_wall:
+        return None, gamma
+    part = part or print_part(robot, gamma.cpu().numpy())
+    return part, thickened(gamma, torch.from_numpy(part.added).to(gamma), robot.settings.power)
 
 
 @torch.no_grad()
@@ -190,6 +211,7 @@ def show(
     chosen: int | None = None,
     void: bool = True,
     scenarios: Evaluation | None = None,
+    part: Part | None = None,
 ) -> tuple[dict[str, float], Part]:
     """Simulate a gait with every particle recorded, and write what people look at and print.
 
@@ -206,37 +228,44 @@ def show(
         chosen: Iteration of that run that the design is of; the last if None.
         void: Simulate void, too.
         scenarios: What the design does in its scenarios, for the summary.
+        part: Of a design whose settings ask for a least wall, if it has been made already.
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
         whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
-        [rad], thinnest wall and gap of the part [m] (NaN if there is none); and the printable part.
+        [rad], thinnest wall and gap of the part [m] (NaN if there is none), of one whose walls were to be mended what
+        :func:`told_of` says; and the printable part. All but C are those of the part with its walls mended.
 
     Raises:
         ValueError: if the design has no connected body to print; movie and motion are written before.
     """
     s = robot.settings
+    part, delivered = mended(robot, gamma, part)
     with progress_bar(f"simulating {name}") as progress:
-        outcome = robot(gamma, everything=True, void=void, progress=progress)
-    density = gamma.cpu().numpy()
+        outcome = robot(delivered, everything=True, void=void, progress=progress)
+    density = delivered.cpu().numpy()
     trajectory = outcome.trajectory
     frames = trajectory.position.cpu().numpy()
     time = trajectory.time.cpu().double().numpy()
     center = trajectory.center_of_gravity.cpu().double().numpy()
+    intermediate = intermediate_density(gamma, robot.design)
     found = {
         "L": float(outcome.travel),
         "feet": float(outcome.feet),
         "stride": mean_stride(center @ np.array(robot.direction), time, start=s.settle, period=1 / s.frequency),
-        "C": float(outcome.intermediate),
+        "C": float(intermediate),
         "C_limit": s.c_max,
         # Rounding differs between the run's device and this one.
-        "C_within_limit": bool(outcome.intermediate <= s.c_max * (1 + 1e-4)),
+        "C_within_limit": bool(intermediate <= s.c_max * (1 + 1e-4)),
         "mass": float(outcome.mass),
     }
     if s.robot == "turner":
         with progress_bar(f"simulating {name}, supply mirrored") as progress:
-            other = robot(gamma, void=void, pressure=robot.supply(mirrored=True), progress=progress)
+            other = robot(delivered, void=void, pressure=robot.supply(mirrored=True), progress=progress)
         found |= {"turn_left": float(outcome.turn), "turn_right": -float(other.turn)}
+    if part is not None:
+        with progress_bar(f"simulating {name}, not mended") as progress:
+            found |= told_of(part, robot(gamma, void=void, progress=progress))
     begin = np.array([np.interp(s.settle, time, component) for component in center.T])
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = mean_pressure(robot, trajectory.time)
@@ -284,7 +313,7 @@ def show(
             note=numbers(found),
             scenarios=None if scenarios is None else scenarios.travel,
         )
-    part = print_part(robot, density)
+    part = part or print_part(robot, density)
     found["thinnest_wall"] = 1e-3 * part.report.thinnest_wall_mm
     found["thinnest_gap"] = 1e-3 * part.report.thinnest_gap_mm
     part.save(path / "shape.stl")
@@ -292,6 +321,41 @@ def show(
     with atomic_write(path / "shape.json") as file:
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
     return found, part
+
+
+def told_of(part: Part, plain: Outcome) -> dict[str, float]:
+    """What is told of a part with mended walls, and of its design without.
+
+    Args:
+        part: The part.
+        plain: What the design does without.
+
+    Returns:
+        Wanted wall [m], whether it is met, the wall before [m], volume added [m3] and as a share, travel before [m].
+    """
+    done = part.report.mended
+    assert done is not None
+    return {
+        "min_wall": 1e-3 * done.min_wall_mm,
+        "min_wall_met": done.met,
+        "thinnest_wall_before": 1e-3 * done.thinnest_wall_before_mm,
+        "mended_volume": 1e-9 * done.volume_mm3,
+        "mended_share": done.share,
+        "L_before": float(plain.travel),
+    }
+
+
+def mending_line(found: Mapping[str, Any]) -> str:
+    """What mending the walls has changed, in a line; empty where none was asked for."""
+    if "min_wall" not in found:
+        return ""
+    walls = [1e3 * found[name] for name in ("min_wall", "thinnest_wall_before", "thinnest_wall")]
+    missed = "" if found["min_wall_met"] else " NOT MET"
+    return (
+        f"walls mended to {walls[0]:.2f} mm{missed}: thinnest {walls[1]:.2f} mm before, {walls[2]:.2f} mm now, by "
+        f"{1e9 * found['mended_volume']:.1f} mm3 ({100 * found['mended_share']:.2f} %); "
+        f"travel {1e3 * found['L_before']:.2f} mm before, {1e3 * found['L']:.2f} mm now\n"
+    )
 
 
 @torch.no_grad()
@@ -335,4 +399,5 @@ def print_part(robot: Robot, density: np.ndarray) -> Part:
     s = robot.settings
     cavity = min(c - 2 * s.wall for c in robot.domain.chambers[0].size)
     port = AirPort(direction=robot.port, diameter=s.port or 0.4 * cavity)
-    return fabricate(robot.domain, density, density=s.density, offset=s.offset, port=port)
+    how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.min_wall}
+    return fabricate(robot.domain, density, port=port, **how)

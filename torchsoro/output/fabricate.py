@@ -13,14 +13,16 @@ spacing outside of the outermost particle centres.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
 
-from torchsoro.output import levelset, thickness
+from torchsoro.design.limits import points_across
+from torchsoro.output import levelset, mend, thickness
 from torchsoro.output.levelset import as_array
-from torchsoro.output.part import Part, PartReport
+from torchsoro.output.part import Mended, Part, PartReport
 from torchsoro.output.port import AirPort, away_from_ports, check_port, with_sleeve
 
 if TYPE_CHECKING:
@@ -36,6 +38,7 @@ def fabricate(
     offset: float = 0.0,
     port: AirPort | None = None,
     minimum_thickness: float | None = None,
+    min_wall: float = 0.0,
     refine: int | None = None,
 ) -> Part:
     """Turn a density field into one closed, printable body.
@@ -53,14 +56,17 @@ def fabricate(
         offset: how far the outer surface is moved outwards [m].
         port: the air port; None leaves the cavity closed.
         minimum_thickness: the thinnest wall that the printer can make [m]; None only reports it.
-        refine: grid points per particle and axis; None takes about 60 along the longest side, and at least 2.
+        min_wall: thickness up to which thin walls are mended, within the box of the body grown by the offset, and the
+            port gets a sleeve, if any is thin [m]; 0 leaves them as they are (see :mod:`torchsoro.output.mend`).
+        refine: grid points per particle and axis; None takes about 60 along the longest side, and at least 2; at least
+            four across ``min_wall``.
 
     Returns:
         The part, in mm.
 
     Raises:
         ValueError: for arguments out of range, for a design without a connected body on the chamber wall, for a port
-            that does not fit, and for a wall below ``minimum_thickness``.
+            that does not fit, for a ``min_wall`` too thin for the grid, and for a wall below ``minimum_thickness``.
     """
     values = _density(domain, gamma)
     _positive("density", density, "kg/m3")
@@ -74,10 +80,14 @@ def fabricate(
     if port is not None:
         check_port(domain, port)
     spacing = float(domain.spacing)
+    if not (math.isfinite(min_wall) and min_wall >= 0):
+        raise ValueError(f"min_wall: got {min_wall} m, want 0 or a positive length")
     if refine is None:
         refine = max(2, math.ceil(60 / max(domain.particles)))
         if port is not None:  # at least four grid points across the hole
             refine = min(32, max(refine, math.ceil(4 * spacing / port.diameter)))
+        if min_wall > 0:
+            refine = max(refine, points_across(min_wall, spacing, max(domain.particles)))
     step = spacing / refine
     if port is not None and port.diameter < 2 * step:
         raise ValueError(
@@ -96,11 +106,27 @@ def fabricate(
         body = with_sleeve(domain, port, body, start, step)
     # Equal and opposite on both sides of the cavity's planes, so that the surface lies on them.
     rim = ndimage.binary_dilation(gas, np.ones((3, 3, 3), dtype=bool)) & ~gas
-    shape = np.where(gas, -step / 2, np.where(rim, np.minimum(body, step / 2), body))
-    if port is not None:
-        shape = np.minimum(shape, away_from_ports(domain, port, shape.shape, start, step))
-        shape, cut = levelset.keep_connected(shape, fine & ~(shape < 0), step)  # the hole may have cut off a rim
-        islands = islands + cut
+    hole = None if port is None else away_from_ports(domain, port, body.shape, start, step)
+
+    def hollowed(body: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
+        shape = np.where(gas, -step / 2, np.where(rim, np.minimum(body, step / 2), body))
+        if hole is None:
+            return shape, ()
+        shape = np.minimum(shape, hole)
+        return levelset.keep_connected(shape, fine & ~(shape < 0), step)  # the hole may have cut off a rim
+
+    shape, cut = plain, _ = hollowed(body)
+    if min_wall > 0 and mend.thin_walls(plain, min_wall, start, step) is not None:
+        if port is not None:  # a hole that cuts through limbs leaves shreds, which would be mended one by one
+            wide = replace(port, sleeve=max(port.sleeve, min_wall + mend.LARGEST * step))
+            body = with_sleeve(domain, wide, body, start, step)
+        taken = gas | levelset.nearest(domain, as_array(domain.outside), refine, pad)
+        low = np.asarray(domain.origin, dtype=float) - offset
+        high = low + np.asarray(domain.size) + 2 * offset
+        free = mend.clearance(taken, low, high, start, step)
+        free = free if hole is None else np.minimum(free, hole)
+        shape, cut = hollowed(mend.mend(body, lambda one: hollowed(one)[0], free, min_wall, start, step))
+    islands = islands + cut
 
     mesh = levelset.march(shape, start, step)
     empty, _ = levelset.pieces(shape <= 0)
@@ -140,10 +166,32 @@ def fabricate(
         euler_number=int(mesh.euler_number),
         port=None if port is None else str(port),
         voxel_mm=step * 1e3,
+        mended=None if min_wall == 0 else _mended(min_wall, plain, thinnest, volume, start, step),
     )
     if not report.manifold or report.bodies != 1:
         raise RuntimeError(f"the surface is not one closed body; please report this with the density field:\n{report}")
-    return Part(mesh=mesh, report=report)
+    return Part(mesh=mesh, report=report, added=_added(domain, plain, shape, refine, pad))
+
+
+def _mended(
+    min_wall: float, plain: np.ndarray, thinnest: float, volume: float, start: np.ndarray, step: float
+) -> Mended:
+    """What mending did to the part of this level-set function [m], whose wall [mm] and volume [mm3] are now these."""
+    before = levelset.march(plain, start, step)
+    return Mended(
+        min_wall_mm=1e3 * min_wall,
+        met=not thinnest < 1e3 * (min_wall - thickness.TOLERANCE * step),
+        thinnest_wall_before_mm=thickness.thinnest(*thickness.walls(before, plain, start, step), step),
+        volume_mm3=volume - float(before.volume),
+        share=volume / float(before.volume) - 1,
+    )
+
+
+def _added(domain: Domain, plain: np.ndarray, shape: np.ndarray, refine: int, pad: int) -> np.ndarray:
+    """Share of each particle's cell that is solid in a part and was not in the plain one [N]."""
+    new = ((shape > 0) & ~(plain > 0))[pad:-pad, pad:-pad, pad:-pad]
+    nx, ny, nz = domain.particles
+    return new.reshape(nx, refine, ny, refine, nz, refine).mean(axis=(1, 3, 5)).ravel()
 
 
 def surface(

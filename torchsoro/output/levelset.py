@@ -97,21 +97,33 @@ def keep_connected(body: np.ndarray, anchor: np.ndarray, step: float) -> tuple[n
 
 def grow(body: np.ndarray, offset: float, step: float) -> np.ndarray:
     """Grow the body: the true distance to its triangles, wherever the new surface can be."""
+    return distances(body, np.ones(body.shape, dtype=bool), step, offset) + offset
+
+
+def distances(body: np.ndarray, where: np.ndarray, step: float, reach: float) -> np.ndarray:
+    """The true distance to the body's triangles [m], positive inside: up to two voxels there, up to a reach outside.
+
+    Args:
+        body: The body.
+        where: The grid points for which it is asked, bool; others get its sign.
+        step: Between grid points [m].
+        reach: Outside of the body [m].
+    """
     mesh = march(body, np.zeros(3), step)
     corners = np.asarray(mesh.triangles) * 1e-3
     inside = body > 0
-    reach = np.where(inside, 2.0 * step, offset + 2.5 * step)
+    limit = np.where(inside, 2.0 * step, reach + 2.5 * step)
     to_outside, to_inside = (np.asarray(ndimage.distance_transform_edt(mask)) for mask in (inside, ~inside))
-    band = to_outside + to_inside <= reach / step
+    band = where & (to_outside + to_inside <= limit / step)
     points = np.argwhere(band) * step
     _, near = KDTree(corners.mean(axis=1)).query(points, k=min(8, len(corners)))
     distance = np.full(len(points), np.inf)
     for column in np.asarray(near).reshape(len(points), -1).T:
         closest = trimesh.triangles.closest_point(corners[column], points)
         distance = np.minimum(distance, np.linalg.norm(closest - points, axis=1))
-    grown = np.where(inside, offset + 2.0 * step, -2.0 * step)
-    grown[band] = offset + np.where(inside[band], distance, -distance)
-    return grown
+    found = np.where(inside, 2.0 * step, -2.0 * step - reach)
+    found[band] = np.where(inside[band], distance, -distance)
+    return found
 
 
 def march(values: np.ndarray, start: np.ndarray, step: float) -> trimesh.Trimesh:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import trimesh
 
 from torchsoro.output import meshfile
@@ -14,6 +15,32 @@ from torchsoro.storage import atomic_write
 
 _SUFFIXES = (".stl", ".3mf", ".ply", ".obj")
 _AXES = "x, y, z of the simulation; z up"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Mended:
+    """What mending did to thin walls.
+
+    Attributes:
+        min_wall_mm: the wanted thickness [mm].
+        met: whether the thinnest wall is that thick now, to a fiftieth of a voxel.
+        thinnest_wall_before_mm: the thinnest wall without mending, on the same grid [mm].
+        volume_mm3: material that was added [mm^3].
+        share: the same as a share of the material before.
+    """
+
+    min_wall_mm: float
+    met: bool
+    thinnest_wall_before_mm: float
+    volume_mm3: float
+    share: float
+
+    def __str__(self) -> str:
+        """A line for the terminal."""
+        return (
+            f"walls mended to {self.min_wall_mm:.2f} mm from {self.thinnest_wall_before_mm:.2f} mm"
+            f"{'' if self.met else ', NOT MET'}: {self.volume_mm3:.0f} mm3 added, {100 * self.share:.1f} %"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +68,7 @@ class PartReport:
             for each handle.
         port: axis, diameter and sleeve of the air port, in words; None without one.
         voxel_mm: edge length of the grid that the surface was extracted on [mm].
+        mended: what was done to thin walls; None if no thickness was asked for.
         units: of the mesh.
         axes: of the mesh.
     """
@@ -61,6 +89,7 @@ class PartReport:
     euler_number: int
     port: str | None
     voxel_mm: float
+    mended: Mended | None = None
     units: str = "mm"
     axes: str = _AXES
 
@@ -79,6 +108,8 @@ class PartReport:
             f"watertight: {self.watertight}, manifold: {self.manifold}, bodies: {self.bodies}, "
             f"air port open: {self.port_open}",
         ]
+        if self.mended is not None:
+            lines.insert(3, str(self.mended))
         if self.enclosed_voids:
             lines.append(f"closed hollows that trap resin [mm3]: {', '.join(f'{v:.3g}' for v in self.enclosed_voids)}")
         return "\n".join(lines)
@@ -91,10 +122,12 @@ class Part:
     Attributes:
         mesh: closed surface in mm, z up, in the coordinates of the simulation.
         report: mass, thickness and what was checked.
+        added: share of each particle's cell that mending filled [N].
     """
 
     mesh: trimesh.Trimesh = field(repr=False)
     report: PartReport
+    added: np.ndarray = field(repr=False)
 
     @property
     def notes(self) -> dict[str, str]:

@@ -8,6 +8,7 @@ count: at a sharp rim both tend to zero, which is neither a wall nor a gap.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
@@ -17,6 +18,7 @@ from scipy import ndimage
 # port in a wall of two voxels is 6 % thinner over four of them.
 PATCH = 6.0
 _STRIDE = 0.5  # along a ray, in grid points
+TOLERANCE = 0.02  # what a wall may be thinner than wanted, in grid points: as near as the surface comes to a grid point
 
 
 def walls(mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -31,7 +33,42 @@ def walls(mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: flo
     Returns:
         Thickness [mm], and area [mm2], of the triangles that have one.
     """
-    return _rays(mesh, shape, start, step, -np.asarray(mesh.face_normals))
+    which, length = _rays(mesh, shape, start, step, -np.asarray(mesh.face_normals))
+    return 1e3 * length, np.asarray(mesh.area_faces)[which]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Thin:
+    """Rays across walls that are thinner than a length.
+
+    Attributes:
+        middle: Of each [n, 3] m.
+        way: Unit vector along it, from its triangle inwards [n, 3].
+        length: [n] m.
+        area: Of its triangle [n] mm2.
+    """
+
+    middle: np.ndarray
+    way: np.ndarray
+    length: np.ndarray
+    area: np.ndarray
+
+
+def thin(mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: float, length: float) -> Thin:
+    """Where the part is thinner than a length.
+
+    Args:
+        mesh: See :func:`walls`.
+        shape: See :func:`walls`.
+        start: See :func:`walls`.
+        step: See :func:`walls`.
+        length: [m].
+    """
+    way = -np.asarray(mesh.face_normals)
+    which, found = _rays(mesh, shape, start, step, way, length)
+    which, found = which[found < length], found[found < length]
+    middle = 1e-3 * np.asarray(mesh.triangles_center)[which] + 0.5 * found[:, None] * way[which]
+    return Thin(middle=middle, way=way[which], length=found, area=np.asarray(mesh.area_faces)[which])
 
 
 def gaps(mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
@@ -46,19 +83,26 @@ def gaps(mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: floa
     Returns:
         Width [mm], and area [mm2], of the triangles that have one.
     """
-    return _rays(mesh, -shape, start, step, np.asarray(mesh.face_normals))
+    which, length = _rays(mesh, -shape, start, step, np.asarray(mesh.face_normals))
+    return 1e3 * length, np.asarray(mesh.area_faces)[which]
 
 
 def _rays(
-    mesh: trimesh.Trimesh, shape: np.ndarray, start: np.ndarray, step: float, way: np.ndarray
+    mesh: trimesh.Trimesh,
+    shape: np.ndarray,
+    start: np.ndarray,
+    step: float,
+    way: np.ndarray,
+    longest: float = math.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Length [mm] of rays from the triangles' middles through where the function is positive, and the areas [mm2]."""
+    """Triangles from whose middles a ray through where the function is positive ends, and its length [m]."""
     at = (np.asarray(mesh.triangles_center) * 1e-3 - start) / step
     limited = np.clip(shape, -step, step) / step
     length = np.full(len(at), np.nan)
     alive = np.flatnonzero(np.asarray(mesh.area_faces) > 0)
     before = np.ones(len(alive))
-    for k in range(1, 1 + int(np.linalg.norm(shape.shape) / _STRIDE)):
+    most = min(float(np.linalg.norm(shape.shape)), longest / step + 1)
+    for k in range(1, 1 + int(most / _STRIDE)):
         if not len(alive):
             break
         place = at[alive] + (k * _STRIDE) * way[alive]
@@ -81,7 +125,7 @@ def _rays(
     )
     slope /= np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     facing = -(slope * way[hit]).sum(axis=1) >= math.cos(math.pi / 4)
-    return length[hit][facing] * step * 1e3, np.asarray(mesh.area_faces)[hit][facing]
+    return hit[facing], length[hit][facing] * step
 
 
 def thinnest(lengths: np.ndarray, areas: np.ndarray, step: float) -> float:
