@@ -57,7 +57,7 @@ def fabricate(
         port: the air port; None leaves the cavity closed.
         minimum_thickness: the thinnest wall that the printer can make [m]; None only reports it.
         min_wall: thickness up to which thin walls are mended, within the box of the body grown by the offset, and the
-            port gets a sleeve, if any is thin [m]; 0 leaves them as they are (see :mod:`torchsoro.output.mend`).
+            port gets a sleeve, if that is not enough [m]; 0 leaves them as they are (see :mod:`torchsoro.output.mend`).
         refine: grid points per particle and axis; None takes about 60 along the longest side, and at least 2; at least
             four across ``min_wall``.
 
@@ -117,15 +117,20 @@ def fabricate(
 
     shape, cut = plain, _ = hollowed(body)
     if min_wall > 0 and mend.thin_walls(plain, min_wall, start, step) is not None:
-        if port is not None:  # a hole that cuts through limbs leaves shreds, which would be mended one by one
-            wide = replace(port, sleeve=max(port.sleeve, min_wall + mend.LARGEST * step))
-            body = with_sleeve(domain, wide, body, start, step)
         taken = gas | levelset.nearest(domain, as_array(domain.outside), refine, pad)
         low = np.asarray(domain.origin, dtype=float) - offset
         high = low + np.asarray(domain.size) + 2 * offset
         free = mend.clearance(taken, low, high, start, step)
         free = free if hole is None else np.minimum(free, hole)
-        shape, cut = hollowed(mend.mend(body, lambda one: hollowed(one)[0], free, min_wall, start, step))
+
+        def mended(body: np.ndarray) -> tuple[np.ndarray, tuple[float, ...]]:
+            return hollowed(mend.mend(body, lambda one: hollowed(one)[0], free, min_wall, start, step))
+
+        shape, cut = mended(body)
+        if port is not None and mend.thin_walls(shape, min_wall, start, step) is not None:
+            # A hole that cuts through limbs leaves shreds, of which mending makes others.
+            wide = replace(port, sleeve=max(port.sleeve, min_wall + mend.LARGEST * step))
+            shape, cut = mended(with_sleeve(domain, wide, body, start, step))
     islands = islands + cut
 
     mesh = levelset.march(shape, start, step)
