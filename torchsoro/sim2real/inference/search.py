@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
+import torch
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
@@ -30,6 +31,8 @@ TWICE = 0.25  # excess of chi-squared of a pair over that of the best single eff
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
+PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
+FIRST = 2  # of them
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
@@ -223,7 +226,13 @@ def _best(fits: Iterable[Fit | None]) -> list[Fit]:
 def _fit_null_model(
     problem: FitProblem, tasks: Sequence[Task], report: Callable[[str], None], rounds: int = 8
 ) -> tuple[FitProblem, Fit]:
-    """The fit without effects, and the problem with slips of markers where they explain most of what is left."""
+    """The fit without effects, and the problem with slips of markers where they explain most of what is left.
+
+    Where bodies touch planes, chi-squared has many valleys in what is stated: an effect that is searched from more
+    places than the null model would be told for having found the better one.
+    """
+    if any(s.planes for s in problem.scenarios):
+        tasks = [*tasks, *_null_starts(problem)]
     while True:
         # What did well on the beginning of the trials may break down later.
         ends = [f for f in problem.fit(tasks, rounds=rounds) if f is not None]
@@ -241,6 +250,18 @@ def _fit_null_model(
         name = problem.experiment.setup.markers[slips[0].marker].name
         report(f"marker {name} slips in trials {', '.join(s.trial for s in slips)}")
         problem = problem.only(problem.trials, slips=tuple(slips))
+
+
+def _null_starts(problem: FitProblem) -> list[Task]:
+    """Where the stated numbers, within their tolerances, leave the least, of evenly spread points."""
+    known = len(problem.common)
+    spread = torch.quasirandom.SobolEngine(known).draw(PLACES, dtype=torch.float64).numpy()
+    points = 2 * ((spread + 0.5) % 1) - 1  # the first is what is stated
+    motions = problem.simulate([((), points)])[0]
+    errors = np.zeros(len(problem.observation.deviations))
+    sound = np.flatnonzero(np.all([m.sound for m in motions], axis=0))
+    left = {int(k): problem.measure([m.alone(int(k)) for m in motions], errors)[0] for k in sound}
+    return [((), points[k]) for k in sorted(left, key=lambda k: left[k])[:FIRST]]
 
 
 def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_model: Fit, most: int) -> list[Task]:
