@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -220,8 +221,9 @@ def weigh(problem: FitProblem, fits: Sequence[Fit]) -> list[tuple[Fit, Posterior
         fits: Ends of searches.
     """
     data = data_of(problem)
-    models = zip(fits, near(problem, fits), strict=True)
-    return [(fit, infer(data, model)) for fit, model in models if model is not None]
+    models = [(fit, model) for fit, model in zip(fits, near(problem, fits), strict=True) if model is not None]
+    with ThreadPoolExecutor(problem.threads) as pool:
+        return list(zip((f for f, _ in models), pool.map(lambda m: infer(data, m[1]), models), strict=True))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

@@ -214,7 +214,7 @@ class Filter:
         return State(time=float(time[-1]), mean=mean, covariance=covariance), found, ln_det
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _advance(time, values, seen, rate, loading, variance, last, mean, covariance, found):
     """Predict to each time and take in its samples one by one; ``mean`` and ``covariance`` are changed."""
     states, columns, markers = len(rate), values.shape[2], values.shape[1]
