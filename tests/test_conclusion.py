@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from swings import EXACT, recorded
 
-from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude, independent
+from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer, told
-from torchsoro.sim2real.inference.observed import Data, TrialData, size_of
+from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
 from torchsoro.sim2real.inference.visible import limit, remedies
@@ -138,7 +138,8 @@ def test_where_no_model_is_right_the_one_that_leaves_less_is_told():
     time = data.trials[0].time
     everywhere = np.ones((1, 3, 2))
     smooth = tuple(0.2 * np.sin(4 * time)[:, None, None] * everywhere for _ in data.trials)
-    rough = tuple(0.1 * np.sin(90 * time)[:, None, None] * everywhere for _ in data.trials)
+    rng = np.random.default_rng(18)
+    rough = tuple(0.1 * rng.normal(size=(len(time), 3, 2)) for _ in data.trials)
     start = tuple(1.0 * np.sin(9 * time)[:, None, None] * everywhere for _ in data.trials)
 
     def ending(name, left):
@@ -152,9 +153,20 @@ def test_where_no_model_is_right_the_one_that_leaves_less_is_told():
     found = conclude(weighing, limit=0.0)
     assert evidence["drag"] > evidence["leak"]
     assert (found.chosen, found.partly) == (("leak",), True)
-    # Numbers of its own count: the same remainder with more of them is less probable.
-    count = independent(data, 0.05)
-    assert count > independent(data, 0.1) > 0.4 * count
+
+
+def test_residuals_that_last_and_move_together_are_worth_few_values():
+    rng = np.random.default_rng(19)
+    count, time = 2000, 40.0  # samples, and their correlation time in samples
+    keep = np.exp(-1 / time)
+    x = np.zeros((count, 4))
+    for k in range(1, count):
+        x[k] = keep * x[k - 1] + np.sqrt(1 - keep**2) * rng.normal(size=4)
+    apart_, together = x.reshape(count, 2, 2), np.repeat(x[:, :1], 4, 1).reshape(count, 2, 2)
+    assert independent((rng.normal(size=(count, 2, 2)),)) == pytest.approx(4 * count, rel=0.1)
+    assert independent((apart_,)) == pytest.approx(4 * count / time, rel=0.3)
+    assert independent((together,)) == pytest.approx(count / time, rel=0.3)
+    assert independent((together, together)) == pytest.approx(2 * independent((together,)))
 
 
 def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told():
@@ -224,6 +236,22 @@ def test_evidence_counts_less_where_the_twin_errs_along_an_effect():
     ]
     assert kappas[0] == 1.0
     assert kappas[2] > 2 * kappas[1] > 2.0
+
+
+def test_an_effect_that_moves_the_body_as_the_twin_errs_is_not_told():
+    data, nothing, drag = recorded(0.0, 20)
+    # The recording is off by a change like that of the effect, and so are twins that are equally good.
+    off = tuple(0.1 * J[..., 0] for J in drag.slopes)
+    off_models = [
+        dataclasses.replace(m, residuals=tuple(r + o for r, o in zip(m.residuals, off, strict=True)))
+        for m in (nothing, drag)
+    ]
+    scales = (-1.2, 0.9, -0.4, 1.3, 0.2, -0.8)
+    variants = [[tuple(r + a * o for r, o in zip(m.residuals, off, strict=True)) for a in scales] for m in off_models]
+    exact = conclude(weighed(data, *off_models), limit=0.0)
+    assert exact.chosen == ("drag",)
+    priced = [by_spread(data, m, v) for m, v in zip(off_models, variants, strict=True)]
+    assert conclude(weighed(data, *priced), limit=0.0).kind == "nothing_missing"
 
 
 def test_a_mode_that_was_found_twice_counts_once():

@@ -26,7 +26,7 @@ from torchsoro.sim2real.inference.evidence import (
 )
 from torchsoro.sim2real.inference.laplace import ln_box, posterior
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.state_space import ErrorModel, Process, total
+from torchsoro.sim2real.inference.state_space import ErrorModel, Gram, Process, integrated, total
 
 # Covariances ---------------------------------------------------------------------------------------------------------
 
@@ -79,6 +79,22 @@ def test_a_recording_in_two_parts_has_the_products_of_the_whole(case, cut):
     whole, pieces = model.gram([(time, values)]), model.gram(p for p in parts if len(p[0]))
     assert pieces.product == pytest.approx(whole.product, rel=1e-12, abs=1e-12)
     assert pieces.ln_det == pytest.approx(whole.ln_det, rel=1e-12, abs=1e-12)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 4))
+def test_errors_that_move_all_markers_are_those_of_the_dense_covariance_with_them(seed, modes):
+    rng = np.random.default_rng(seed)
+    root, X, D = (
+        rng.normal(size=(9, 9)),
+        rng.normal(size=(9, 3)),
+        10 ** rng.uniform(-3, 3) * rng.normal(size=(9, modes)),
+    )
+    C, columns = root @ root.T + np.eye(9), np.concatenate([X, D], 1)
+    gram = Gram(product=columns.T @ np.linalg.solve(C, columns), ln_det=float(np.linalg.slogdet(C)[1]), count=9)
+    found, whole = integrated(gram, modes), C + D @ D.T
+    assert found.product == pytest.approx(X.T @ np.linalg.solve(whole, X), rel=1e-6, abs=1e-7)
+    assert found.ln_det == pytest.approx(float(np.linalg.slogdet(whole)[1]), rel=1e-9, abs=1e-9)
+    assert integrated(gram, 0) is gram
 
 
 def test_a_million_rows_are_whitened_within_20_megabytes():

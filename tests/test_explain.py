@@ -23,7 +23,7 @@ from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noi
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, finer
-from torchsoro.sim2real.inference.search import _simpler
+from torchsoro.sim2real.inference.search import FIRST, _null_starts, _simpler, spread
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
 from torchsoro.sim2real.report.words import digits
@@ -309,6 +309,27 @@ def test_planes_of_one_trial_alone_are_touched(made):
     experiment = dataclasses.replace(experiment, trials=(one, other))
     fine = Twin(experiment.setup, edge=0.6 * twin.edge, across=5)
     assert [np.isfinite(d).all() for d in measure(experiment, twin, fine).deviation.values()] == [True, True]
+
+
+def test_the_null_model_of_a_body_on_a_plane_begins_where_what_is_stated_leaves_least(made):
+    twin, record = made
+    experiment = record("modulus", (-0.06,))
+    starts = _null_starts(FitProblem(experiment, twin, noise=5e-5))
+    assert len(starts) == FIRST and all(not effects and np.abs(at).max() <= 1 for effects, at in starts)
+    # Tolerance of ln of the modulus: 0.1. Of sixteen even places the two nearest are within an eighth of it.
+    assert [float(at[0]) for _, at in starts] == pytest.approx([-0.6, -0.6], abs=0.13)
+
+
+@pytest.mark.parametrize("one", library(), ids=lambda e: type(e).__name__)
+def test_screened_points_are_within_bounds_and_places_within_the_body(made, one):
+    twin, record = made
+    points = spread(twin, one)
+    low, high = FitProblem(record(None), twin).bounds((one,))
+    assert (points >= low[1:]).all() and (points <= high[1:]).all()
+    assert len(np.unique(points, axis=0)) == len(points) and np.abs(points[:, : len(one.quantities)]).max(1).all()
+    if one.local:  # even in the body: each half of each edge has half of them
+        middle = 10 * np.array(twin.setup.center) / np.array(twin.setup.size)
+        assert (points[:, -3:] < middle).mean(0) == pytest.approx(0.5, abs=0.1)
 
 
 def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):

@@ -88,7 +88,7 @@ def read_inputs(options: Options) -> Inputs:
     if effects and not any(e.applies(scenarios[t.name], twin) for e in effects for t in trials):
         raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
     with named_in(experiment.folder):
-        fine = finer(twin, len(trials), 2 * options.budget)
+        fine = finer(twin, len(trials), 4 * options.budget)
     return Inputs(
         experiment=experiment,
         trials=trials,

@@ -17,19 +17,23 @@ from torchsoro.sim2real.hypotheses.body_effects import (
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.outer_effects import (
     Adhesion,
-    AirStiffness,
-    AirTwice,
     FluidDrag,
     Friction,
     GravityTilt,
     InitialMotion,
+    InitialPose,
     InitialSpin,
     InitialTilt,
-    Leak,
-    PressureGain,
-    PressureLag,
     Sliding,
     WallOffset,
+)
+from torchsoro.sim2real.hypotheses.supply_effects import (
+    AirStiffness,
+    AirTwice,
+    Leak,
+    OrificeLeak,
+    PressureGain,
+    PressureLag,
 )
 
 
@@ -37,7 +41,8 @@ def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
-        *(AttachedMass, Tether, LoadInertia, FluidDrag, PressureLag, PressureGain, Leak, AirStiffness, AirTwice),
-        *(Sliding, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt),
+        *(AttachedMass, Tether, LoadInertia, FluidDrag),
+        *(PressureLag, PressureGain, Leak, OrificeLeak, AirStiffness, AirTwice),
+        *(Sliding, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt, InitialPose),
     )
     return tuple(kind() for kind in kinds)

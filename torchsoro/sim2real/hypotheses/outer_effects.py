@@ -1,4 +1,4 @@
-"""Effects around the body: supply, fluid, planes, gravity, start."""
+"""Effects around the body: fluid, planes, gravity, start."""
 
 from __future__ import annotations
 
@@ -13,133 +13,8 @@ from torch import Tensor
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
-from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.loads import QuadraticDrag
-
-
-class PressureGain(Hypothesis):
-    """The chamber gets less, or more, than the supply's pressure."""
-
-    name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
-    quantities = (Quantity("ln_factor", "1", 0.05, -30.0, 12.0),)
-    starts = ((-1.0,), (-4.0,), (-10.0,))
-
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
-        """What is lost."""
-        return {"fraction": (1 - math.exp(values[0]), "1")}
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """P exp(a)."""
-        assert scenario.pressure is not None
-        pressure = _chambers(scenario.pressure) * values[:, 0].exp()[:, None, None]
-        return scenario.replace(pressure=dataclasses.replace(scenario.pressure, pressure=pressure))
-
-    def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a chamber."""
-        return scenario.pressure is not None
-
-
-def _chambers(supply: Waveform) -> Tensor:
-    """Pressure [..., chambers, S]."""
-    return supply.pressure if supply.pressure.ndim > 1 else supply.pressure.unsqueeze(0)
-
-
-def lagged(scenario: Scenario, tau: Tensor) -> Waveform:
-    """The exact answer of a first-order lag [B] s to a piecewise linear supply."""
-    supply = scenario.pressure
-    assert supply is not None
-    # Even, fine samples: the lag's own exponentials are not piecewise linear.
-    time = torch.arange(0.0, scenario.duration + 4e-3, 2e-3, dtype=torch.float64)
-    p = Waveform(time=supply.time.double(), pressure=_chambers(supply).double()).at(time)
-    p = p.expand(len(tau), *p.shape[-2:])
-    ratio = 2e-3 / tau.clamp(min=1e-9)[:, None]
-    keep, early = torch.exp(-ratio), -torch.expm1(-ratio) / ratio
-    # Exact for a supply that changes linearly in a sample.
-    pushed = (early - keep).unsqueeze(-1) * p[..., :-1] + (1 - early).unsqueeze(-1) * p[..., 1:]
-    found, kept = torch.cat([p[..., :1], pushed], -1).movedim(-1, 0).contiguous().numpy(), keep.numpy()
-    for k in range(1, len(found)):
-        found[k] += kept * found[k - 1]
-    late = torch.where(tau[:, None, None] > 0, torch.from_numpy(found).movedim(0, -1), p)
-    return Waveform(time=time, pressure=late)
-
-
-class PressureLag(Hypothesis):
-    """The line fills and empties with a lag: tau p' = p_supply - p."""
-
-    name, affected_quantity, model_form_deviation = "pressure_lag", "chamber pressure", LAW
-    quantities = (Quantity("time_constant_s", "s", 0.01, 0.0, 100.0),)
-    starts = ((1.0,), (3.0,), (8.0,))
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Late."""
-        return scenario.replace(pressure=lagged(scenario, values[:, 0]))
-
-    def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a chamber."""
-        return scenario.pressure is not None
-
-
-class AirStiffness(Hypothesis):
-    """The chamber's pressure falls as it grows: p = p_supply - k (V/V0 - 1)."""
-
-    name, affected_quantity, model_form_deviation = "air_stiffness", "chamber pressure by its volume", LAW
-    quantities = (Quantity("air_stiffness_pa", "Pa", 2e4, 0.0, 50.0),)
-    starts = ((1.0,), (5.0,))
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Added to what is believed."""
-        return scenario.replace(air_stiffness=scenario.air_stiffness + values[:, :1])
-
-    def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a chamber."""
-        return scenario.pressure is not None
-
-
-class AirTwice(Hypothesis):
-    """There is less air to compress than believed, as where the pressure was measured in the chamber itself."""
-
-    name, affected_quantity = "air_stiffness", "chamber pressure by its volume"
-    quantities = (Quantity("share", "1", 0.1, -10.0, 0.0),)
-    starts = ((-3.0,), (-10.0,))
-
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
-        """What is to be added."""
-        return {"air_stiffness_pa": (float(values[0]) * float(scenario.air_stiffness.max()), "Pa")}
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """A share of what is believed less."""
-        return scenario.replace(air_stiffness=scenario.air_stiffness * (1 + values[:, :1]))
-
-    def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a chamber whose air is believed to be compressed."""
-        return scenario.pressure is not None and bool((scenario.air_stiffness > 0).any())
-
-
-class Leak(Hypothesis):
-    """A part of the supply is lost behind a line that fills slowly: tau p' = (1 - a) p_supply - p."""
-
-    name, affected_quantity, model_form_deviation = "leak", "chamber pressure", LAW
-    quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
-    starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
-
-    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
-        """With all of the pressure in the end, a lag; at once, a loss."""
-        full, prompt = (v < 0.01 * q.scale for v, q in zip(values, self.quantities, strict=True))
-        if full:
-            return "pressure_lag", values[1:]
-        return ("pressure_loss", np.log1p(-values[:1])) if prompt else None
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Less pressure, later."""
-        assert scenario.pressure is not None
-        less = _chambers(scenario.pressure) * (1 - values[:, 0])[:, None, None]
-        scenario = scenario.replace(pressure=dataclasses.replace(scenario.pressure, pressure=less))
-        return scenario.replace(pressure=lagged(scenario, values[:, 1]))
-
-    def applies(self, scenario: Scenario, twin: Twin) -> bool:
-        """With a chamber."""
-        return scenario.pressure is not None
 
 
 class FluidDrag(Hypothesis):
@@ -332,6 +207,42 @@ class InitialTilt(Hypothesis):
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a body that nothing holds."""
         return not twin.held.any()
+
+
+class InitialPose(Hypothesis):
+    """A clamped body is let go from a bend, in which something has held its free end."""
+
+    name, affected_quantity = "initial_pose", "shape of the body at the start"
+    nonnegative = frozenset({"deflection_m"})
+    quantities = tuple(Quantity(f"offset_{i}_m", "m", 0.002, -25.0, 25.0) for i in ("first", "second"))
+    starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
+
+    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+        """Both offsets, and the whole."""
+        return {**super().reported(values, scenario), "deflection_m": (float(np.hypot(*values)), "m")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Of a slender cantilever under a force at its end, whose cross-sections stay plane and normal to it.
+
+        At a share s of the length L from the clamp, w = a (3 s^2 - s^3) / 2 across, and -w' times the distance from
+        the middle along the axis.
+        """
+        axis, side = twin.faces[0]
+        places, size = twin.places, twin.setup.size
+        length = size[axis]
+        s = (twin.depth(places, axis, side) / length).clamp(0, 1)
+        bend, slope = (3 * s**2 - s**3) / 2, (6 * s - 3 * s**2) / (2 * length)
+        moved = torch.zeros(len(values), len(places), 3, dtype=torch.float64)
+        for k, across in enumerate(a for a in range(3) if a != axis):
+            off = values[:, k : k + 1]
+            moved[..., across] += off * bend
+            # Away from the clamp the axis points to the side that the clamp is not on.
+            moved[..., axis] += side * off * slope * (places[:, across] - twin.setup.center[across])
+        return scenario.replace(displacement=scenario.displacement + moved)
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a body of which one face is clamped."""
+        return len(twin.faces) == 1
 
 
 def turned(v: Tensor, turn: Tensor) -> Tensor:

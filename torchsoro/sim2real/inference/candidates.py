@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -111,7 +112,6 @@ def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
     Returns:
         A model of each; None where a simulation breaks down.
     """
-    data = data_of(problem)
     finer = None if problem.stated else problem.fine
     bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
@@ -135,38 +135,58 @@ def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
                 numerics=TwinError(amplitude=np.sqrt(stated)),
             )
         )
-    return models if finer is None else _corrected(problem, data, fits, models, finer)
+    return models if finer is None else _corrected(problem, coarse, fits, models, finer)
 
 
 def _corrected(
-    problem: FitProblem, data: Data, fits: Sequence[Fit], models: Sequence[Linearised | None], fine: Twin
+    problem: FitProblem, coarse: FitProblem, fits: Sequence[Fit], models: Sequence[Linearised | None], fine: Twin
 ) -> list[Linearised | None]:
     """Models with the residuals by finer twins, and the error of these."""
-    middle = between(problem.twin, fine)
-    by_fine, by_middle = (
-        problem.only(problem.trials, twin=twin, discretization=DiscretizationError()) for twin in (fine, middle)
-    )
-    planes = any(s.planes for s in problem.scenarios)
+    data = data_of(problem)
+    by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
-    closer = ask
-    if planes:
-        wall = WallOffset()
-        gaps = GAPS[:, None] / wall.quantities[0].scale
-        closer = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
+    sharp = [_residuals(problem, f, motions) for f, motions in zip(fits, by_fine.simulate(ask), strict=True)]
+    if any(s.planes for s in problem.scenarios):
+        touching = _touching(problem, coarse, fits)
+        found: list[Linearised | None] = []
+        for model, finer, variants in zip(models, sharp, touching, strict=True):
+            if model is None or not finer or not variants:
+                found.append(None)
+                continue
+            # What a plane's place changes, by the twin in use: the finer one would take a hundred times as long.
+            moved = [_sum(finer[0], v, model.residuals) for v in variants]
+            found.append(by_spread(data, model, moved, model.residuals, problem.twin.edge / fine.edge))
+        return found
+    middle = between(problem.twin, fine)
+    by_middle = problem.only(problem.trials, twin=middle, discretization=DiscretizationError())
+    dull = [_residuals(problem, f, motions) for f, motions in zip(fits, by_middle.simulate(ask), strict=True)]
     ratio = max((fine.count / middle.count) ** (1 / 3), LEAST_RATIO)
-    found: list[Linearised | None] = []
-    for f, model, sharp, dull in zip(fits, models, by_fine.simulate(closer), by_middle.simulate(ask), strict=True):
-        if model is None or not all(m.sound.all() for m in (*sharp, *dull)):
-            found.append(None)
-            continue
-        variants = [_left(problem, [m.alone(k) for m in sharp], f.errors) for k in range(len(sharp[0].position))]
-        coarser = _left(problem, [m.alone() for m in dull], f.errors)
-        if planes:
-            found.append(by_spread(data, model, [*variants, coarser]))
-        else:
-            model = dataclasses.replace(model, residuals=variants[0])
-            found.append(by_richardson(data, model, coarser, ratio))
-    return found
+    return [
+        by_richardson(data, dataclasses.replace(model, residuals=finer[0]), coarser[0], ratio)
+        if model is not None and finer and coarser
+        else None
+        for model, finer, coarser in zip(models, sharp, dull, strict=True)
+    ]
+
+
+def _touching(problem: Likelihood, coarse: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
+    """Residuals with planes a little nearer and farther, of each fit; none where one breaks down."""
+    wall = WallOffset()
+    gaps = GAPS[:, None] / wall.quantities[0].scale
+    ask = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
+    return [_residuals(problem, f, motions) for f, motions in zip(fits, coarse.simulate(ask), strict=True)]
+
+
+def _residuals(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTrajectory]) -> list[Motions]:
+    """Residuals by each variation of motions, with the measurement errors of a fit; none where one breaks down."""
+    if not all(m.sound.all() for m in motions):
+        return []
+    return [_left(problem, [m.alone(k) for m in motions], fit.errors) for k in range(len(motions[0].position))]
+
+
+def _sum(one: Motions, more: Motions, less: Motions) -> Motions:
+    """One and what is more than less of it, in each trial."""
+    return tuple(a + b - c for a, b, c in zip(one, more, less, strict=True))
 
 
 def _left(problem: Likelihood, motions: Sequence[MarkerTrajectory], errors: np.ndarray) -> Motions:
@@ -201,8 +221,9 @@ def weigh(problem: FitProblem, fits: Sequence[Fit]) -> list[tuple[Fit, Posterior
         fits: Ends of searches.
     """
     data = data_of(problem)
-    models = zip(fits, near(problem, fits), strict=True)
-    return [(fit, infer(data, model)) for fit, model in models if model is not None]
+    models = [(fit, model) for fit, model in zip(fits, near(problem, fits), strict=True) if model is not None]
+    with ThreadPoolExecutor(problem.threads) as pool:
+        return list(zip((f for f, _ in models), pool.map(lambda m: infer(data, m[1]), models), strict=True))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

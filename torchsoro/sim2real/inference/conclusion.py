@@ -8,7 +8,7 @@ likelihood: Ribatet, Cooley and Davison 2012),
 
     kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
-and the likelihood is taken to the power of 1 / kappa.
+C without what it has of d, and the likelihood is taken to the power of 1 / kappa.
 
 Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
 how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
@@ -27,17 +27,18 @@ from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import COMMON, CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
     closest,
-    errors,
     leave_one_out,
     mode_of,
+    products,
 )
-from torchsoro.sim2real.inference.observed import Data, Motions, size_of
+from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
+from torchsoro.sim2real.inference.state_space import total
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
@@ -150,19 +151,18 @@ class Weighing:
     @cached_property
     def kappa(self) -> float:
         """Mean adjustment over the changes by all names, by the errors of the most probable model."""
-        best = self.best
+        best, trials = self.best, range(len(self.data.trials))
         changes = [self.change(modes[0]) for modes in self.groups.values()]
-        draws, n = [tuple(best.discrepancy.twin * d for d in draw) for draw in best.near.numerics.draws], len(changes)
-        if not draws or not changes:
+        numerics, n = best.near.numerics, len(changes)
+        if not numerics.draws or not changes:
             return 1.0
-        models = errors(self.data, best.near.numerics, best.discrepancy)
-        grams = [
-            model.gram([(trial.time, np.stack([c[i] for c in (*changes, *draws)], -1))]).product
-            for i, (trial, model) in enumerate(zip(self.data.trials, models, strict=True))
-        ]
-        product = np.sum(grams, 0)
-        lengths = np.maximum(np.diag(product)[:n], 1e-300)
-        return 1.0 + float(((product[:n, n:] ** 2).mean(1) / lengths).mean())
+        gained = []
+        for k, draw in enumerate(numerics.draws):
+            columns = [np.stack([*(c[i] for c in changes), best.discrepancy.twin * draw[i]], -1) for i in trials]
+            # What a draw is worth to an effect is seen where it is none of the errors that are known.
+            product = total(products(self.data, numerics.without(k), best.discrepancy, columns)).product
+            gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
+        return 1.0 + float(np.mean(gained))
 
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
@@ -204,7 +204,8 @@ class Weighing:
         if self.best.matters:
             # Whether something is missing is told by evidence, what it is by the size of what is left.
             missing = 1 - probabilities[NOTHING]
-            count = independent(self.data, self.best.discrepancy.time)
+            least = min(groups, key=lambda name: left[name]) if groups else None
+            count = independent(self.null.left if least is None else self.groups[least][0].left)
             rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(self.unexplained)}
             for name, modes in groups.items():
                 own = len(modes[0].near.model.own)
@@ -229,13 +230,6 @@ def normalised(ln_p: dict[str, float]) -> dict[str, float]:
     most = max(ln_p.values())
     whole = sum(math.exp(value - most) for value in ln_p.values())
     return {name: math.exp(value - most) / whole for name, value in ln_p.items()}
-
-
-def independent(data: Data, time: float) -> float:
-    """Number of independent values of a discrepancy with a correlation time [s], in trials, axes and markers."""
-    axes, markers = data.amplitudes[0].shape
-    channels = axes * markers / (1 + (markers - 1) * COMMON**2)
-    return channels * sum(max(1.0, float(t.time[-1] - t.time[0]) / time) for t in data.trials)
 
 
 def _summed(modes: Sequence[Posterior]) -> float:

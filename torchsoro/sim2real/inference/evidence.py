@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,9 +24,9 @@ from scipy.optimize import minimize
 
 from torchsoro.sim2real.inference.decision import COMMON, LASTING
 from torchsoro.sim2real.inference.laplace import Mode, posterior
-from torchsoro.sim2real.inference.observed import Data, Motions, size_of
+from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, tempered, total
+from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, integrated, tempered, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
 NARROW = 0.05  # of ln s, ln tau and ln c: what they need not be known better than
@@ -60,11 +60,25 @@ class TwinError:
         amplitude: Standard deviation by axis and marker [A, M] m.
         time: Correlation time [s].
         draws: Errors as they may be, as far as beliefs and measurement errors do not take them up.
+        modes: Of each trial, in proportion to the draws, errors that move all markers together, each times an unknown
+            of unit variance [T, M, A, R] m; none if empty.
     """
 
     amplitude: np.ndarray
     time: float = NOISE_TIME
     draws: tuple[Motions, ...] = ()
+    modes: Motions = ()
+
+    def without(self, draw: int) -> TwinError:
+        """The same, of whose modes the one of a draw is not known."""
+        if not self.modes:
+            return self
+        return dataclasses.replace(self, modes=tuple(np.delete(m, draw, -1) for m in self.modes))
+
+    def divided(self, factor: float) -> TwinError:
+        """That of a twin whose error is so many times smaller."""
+        modes = tuple(m / factor for m in self.modes)
+        return dataclasses.replace(self, amplitude=self.amplitude / factor, modes=modes)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -111,13 +125,6 @@ class Linearised:
     slopes: tuple[np.ndarray, ...]
     numerics: TwinError
 
-    def chunks(self, data: Data, trial: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Times, and columns of residual and slopes, of a trial in parts."""
-        time = data.trials[trial].time
-        for k in range(0, len(time), ROWS):
-            part = slice(k, k + ROWS)
-            yield time[part], np.concatenate([self.residuals[trial][part, ..., None], self.slopes[trial][part]], -1)
-
     def left(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Residuals at another point [T, M, A] m."""
         return tuple(r - J @ (x - self.at) for r, J in zip(self.residuals, self.slopes, strict=True))
@@ -149,8 +156,8 @@ class Posterior:
 
     Attributes:
         near: The model, and where it was linearised.
-        some: With a discrepancy that matters.
-        none: With one as large as what does not matter.
+        some: With a discrepancy that matters, see :func:`least_that_matters`.
+        none: With one that does not.
     """
 
     near: Linearised
@@ -222,7 +229,19 @@ def _each(deviation: np.ndarray) -> np.ndarray:
 
 def grams(data: Data, near: Linearised, discrepancy: Discrepancy) -> list[Gram]:
     """Products of residual and slopes under the errors of each trial."""
-    return [model.gram(near.chunks(data, i)) for i, model in enumerate(errors(data, near.numerics, discrepancy))]
+    columns = [np.concatenate([r[..., None], J], -1) for r, J in zip(near.residuals, near.slopes, strict=True)]
+    return products(data, near.numerics, discrepancy, columns)
+
+
+def products(data: Data, numerics: TwinError, discrepancy: Discrepancy, columns: Sequence[np.ndarray]) -> list[Gram]:
+    """Products of columns of each trial [T, M, A, C] under its errors, which the first column has where it is lost."""
+    found = []
+    for i, (trial, model, X) in enumerate(zip(data.trials, errors(data, numerics, discrepancy), columns, strict=True)):
+        modes = numerics.modes[i] if numerics.modes else X[..., :0]
+        parts = (slice(k, k + ROWS) for k in range(0, len(trial.time), ROWS))
+        chunks = ((trial.time[part], np.concatenate([X[part], modes[part]], -1)) for part in parts)
+        found.append(integrated(model.gram(chunks), modes.shape[-1]))
+    return found
 
 
 def infer(data: Data, near: Linearised) -> Posterior:
@@ -246,15 +265,21 @@ def infer(data: Data, near: Linearised) -> Posterior:
         return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
 
     low, high = ranges(data, near.numerics)
-    middle = 0.5 * (low + high)
+    line = least_that_matters(data, near.numerics)
+    above, below = np.array([line, *low[1:]]), np.array([line, *high[1:]])
+    middle = 0.5 * (above + high)
     # From little and from much: with much, the first mode is not bent by a wrong model.
-    some = [settled(np.array([ln_s, middle[1], high[2]]), low, high) for ln_s in (middle[0], high[0])]
-    none = settled(np.array([low[0], middle[1], high[2]]), low, np.array([low[0], *high[1:]]))
+    some = [settled(np.array([ln_s, middle[1], high[2]]), above, high) for ln_s in (middle[0], high[0])]
+    none = settled(np.array([low[0], middle[1], high[2]]), low, below)
     return Posterior(near=near, some=max(some, key=lambda branch: branch.ln_evidence), none=none)
 
 
 def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
-    """The posterior with the likelihood to the power of 1 / kappa, and the priors as they are.
+    """The posterior with the likelihood of effects to the power of 1 / kappa, and the priors as they are.
+
+    Beliefs and measurement errors are integrated out first, with the likelihood as it is: where markers sit is told by
+    samples that no effect moves. So ln Z = ln L + ln O, L the likelihood of the effects' own numbers at their mode and
+    O the share of their prior that is left there, becomes ln L / kappa + ln O with the covariance of now.
 
     Args:
         data: Recordings.
@@ -263,9 +288,28 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     """
 
     def again(branch: Branch) -> Branch:
-        return dataclasses.replace(branch, mode=mode_of(data, found.near, branch.discrepancy, kappa))
+        mode, model = branch.mode, found.near.model
+        before, after = (_ln_own_occam(model, mode, k) for k in (1.0, kappa))
+        ln_evidence = (mode.ln_evidence - before) / kappa + after
+        wider = mode_of(data, found.near, branch.discrepancy, kappa)
+        return dataclasses.replace(branch, mode=dataclasses.replace(wider, ln_evidence=ln_evidence))
 
+    if kappa == 1.0:
+        return found
     return dataclasses.replace(found, some=again(found.some), none=again(found.none))
+
+
+def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
+    """Ln of the share of the effects' prior that a likelihood to the power of 1 / kappa leaves near a mode."""
+    own = list(model.own)
+    if not own:
+        return 0.0
+    priors, at = [model.priors[k] for k in own], mode.at[own]
+    weight = np.diag([p.weight(x) for p, x in zip(priors, at, strict=True)])
+    precision = (np.linalg.inv(mode.covariance[np.ix_(own, own)]) - weight) / kappa + weight
+    ln_prior = sum(p.ln_density(x) for p, x in zip(priors, at, strict=True))
+    volume = 0.5 * (len(own) * math.log(2 * math.pi) - float(np.linalg.slogdet(precision)[1]))
+    return min(0.0, ln_prior + volume)
 
 
 def mode_of(data: Data, near: Linearised, discrepancy: Discrepancy, kappa: float = 1.0) -> Mode:
@@ -288,6 +332,13 @@ def ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
     return np.array([least, low, price]), np.array([most, high, 0.0])
 
 
+def least_that_matters(data: Data, numerics: TwinError) -> float:
+    """Ln s of the least discrepancy that matters: less than the twin's price may be its own error in another form."""
+    least, most = data.shares
+    price = math.sqrt(float((numerics.amplitude**2).mean())) / data.size
+    return math.log(min(max(least, price), 0.9 * most))
+
+
 def _discrepancy(x: np.ndarray) -> Discrepancy:
     share, time, twin = map(math.exp, x)
     return Discrepancy(share=share, time=time, twin=twin)
@@ -295,11 +346,8 @@ def _discrepancy(x: np.ndarray) -> Discrepancy:
 
 def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
     """Of residuals, with a discrepancy."""
-    value, models = 0.0, errors(data, near.numerics, _discrepancy(x))
-    for trial, model, r in zip(data.trials, models, left, strict=True):
-        gram = model.gram([(trial.time, r[..., None])])
-        value -= 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
-    return value
+    found = products(data, near.numerics, _discrepancy(x), [r[..., None] for r in left])
+    return -0.5 * sum(float(gram.product[0, 0]) + gram.ln_det for gram in found)
 
 
 def _restricted(
@@ -393,7 +441,10 @@ def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = Non
 
 
 def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
-    """The mode by least squares: with errors of all samples independent, and as large as what is left.
+    """The mode by least squares: errors of all samples are alike, and as large as what is left.
+
+    They count as the independent values that they amount to, so that beliefs and measurement errors stay what they may
+    be where what is left is large and lasts.
 
     Args:
         data: Recordings.
@@ -404,8 +455,9 @@ def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
     kept = [i for i in range(len(data.trials)) if i != but]
     at = near.at
     for _ in range(SETTLED):
-        left = size_of([r for i, r in enumerate(near.left(at)) if i in kept])
-        parts = grams(dataclasses.replace(data, noise=max(left, data.noise)), exact, Discrepancy())
-        mode = posterior(total([parts[i] for i in kept]), near.at, near.model.priors)
+        left = tuple(r for i, r in enumerate(near.left(at)) if i in kept)
+        parts = grams(dataclasses.replace(data, noise=max(size_of(left), data.noise)), exact, Discrepancy())
+        whole = total([parts[i] for i in kept])
+        mode = posterior(tempered(whole, max(whole.count / independent(left), 1.0)), near.at, near.model.priors)
         at = mode.at
     return mode

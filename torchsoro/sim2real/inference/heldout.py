@@ -11,6 +11,7 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 ROUNDS = 10  # Gauss-Newton steps in which the clock of one trial is fitted
@@ -40,6 +41,9 @@ class Prediction:
 def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
     """Predict trials with the parameters and measurement errors of a fit; only the clock of each trial is fitted.
 
+    The finer twin predicts, where there is one and trials come without simulations of their own: its correction of the
+    other, taken at other numbers, does not hold for motion that contact has led elsewhere.
+
     Args:
         problem: The fit's.
         fit: What was found.
@@ -57,6 +61,8 @@ def predict_all(
 ) -> list[list[Prediction]]:
     """:func:`predict` for several fits, simulated together."""
     there = problem.only(trials, slips=())
+    if there.fine is not None and not there.stated:
+        there = there.only(trials, twin=there.fine, discretization=DiscretizationError())
     still = np.zeros((1, len(there.common)))
     simulated = there.simulate([((), still) if believed else (fit.effects, fit.point[None]) for fit in fits])
     return [

@@ -16,7 +16,7 @@ import torch
 from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
+from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel, Priors
 from torchsoro.sim2real.inference.twin_error import DiscretizationError

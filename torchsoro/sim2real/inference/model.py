@@ -18,7 +18,7 @@ from torchsoro.sim2real.data.schema import ModelFile, read_tables, validated
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.hypotheses.outer_effects import PressureGain
+from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference.fit import Fit
 from torchsoro.sim2real.twin.batch import THREADS, simulate
 from torchsoro.sim2real.twin.scenario import Scenario

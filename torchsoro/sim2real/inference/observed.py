@@ -88,3 +88,26 @@ def _moved(position: np.ndarray) -> np.ndarray:
 def size_of(values: Sequence[np.ndarray]) -> float:
     """Root mean square over all samples [m]."""
     return float(np.sqrt(np.nanmean(np.concatenate([v.ravel() for v in values]) ** 2)))
+
+
+def independent(left: Motions) -> float:
+    """Number of independent values that residuals [T, M, A] of each trial amount to.
+
+    A covariance of eigenvalues l is worth (sum l)^2 / sum l^2 values. With C channels of covariance K and N samples,
+    whose correlation at a lag of k samples is rho_k over all channels, that is
+
+        N_eff = n N / (1 + 2 sum_k (1 - k/N) (rho_k^2 - e_k)),    n = (tr K)^2 / tr K^2,
+
+    where e_k = (1 - k/N) / (n N) is what rho_k^2 is on average where samples are independent.
+    """
+    found = 0.0
+    for r in left:
+        x = np.nan_to_num(r).reshape(len(r), -1)
+        count, K = len(x), x.T @ x
+        channels = float(np.trace(K)) ** 2 / max(float((K**2).sum()), 1e-300)
+        spectrum = np.abs(np.fft.rfft(x, 2 * count, axis=0)) ** 2
+        rho = np.fft.irfft(spectrum.sum(1))[1:count] / max(float(np.trace(K)), 1e-300)
+        share = 1 - np.arange(1, count) / count
+        lasting = 1 + 2 * float((share * (rho**2 - share / max(channels * count, 1.0))).sum())
+        found += channels * count / max(lasting, 1.0)
+    return max(found, 1.0)

@@ -6,10 +6,12 @@ the finer one (Richardson 1911),
     e = (y2 - y1) / ((h1 / h2)^2 - 1).
 
 Contact: which node touches when is decided by distances far below a cell, and motion after that differs by more than
-what finer cells change. Twins whose planes or lattice are shifted below a cell are equally good: R of them are draws of
-one distribution, and so is nature. Their mean predicts best, and its error has the variance
+what finer cells change. Twins whose planes are shifted below a cell are equally good: R of them are draws of one
+distribution, and so is nature. Their mean predicts best, and its error has the covariance
 
-    S^2 = (1 + 1/R) 1/(R - 1) sum_r (y_r - mean)^2.
+    S = (1 + 1/R) 1/(R - 1) sum_r (y_r - mean) (y_r - mean)',
+
+to which the error of the cells is added, of order one where bodies touch.
 
 In both, only that counts which beliefs and measurement errors cannot take up.
 """
@@ -37,6 +39,7 @@ from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.state_space import total
 
 ORDER = 2  # of convergence with the edge of the cells, of smooth motion
+TOUCHING = 1  # the same of bodies that meet planes: where nodes touch is known to a cell
 FAINT = 1e-3  # of the differences' size: white noise with which their correlation time is found
 
 
@@ -59,26 +62,41 @@ def by_richardson(data: Data, near: Linearised, coarser: Motions, ratio: float) 
     return dataclasses.replace(near, numerics=_process(data, (error,)))
 
 
-def by_spread(data: Data, near: Linearised, variants: Sequence[Motions]) -> Linearised:
-    """The mean of equally good twins, with the error that this has.
+def by_spread(
+    data: Data, near: Linearised, variants: Sequence[Motions], coarser: Motions | None = None, ratio: float = math.inf
+) -> Linearised:
+    """The mean of equally good twins, with the error that this has, in each trial by itself.
+
+    Errors of contact move a body as a whole, much as effects do: a variance of each marker would not know, and take an
+    effect that moves the body alike for the better explanation. So the covariance of the variants is kept as it is,
+    beside a process of the same size for what they do not show.
 
     Args:
         data: Recordings.
         near: Of which residuals do not count.
         variants: Residuals by each of R twins.
+        coarser: Residuals by a twin with larger cells.
+        ratio: Edge of its cells over that of the variants'.
 
     Raises:
-        ValueError: for fewer than two.
+        ValueError: for fewer than two variants, or a ratio that is not above one.
     """
     count = len(variants)
     if count < 2:
         raise ValueError(f"variants: {count}, wanted two or more twins")
+    if not ratio > 1:
+        raise ValueError(f"ratio = {ratio:g}, wanted one above 1: the other twin has larger cells")
     mean = tuple(np.mean(same, 0) for same in zip(*variants, strict=True))
     factor = math.sqrt((1 + 1 / count) * count / (count - 1))
-    draws = tuple(
-        cleared(data, near, tuple(factor * (r - m) for r, m in zip(one, mean, strict=True))) for one in variants
-    )
-    return dataclasses.replace(near, residuals=mean, numerics=_process(data, draws))
+    draws = [cleared(data, near, tuple(factor * (r - m) for r, m in zip(one, mean, strict=True))) for one in variants]
+    modes = [tuple(d / math.sqrt(count) for d in draw) for draw in draws]
+    if coarser is not None:
+        share = 1 / (ratio**TOUCHING - 1)
+        modes.append(cleared(data, near, tuple(share * (b - m) for b, m in zip(coarser, mean, strict=True))))
+        draws.append(modes[-1])
+    process = _process(data, draws)
+    together = tuple(np.stack(same, -1) for same in zip(*modes, strict=True))
+    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together))
 
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
@@ -97,14 +115,14 @@ def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
     return still.left(posterior(total(grams(data, still, Discrepancy())), still.at, model.priors).at)
 
 
-def _process(data: Data, draws: tuple[Motions, ...]) -> TwinError:
+def _process(data: Data, draws: Sequence[Motions]) -> TwinError:
     """The process that errors are draws of: its size by axis and marker, and its correlation time."""
     squares = [np.nanmean(d**2, 0).T for draw in draws for d in draw]
     own = np.mean(squares, 0)
     # A few draws tell an average better than each of its parts.
     amplitude = np.sqrt((own + own.mean()) / 2)
     if not amplitude.any():
-        return TwinError(amplitude=amplitude, draws=draws)
+        return TwinError(amplitude=amplitude, draws=tuple(draws))
     quiet = dataclasses.replace(data, noise=FAINT * float(amplitude.mean()))
 
     def lost(x: np.ndarray) -> float:
@@ -125,4 +143,4 @@ def _process(data: Data, draws: tuple[Motions, ...]) -> TwinError:
         options={"maxfev": 60, "xatol": 0.02, "fatol": 0.1},
     )
     # The size is that of the differences: of smooth ones, likelihood by itself would make it up.
-    return TwinError(amplitude=amplitude, time=math.exp(float(found.x[1])), draws=draws)
+    return TwinError(amplitude=amplitude, time=math.exp(float(found.x[1])), draws=tuple(draws))

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
+import torch
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
+from torchsoro.sim2real.twin.twin import Twin
 
 BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
 FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
@@ -25,11 +27,15 @@ CORRECTED = 1.5  # chi-squared per sample of the null model, above which the fin
 REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
+MOST_ROUGH = 24  # the same where bodies touch planes and most searches end in valleys nearby
+SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
+PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
+FIRST = 2  # of them
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
@@ -53,7 +59,8 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST))
+    rough = any(s.planes for s in problem.scenarios)
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if rough else MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -76,6 +83,8 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
+    if rough:
+        tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
     if len(tasks) > COMPLETED:
@@ -168,6 +177,48 @@ def _probe_points(
     return probe_points
 
 
+def _screened(
+    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
+) -> list[tuple[float, Hypothesis, np.ndarray]]:
+    """Chi-squared of each effect at evenly spread points: of a rough motion, no response tells it from afar."""
+    points = [spread(problem.twin, e) for e in effects]
+    at = [np.concatenate([np.tile(null_model.point, (len(x), 1)), x], 1) for x in points]
+    motions = problem.simulate([((e,), x) for e, x in zip(effects, at, strict=True)])
+    found = []
+    for effect, x, seen in zip(effects, at, motions, strict=True):
+        for k in map(int, np.flatnonzero(np.all([m.sound for m in seen], axis=0))):
+            found.append((problem.measure([m.alone(k) for m in seen], null_model.errors)[0], effect, x[k]))
+    return found
+
+
+def spread(twin: Twin, effect: Hypothesis) -> np.ndarray:
+    """Evenly spread values of an effect [N, K] in scales.
+
+    Strengths are half to twice those of its starts, components that add up both ways; places are anywhere in the body.
+
+    Args:
+        twin: The body.
+        effect: Which.
+    """
+    kinds, starts = len(effect.quantities), np.array(effect.starts)
+    low, high = np.array([[q.least, q.most] for q in effect.quantities]).T
+    count = SCREENED * (4 if effect.local else 1)
+    u = torch.quasirandom.SobolEngine(kinds + 3 * effect.local).draw(count + 2, dtype=torch.float64).numpy()
+    u = u[2:]  # after a corner and the middle
+    if effect.joint:
+        values = 4 * (u[:, :kinds] - 0.5) * starts.max(0)
+    else:
+        values = starts[np.arange(count) % len(starts)]
+        # A second quantity that may be negative, as the logarithm of a time, is a shape and no strength.
+        scaled = (low >= 0) | (np.arange(kinds) == 0)
+        values = values * np.where(scaled, 2 ** (2 * u[:, :kinds] - 1), 1.0)
+    values = np.clip(np.where(low >= 0, np.abs(values), values), low, high)
+    if effect.local:
+        origin, size = np.array(twin.setup.origin), np.array(twin.setup.size)
+        values = np.concatenate([values, 10 * origin / size + 10 * u[:, kinds:]], 1)
+    return np.unique(values, axis=0)
+
+
 def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most: int) -> list[Task]:
     """Where searches end that see more and more of the trials: that for nothing, and the best for each effect."""
     carried: list[Task] = [((), None)]
@@ -223,7 +274,13 @@ def _best(fits: Iterable[Fit | None]) -> list[Fit]:
 def _fit_null_model(
     problem: FitProblem, tasks: Sequence[Task], report: Callable[[str], None], rounds: int = 8
 ) -> tuple[FitProblem, Fit]:
-    """The fit without effects, and the problem with slips of markers where they explain most of what is left."""
+    """The fit without effects, and the problem with slips of markers where they explain most of what is left.
+
+    Where bodies touch planes, chi-squared has many valleys in what is stated: an effect that is searched from more
+    places than the null model would be told for having found the better one.
+    """
+    if any(s.planes for s in problem.scenarios):
+        tasks = [*tasks, *_null_starts(problem)]
     while True:
         # What did well on the beginning of the trials may break down later.
         ends = [f for f in problem.fit(tasks, rounds=rounds) if f is not None]
@@ -241,6 +298,18 @@ def _fit_null_model(
         name = problem.experiment.setup.markers[slips[0].marker].name
         report(f"marker {name} slips in trials {', '.join(s.trial for s in slips)}")
         problem = problem.only(problem.trials, slips=tuple(slips))
+
+
+def _null_starts(problem: FitProblem) -> list[Task]:
+    """Where the stated numbers, within their tolerances, leave the least, of evenly spread points."""
+    known = len(problem.common)
+    spread = torch.quasirandom.SobolEngine(known).draw(PLACES, dtype=torch.float64).numpy()
+    points = 2 * ((spread + 0.5) % 1) - 1  # the first is what is stated
+    motions = problem.simulate([((), points)])[0]
+    errors = np.zeros(len(problem.observation.deviations))
+    sound = np.flatnonzero(np.all([m.sound for m in motions], axis=0))
+    left = {int(k): problem.measure([m.alone(int(k)) for m in motions], errors)[0] for k in sound}
+    return [((), points[k]) for k in sorted(left, key=lambda k: left[k])[:FIRST]]
 
 
 def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_model: Fit, most: int) -> list[Task]:

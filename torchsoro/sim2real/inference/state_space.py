@@ -118,6 +118,26 @@ class Gram:
         )
 
 
+def integrated(gram: Gram, count: int) -> Gram:
+    """The same where samples also differ by unknown amounts of the last columns, of unit variance each.
+
+    For C + D D' in place of C (Woodbury; Sylvester), with K = I + D' C^-1 D:
+
+        X' (C + D D')^-1 X = X' C^-1 X - X' C^-1 D K^-1 D' C^-1 X,    ln det (C + D D') = ln det C + ln det K.
+
+    Args:
+        gram: Of columns [X, D].
+        count: Number of columns of D.
+    """
+    if not count:
+        return gram
+    A, B, G = gram.product[:-count, :-count], gram.product[:-count, -count:], gram.product[-count:, -count:]
+    root = np.linalg.cholesky(np.eye(count) + G)
+    taken = np.linalg.solve(root, B.T)
+    ln_det = gram.ln_det + 2 * float(np.log(np.diag(root)).sum())
+    return Gram(product=A - taken.T @ taken, ln_det=ln_det, count=gram.count)
+
+
 def tempered(gram: Gram, kappa: float) -> Gram:
     """Of a likelihood to the power of 1 / kappa."""
     return Gram(product=gram.product / kappa, ln_det=gram.ln_det / kappa, count=gram.count / kappa)
@@ -194,7 +214,7 @@ class Filter:
         return State(time=float(time[-1]), mean=mean, covariance=covariance), found, ln_det
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _advance(time, values, seen, rate, loading, variance, last, mean, covariance, found):
     """Predict to each time and take in its samples one by one; ``mean`` and ``covariance`` are changed."""
     states, columns, markers = len(rate), values.shape[2], values.shape[1]

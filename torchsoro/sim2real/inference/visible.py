@@ -15,8 +15,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, VISIBLE
-from torchsoro.sim2real.inference.evidence import Posterior, errors
+from torchsoro.sim2real.inference.evidence import Posterior, products
 from torchsoro.sim2real.inference.observed import Data, Motions
+from torchsoro.sim2real.inference.state_space import total
 
 FACTORS = (2.0, 4.0, 8.0, 16.0)  # by which an experiment or a twin may be made better
 
@@ -33,15 +34,13 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
         trials: Times as many trials as there are.
     """
     near = null.near
-    models = errors(data, near.numerics, null.discrepancy)
     count = responses[0].shape[-1]
     columns = [
         # A sample that was lost tells nothing of a response either.
         np.concatenate([np.where(np.isfinite(r)[..., None], c, np.nan), J], -1)
         for r, c, J in zip(near.residuals, responses, near.slopes, strict=True)
     ]
-    grams = [model.gram([(t.time, x)]).product for t, model, x in zip(data.trials, models, columns, strict=True)]
-    product = trials * np.sum(grams, 0)
+    product = trials * total(products(data, near.numerics, null.discrepancy, columns)).product
     A, B, G = product[count:, count:], product[count:, :count], product[:count, :count]
     weight = np.diag([p.weight(x) for p, x in zip(near.model.priors, null.mode.at, strict=True)])
     taken = np.linalg.solve(A + weight, B)
@@ -75,7 +74,7 @@ def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, name
     if now <= wanted:
         return {}
     for factor in FACTORS:
-        numerics = dataclasses.replace(null.near.numerics, amplitude=null.near.numerics.amplitude / factor)
+        numerics = null.near.numerics.divided(factor)
         finer = dataclasses.replace(null, near=dataclasses.replace(null.near, numerics=numerics))
         quiet = dataclasses.replace(data, noise=data.noise / factor)
         ways: Sequence[tuple[str, float]] = (

@@ -27,6 +27,7 @@ EFFECTS = {
     "gravity_tilt": "a tilted setup",
     "initial_motion": "another velocity at the start",
     "initial_tilt": "another orientation at the start",
+    "initial_pose": "a bend from which the body was let go",
 }
 
 # Quantities by name, or by effect and name where one name means several things.
@@ -65,6 +66,9 @@ QUANTITIES = {
     "about_z": "tilt about z",
     "angle_rad": "angle",
     "speed_m_s": "speed",
+    "deflection_m": "deflection of the free end",
+    "initial_pose.offset_first_m": "deflection along the first axis across the body",
+    "initial_pose.offset_second_m": "deflection along the second axis across the body",
     "velocity_x": "velocity along x",
     "velocity_y": "velocity along y",
     "velocity_z": "velocity along z",
@@ -81,6 +85,7 @@ MAIN = {
     "gravity_tilt": ("angle_rad",),
     "initial_motion": ("speed_m_s",),
     "initial_tilt": ("angle_rad",),
+    "initial_pose": ("deflection_m",),
     "adhesion": ("energy_j_m2",),
 }
 
