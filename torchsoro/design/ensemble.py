@@ -1,8 +1,8 @@
 """Scenarios of a design run: simulated in shares, judged together, and their gradients summed in a fixed order.
 
-A scenario's numbers do not depend on which others are simulated beside it: on a CPU every share fills whole groups of
+On a CPU a scenario's numbers do not depend on which others are simulated beside it: every share fills whole groups of
 sixteen lanes, all shares take the same substep, and gradients are kept apart until they are summed in the order of
-scenarios. So they are the same bits for any number of processes.
+scenarios. So they are the same bits for any number of processes. On a GPU they agree to rounding.
 """
 
 from __future__ import annotations
