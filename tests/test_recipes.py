@@ -213,6 +213,7 @@ def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_p
         "design.npz",
         "shapes",
         "shape.stl",
+        "shape.3mf",
         "shape.json",
         "result.json",
         "climber.mp4",
