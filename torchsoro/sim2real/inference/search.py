@@ -300,11 +300,15 @@ def _fit_null_model(
         problem = problem.only(problem.trials, slips=tuple(slips))
 
 
+def within_tolerances(problem: FitProblem) -> np.ndarray:
+    """Evenly spread values of the stated numbers within their tolerances [N, K]; the first is what is stated."""
+    even = torch.quasirandom.SobolEngine(len(problem.common)).draw(PLACES, dtype=torch.float64).numpy()
+    return 2 * ((even + 0.5) % 1) - 1
+
+
 def _null_starts(problem: FitProblem) -> list[Task]:
     """Where the stated numbers, within their tolerances, leave the least, of evenly spread points."""
-    known = len(problem.common)
-    spread = torch.quasirandom.SobolEngine(known).draw(PLACES, dtype=torch.float64).numpy()
-    points = 2 * ((spread + 0.5) % 1) - 1  # the first is what is stated
+    points = within_tolerances(problem)
     motions = problem.simulate([((), points)])[0]
     errors = np.zeros(len(problem.observation.deviations))
     sound = np.flatnonzero(np.all([m.sound for m in motions], axis=0))

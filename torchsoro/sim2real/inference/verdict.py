@@ -18,7 +18,7 @@ from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.observed import Data
-from torchsoro.sim2real.inference.search import search
+from torchsoro.sim2real.inference.search import search, within_tolerances
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
@@ -130,7 +130,7 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *ends])
+    known = weigh(problem, [null_model, *strained, *_other_valleys(problem), *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     for _ in range(ROUNDS):
         leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
@@ -167,6 +167,18 @@ def weighed(
         conclusion=found,
     )
     return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
+
+
+def _other_valleys(problem: FitProblem) -> list[Fit]:
+    """Where bodies touch planes, the null model all over its tolerances.
+
+    The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
+    it into a deep one must not be told where what is stated, a little different, does so, too.
+    """
+    if problem.fine is None or problem.stated or not any(s.planes for s in problem.scenarios):
+        return []
+    tasks = [((), point) for point in within_tolerances(problem)]
+    return [f for f in problem.fit(tasks, rounds=0, settle=False) if f is not None]
 
 
 def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
