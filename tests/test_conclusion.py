@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from swings import EXACT, recorded
 
-from torchsoro.sim2real.inference.conclusion import Weighing, apart, conclude
+from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import Linearised, Model, TwinError, infer, told
+from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, Model, TwinError, infer, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
@@ -252,6 +252,20 @@ def test_an_effect_that_moves_the_body_as_the_twin_errs_is_not_told():
     assert exact.chosen == ("drag",)
     priced = [by_spread(data, m, v) for m, v in zip(off_models, variants, strict=True)]
     assert conclude(weighed(data, *priced), limit=0.0).kind == "nothing_missing"
+
+
+def test_the_adjustment_of_a_twin_that_errs_along_a_response_grows_with_the_square_of_its_error():
+    data, nothing, drag = recorded(0.0, 21)
+    size = np.full_like(data.amplitudes[0], 0.02)
+
+    def kappa(error):
+        twin = TwinError(amplitude=size, draws=(tuple(error * J[..., 0] for J in drag.slopes),))
+        found = infer(data, dataclasses.replace(nothing, numerics=twin))
+        fixed = dataclasses.replace(found.none, discrepancy=Discrepancy(share=0.01))
+        return adjustment(data, dataclasses.replace(found, some=fixed, none=fixed), drag.slopes)
+
+    assert kappa(0.0) == 1.0
+    assert kappa(0.2) - 1 == pytest.approx(4 * (kappa(0.1) - 1), rel=1e-9)
 
 
 def test_a_mode_that_was_found_twice_counts_once():

@@ -151,18 +151,9 @@ class Weighing:
     @cached_property
     def kappa(self) -> float:
         """Mean adjustment over the changes by all names, by the errors of the most probable model."""
-        best, trials = self.best, range(len(self.data.trials))
         changes = [self.change(modes[0]) for modes in self.groups.values()]
-        numerics, n = best.near.numerics, len(changes)
-        if not numerics.draws or not changes:
-            return 1.0
-        gained = []
-        for k, draw in enumerate(numerics.draws):
-            columns = [np.stack([*(c[i] for c in changes), best.discrepancy.twin * draw[i]], -1) for i in trials]
-            # What a draw is worth to an effect is seen where it is none of the errors that are known.
-            product = total(products(self.data, numerics.without(k), best.discrepancy, columns)).product
-            gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
-        return 1.0 + float(np.mean(gained))
+        columns = tuple(np.stack(same, -1) for same in zip(*changes, strict=True))
+        return adjustment(self.data, self.best, columns) if changes else 1.0
 
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
@@ -223,6 +214,30 @@ class Weighing:
             for name, modes in groups.items()
         ]
         return probabilities, sorted(found, key=lambda c: -c.probability)
+
+
+def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
+    """Kappa, on average over changes of the motion.
+
+    Args:
+        data: Recordings.
+        found: Whose errors count.
+        changes: Of each trial [T, M, A, E] m.
+    """
+    numerics, n = found.near.numerics, changes[0].shape[-1]
+    if not numerics.draws or not n:
+        return 1.0
+    gained = []
+    for k, draw in enumerate(numerics.draws):
+        # A sample that was lost tells nothing of a change either.
+        columns = [
+            np.concatenate([np.where(np.isfinite(d)[..., None], c, np.nan), found.discrepancy.twin * d[..., None]], -1)
+            for c, d in zip(changes, draw, strict=True)
+        ]
+        # What a draw is worth to an effect is seen where it is none of the errors that are known.
+        product = total(products(data, numerics.without(k), found.discrepancy, columns)).product
+        gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
+    return 1.0 + float(np.mean(gained))
 
 
 def normalised(ln_p: dict[str, float]) -> dict[str, float]:

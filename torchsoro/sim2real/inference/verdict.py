@@ -13,7 +13,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses, weigh, weighing_of
-from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
+from torchsoro.sim2real.inference.conclusion import Conclusion, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict
@@ -143,7 +143,9 @@ def weighed(
         known = [k for k in known if k[1] not in far or k[1].near.model.name not in sound] + again
         weighing = weighing_of(problem, [p for _, p in known], names)
     changes = responses(problem, effects, _fit_of(known, weighing.null))
-    asked = data, weighing.null, changes, weighing.kappa, names
+    # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
+    kappa = weighing.kappa if weighing.groups else adjustment(data, weighing.null, changes)
+    asked = data, weighing.null, changes, kappa, names
     found = conclude(weighing, visible.limit(*asked), visible.remedies(*asked))
     ranking = [
         Candidate(
