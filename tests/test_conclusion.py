@@ -177,6 +177,15 @@ def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told()
     assert (found.kind, found.chosen) == ("unknown_physics", ())
 
 
+def test_an_effect_that_leaves_no_more_than_the_twin_may_err_is_told():
+    data, nothing, drag = recorded(0.3, 15, effect=0.6)
+    (candidate,) = conclude(weighed(data, nothing, drag), limit=0.0).candidates
+    # Priced as large as what is left, the error of the twin may be all of it.
+    price = TwinError(amplitude=np.full_like(data.amplitudes[0], 1.05 * candidate.left), time=0.1)
+    found = conclude(weighed(data, *(dataclasses.replace(m, numerics=price) for m in (nothing, drag))), limit=0.0)
+    assert (found.kind, found.chosen) == ("explained", ("drag",))
+
+
 def test_numbers_that_are_told_leave_the_least_where_a_discrepancy_matters():
     data, _, drag = recorded(0.3, 16, effect=0.6)
     found = infer(data, drag)

@@ -284,7 +284,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
-    # What does not matter is nothing, and what leaves much of the difference is not what is missing.
+    # What does not matter is nothing; what leaves much of the difference, more than the twin may err, is not missing.
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
@@ -295,7 +295,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         plain = [d for d in plain if apart(c.best, d.best) < least]
         if c.size < least:
             told[NOTHING] += c.probability
-        elif c.best.matters and c.left > UNEXPLAINED * left:
+        elif c.best.matters and c.left > max(UNEXPLAINED * left, c.best.near.numerics.size):
             told[UNKNOWN] += c.probability
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name

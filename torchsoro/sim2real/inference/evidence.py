@@ -69,6 +69,11 @@ class TwinError:
     draws: tuple[Motions, ...] = ()
     modes: Motions = ()
 
+    @property
+    def size(self) -> float:
+        """Root mean square over axes and markers [m]."""
+        return math.sqrt(float((self.amplitude**2).mean()))
+
     def without(self, draw: int) -> TwinError:
         """The same, of whose modes the one of a draw is not known."""
         if not self.modes:
@@ -335,8 +340,7 @@ def ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
 def least_that_matters(data: Data, numerics: TwinError) -> float:
     """Ln s of the least discrepancy that matters: less than the twin's price may be its own error in another form."""
     least, most = data.shares
-    price = math.sqrt(float((numerics.amplitude**2).mean())) / data.size
-    return math.log(min(max(least, price), 0.9 * most))
+    return math.log(min(max(least, numerics.size / data.size), 0.9 * most))
 
 
 def _discrepancy(x: np.ndarray) -> Discrepancy:
