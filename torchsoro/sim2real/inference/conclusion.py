@@ -295,7 +295,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         plain = [d for d in plain if apart(c.best, d.best) < least]
         if c.size < least:
             told[NOTHING] += c.probability
-        elif c.best.matters and c.left > max(UNEXPLAINED * left, c.best.near.numerics.size):
+        elif c.best.matters and c.left > max(UNEXPLAINED * left, c.best.near.numerics.size, null.near.numerics.size):
             told[UNKNOWN] += c.probability
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name
