@@ -146,14 +146,14 @@ def _corrected(
     by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     sharp = [_residuals(problem, f, motions) for f, motions in zip(fits, by_fine.simulate(ask), strict=True)]
-    if any(s.planes for s in problem.scenarios):
+    if problem.rough:
         touching = _touching(problem, coarse, fits)
         found: list[Linearised | None] = []
         for model, finer, variants in zip(models, sharp, touching, strict=True):
             if model is None or not finer or not variants:
                 found.append(None)
                 continue
-            # What a plane's place changes, by the twin in use: the finer one would take a hundred times as long.
+            # What a plane's place changes, by the twin in use: the finer one would take some twenty times as long.
             moved = [_sum(finer[0], v, model.residuals) for v in variants]
             found.append(by_spread(data, model, moved, model.residuals, problem.twin.edge / fine.edge))
         return found

@@ -86,7 +86,7 @@ def measure(
 
 def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
-    if not any(s.planes for s in here.scenarios):
+    if not here.rough:
         return []
     moved = [
         s.replace(

@@ -131,6 +131,11 @@ class Likelihood:
         """What is believed of each trial, until the end of its recording."""
         return tuple(self.twin.scenario(t).replace(until=self.observation.until(i)) for i, t in enumerate(self.trials))
 
+    @property
+    def rough(self) -> bool:
+        """Whether a trial has planes: what touches when makes chi-squared rough."""
+        return any(s.planes for s in self.scenarios)
+
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:
         """What is fitted always, modulus and where there is one pressure, with its tolerance."""

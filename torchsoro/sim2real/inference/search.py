@@ -9,7 +9,7 @@ import torch
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE
+from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE, Request
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
 from torchsoro.sim2real.twin.twin import Twin
@@ -59,8 +59,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    rough = any(s.planes for s in problem.scenarios)
-    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if rough else MOST))
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough else MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -83,7 +82,7 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
-    if rough:
+    if problem.rough:
         tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
@@ -183,11 +182,17 @@ def _screened(
     """Chi-squared of each effect at evenly spread points: of a rough motion, no response tells it from afar."""
     points = [spread(problem.twin, e) for e in effects]
     at = [np.concatenate([np.tile(null_model.point, (len(x), 1)), x], 1) for x in points]
-    motions = problem.simulate([((e,), x) for e, x in zip(effects, at, strict=True)])
+    asked = [((e,), x) for e, x in zip(effects, at, strict=True)]
+    rows = zip(effects, at, _simulated(problem, asked, null_model.errors), strict=True)
+    return [(chi2, effect, x[k]) for effect, x, left in rows for k, chi2 in left.items()]
+
+
+def _simulated(problem: FitProblem, asked: Sequence[Request], errors: np.ndarray) -> list[dict[int, float]]:
+    """Chi-squared at the points of each request by their number, without those that break down."""
     found = []
-    for effect, x, seen in zip(effects, at, motions, strict=True):
-        for k in map(int, np.flatnonzero(np.all([m.sound for m in seen], axis=0))):
-            found.append((problem.measure([m.alone(k) for m in seen], null_model.errors)[0], effect, x[k]))
+    for motions in problem.simulate(asked):
+        sound = map(int, np.flatnonzero(np.all([m.sound for m in motions], axis=0)))
+        found.append({k: problem.measure([m.alone(k) for m in motions], errors)[0] for k in sound})
     return found
 
 
@@ -279,7 +284,7 @@ def _fit_null_model(
     Where bodies touch planes, chi-squared has many valleys in what is stated: an effect that is searched from more
     places than the null model would be told for having found the better one.
     """
-    if any(s.planes for s in problem.scenarios):
+    if problem.rough:
         tasks = [*tasks, *_null_starts(problem)]
     while True:
         # What did well on the beginning of the trials may break down later.
@@ -309,10 +314,7 @@ def within_tolerances(problem: FitProblem) -> np.ndarray:
 def _null_starts(problem: FitProblem) -> list[Task]:
     """Where the stated numbers, within their tolerances, leave the least, of evenly spread points."""
     points = within_tolerances(problem)
-    motions = problem.simulate([((), points)])[0]
-    errors = np.zeros(len(problem.observation.deviations))
-    sound = np.flatnonzero(np.all([m.sound for m in motions], axis=0))
-    left = {int(k): problem.measure([m.alone(int(k)) for m in motions], errors)[0] for k in sound}
+    (left,) = _simulated(problem, [((), points)], np.zeros(len(problem.observation.deviations)))
     return [((), points[k]) for k in sorted(left, key=lambda k: left[k])[:FIRST]]
 
 
