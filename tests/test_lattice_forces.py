@@ -206,11 +206,17 @@ def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamb
 def test_tiles_cover_an_axis_and_no_node_belongs_to_more_than_two(cells, creased, most):
     a = axis(*np.ones(cells), creases=tuple(c for c in creased if c < cells))
     tiles = tiles_along(a, most)
-    assert np.concatenate([np.arange(c, c + n) for c, n, _ in tiles]).tolist() == list(range(cells))
-    nodes = np.concatenate([np.arange(first, first + n + 2) for _, n, first in tiles])
-    assert all((a.first[c : c + n] == first + np.arange(n)).all() for c, n, first in tiles)
+    taken = [[first + k for k in range(most) if seats >> k & 1] for _, seats, first in tiles]
+    assert sum(taken, []) == a.first.tolist()
+    assert [c for c, _, _ in tiles] == np.cumsum([0, *(len(t) for t in taken[:-1])]).tolist()
+    assert all(seats < 2**most for _, seats, _ in tiles)
+    nodes = np.concatenate([np.arange(t[0], t[-1] + 3) for t in taken])
     count = np.bincount(nodes, minlength=a.nodes)
     assert 1 <= count.min() <= count.max() <= 2
+
+
+def test_a_tile_goes_on_beyond_a_crease_and_leaves_a_seat_free_there():
+    assert tiles_along(axis(1, 1, 1, 1, creases=(1,)), 4).tolist() == [[0, 0b1101, 0], [3, 0b1, 4]]
 
 
 def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
@@ -224,7 +230,7 @@ def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
     assert len(np.unique(at)) == len(at)
     assert at.max() < many * layout.SLOT
     tiles = [tiles_along(a, n) for a, n in zip(lat.axes, layout.TILE_CELLS, strict=True)]
-    counts = [np.bincount(np.concatenate([np.arange(f, f + n + 2) for _, n, f in t])) for t in tiles]
+    counts = [np.bincount(np.concatenate([np.arange(f, f + int(n).bit_length() + 2) for _, n, f in t])) for t in tiles]
     wanted = counts[0][:, None, None] * counts[1][None, :, None] * counts[2][None, None, :]
     assert (sources[0] >= 0).sum(0).tolist() == wanted.reshape(-1).tolist()
     assert chamber_start.tolist() == [0, len(slots), len(slots)]

@@ -133,8 +133,9 @@ WALL_VECTORS = 15
 STEP_SIZE, EDGE, AXES = 0, 1, 2
 AXIS = 6
 
-# A tile is a box of cells whose points a block of threads works on, one each; its nodes are two more along each axis
-# than its cells, as it ends at creases. A node belongs to two tiles along each axis at most.
+# A tile is a box of seats for cells whose points a block of threads works on, one each. Its nodes are two more along
+# each axis than its seats, of which one stays free where a crease crosses the tile. A node belongs to two tiles along
+# each axis at most.
 TILE_CELLS = (2, 4, 4)
 TILE = 256  # points of a tile
 TILE_X, TILE_Y, TILE_Z = (n + 2 for n in TILE_CELLS)  # nodes

@@ -170,7 +170,7 @@ def tile_box(block: ti.template(), fresh, item):
     """What is to be known of a tile, number ``item`` of all simulations; a GPU keeps it at hand until ``fresh``.
 
     Returns:
-        Lowest cell; cells along x, y, z; lowest node; where its pairs with chambers begin and end; the simulation, and
+        Lowest cell; which seats along x, y, z have a cell; lowest node; where its pairs with chambers begin and end; the simulation, and
         the tile's number in it.
     """
     box = ti.Vector([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
@@ -183,24 +183,29 @@ def tile_box(block: ti.template(), fresh, item):
     else:
         for k in ti.static(range(13)):
             box[k] = tile_number(block.head, block.ints, item, k)
-    cell, cells = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
-    return cell, cells, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
+    cell, seats = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
+    return cell, seats, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
 
 
 @ti.func
-def point_place(cell, q):
-    """Number, along each axis, of the tile's point q."""
-    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
-    return ti.Vector([2 * cell[0] + x, 2 * cell[1] + y, 2 * cell[2] + z])
+def number_along(cell, seats, most: ti.template(), at):
+    """Along an axis, the number of a tile's point ``at`` among those of the lattice; -1 at a free seat."""
+    seat = at // 2
+    found = 2 * cell + at % 2
+    for k in ti.static(range(most - 1)):
+        found += ti.select(k < seat, 2 * (seats >> k & 1), 0)
+    return ti.select(seats >> seat & 1 == 1, found, -1)
 
 
 @ti.func
-def point_of(head: ti.template(), cell, cells, q):
-    """The point that thread q works on; -1 if the tile has fewer."""
-    at = point_place(cell, q) - 2 * cell
+def point_of(head: ti.template(), cell, seats, q):
+    """The point that thread q works on; -1 if the tile has none there."""
+    x = number_along(cell[0], seats[0], TILE_CELLS[0], q // ti.static(DEEP * HIGH))
+    y = number_along(cell[1], seats[1], TILE_CELLS[1], (q // HIGH) % DEEP)
+    z = number_along(cell[2], seats[2], TILE_CELLS[2], q % HIGH)
     p = ti.cast(-1, ti.i32)
-    if at[0] < 2 * cells[0] and at[1] < 2 * cells[1] and at[2] < 2 * cells[2]:
-        p = ((2 * cell[0] + at[0]) * head[NY] + 2 * cell[1] + at[1]) * head[NZ] + 2 * cell[2] + at[2]
+    if x >= 0 and y >= 0 and z >= 0:
+        p = (x * head[NY] + y) * head[NZ] + z
     return p
 
 
@@ -235,20 +240,21 @@ def stage(block: ti.template(), a: ti.template(), at, number: ti.template(), nod
 
 
 @ti.func
-def stage_axes(block: ti.template(), cell, cells):
-    """Copy weights and slopes of a tile's points along the axes to the pad; zeros for cells that it has not."""
+def stage_axes(block: ti.template(), cell, seats):
+    """Copy weights and slopes of a tile's points along the axes to the pad; zeros for free seats."""
     starts = axis_starts(block.head)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
         if q < ti.static(AXIS * (WIDE + DEEP + HIGH)):
-            p, start, first, count = q // AXIS, starts[0], cell[0], cells[0]
-            if p >= ti.static(WIDE + DEEP):
-                p, start, first, count = p - ti.static(WIDE + DEEP), starts[2], cell[2], cells[2]
-            elif p >= WIDE:
-                p, start, first, count = p - WIDE, starts[1], cell[1], cells[1]
+            p, start = number_along(cell[0], seats[0], TILE_CELLS[0], q // AXIS), starts[0]
+            if q >= ti.static(AXIS * (WIDE + DEEP)):
+                along = q // AXIS - ti.static(WIDE + DEEP)
+                p, start = number_along(cell[2], seats[2], TILE_CELLS[2], along), starts[2]
+            elif q >= ti.static(AXIS * WIDE):
+                p, start = number_along(cell[1], seats[1], TILE_CELLS[1], q // AXIS - WIDE), starts[1]
             number = block.fixed[STEP_SIZE] * 0
-            if p < 2 * count:
-                number = block.fixed[start + AXIS * (2 * first + p) + q % AXIS]
+            if p >= 0:
+                number = block.fixed[start + AXIS * p + q % AXIS]
             block.pad[block.base + PAD_AXES + q] = number
 
 

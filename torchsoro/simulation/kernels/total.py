@@ -251,10 +251,10 @@ def stress_point(block: ti.template(), q, t, b, p):
 def point_pass(block: ti.template(), item, fresh, t):
     """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
     gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
-    cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
+    cell, seats, node, first, last, b, tile = tile_box(block, fresh, item)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     if fresh == 1:
-        stage_axes(block, cell, cells)
+        stage_axes(block, cell, seats)
     stage(block, block.state, at, 0, node)
     if ti.static(block.features & LOADED):
         if head[VISCOUS] == 1:
@@ -268,13 +268,13 @@ def point_pass(block: ti.template(), item, fresh, t):
         if slot < first:
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                stress_point(block, q, t, b, point_of(head, cell, cells, q))
+                stress_point(block, q, t, b, point_of(head, cell, seats, q))
         else:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                p = point_of(head, cell, cells, q)
+                p = point_of(head, cell, seats, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)

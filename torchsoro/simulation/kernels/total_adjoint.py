@@ -215,12 +215,12 @@ def tally(block: ti.template(), t, b, row):
 def point_pass_adjoint(block: ti.template(), item, fresh, t):
     """Adjoint of ``total.point_pass``."""
     gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
-    cell, cells, node, first, last, b, tile = tile_box(block, fresh, item)
+    cell, seats, node, first, last, b, tile = tile_box(block, fresh, item)
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
     if fresh == 1:
-        stage_axes(block, cell, cells)
+        stage_axes(block, cell, seats)
     stage(block, block.state, at, 0, node)
     stage(block, block.back, head[FORCES] + b * 3 * nodes, 1, node)
     if ti.static(block.features & LOADED):
@@ -236,13 +236,13 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
         if slot < first:
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                stress_point_adjoint(block, q, t, b, point_of(head, cell, cells, q))
+                stress_point_adjoint(block, q, t, b, point_of(head, cell, seats, q))
         elif slot < last:
             out = partials + (tile_count(head) + slot) * SLOT
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                p = point_of(head, cell, cells, q)
+                p = point_of(head, cell, seats, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
@@ -256,7 +256,7 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
                 sync(gpu)
                 for each in range(block.q0, block.q1):
                     q = thread(block, each)
-                    rate_point_adjoint(block, q, b, point_of(head, cell, cells, q))
+                    rate_point_adjoint(block, q, b, point_of(head, cell, seats, q))
         sync(gpu)
         sum_tile(block, ti.cast(slot < first, ti.i32), out, alone)
 

@@ -16,14 +16,18 @@ from torchsoro.simulation.ops.lattice import Lattice
 
 @lru_cache(maxsize=256)
 def tiles_along(axis: Axis, most: int) -> np.ndarray:
-    """The tiles along an axis, of ``most`` cells at most: first cell, cells, first node [T, 3].
+    """The tiles along an axis, of ``most`` seats at most: first cell, which seats have a cell, first node [T, 3].
 
-    They end at creases, so that the nodes of a tile follow each other and no node belongs to more than two tiles.
+    The seats follow each other as the lowest nodes of cells do without creases: a cell beyond a crease has its lowest
+    node two further on, and leaves a seat free. Bit k of the second number is seat k. So no node belongs to more than
+    two tiles.
     """
-    rows = []
-    runs = [0, *(np.flatnonzero(np.diff(axis.first) > 1) + 1).tolist(), axis.cells]
-    for begin, end in itertools.pairwise(runs):
-        rows += [(cell, min(most, end - cell), axis.first[cell]) for cell in range(begin, end, most)]
+    rows, cell = [], 0
+    while cell < axis.cells:
+        seats = axis.first[cell:] - axis.first[cell]
+        seats = seats[seats < most]
+        rows.append((cell, (1 << seats).sum(), axis.first[cell]))
+        cell += len(seats)
     return np.array(rows)
 
 
@@ -149,14 +153,14 @@ def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:
 
 def _tile_of_points(along: np.ndarray) -> np.ndarray:
     """Tile of each point along an axis [2 cells]."""
-    return np.repeat(np.arange(len(along)), 2 * along[:, 1])
+    return np.repeat(np.arange(len(along)), 2 * np.bitwise_count(along[:, 1]))
 
 
 def _tiles_of_nodes(axis: Axis, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tiles that a node along an axis belongs to, and its number among their nodes; each [nodes, 2], -1 for none."""
     tiles, local = np.full((2, axis.nodes, 2), -1)
-    for number, (_, cells, first) in enumerate(along):
-        nodes = np.arange(first, first + cells + 2)
+    for number, (_, seats, first) in enumerate(along):
+        nodes = np.arange(first, first + int(seats).bit_length() + 2)
         free = (tiles[nodes, 0] >= 0).astype(int)
         tiles[nodes, free], local[nodes, free] = number, np.arange(len(nodes))
     return tiles, local
