@@ -207,7 +207,7 @@ def test_tiles_cover_an_axis_and_no_node_belongs_to_more_than_two(cells, creased
     a = axis(*np.ones(cells), creases=tuple(c for c in creased if c < cells))
     tiles = tiles_along(a, most)
     taken = [[first + k for k in range(most) if seats >> k & 1] for _, seats, first in tiles]
-    assert sum(taken, []) == a.first.tolist()
+    assert [c for t in taken for c in t] == a.first.tolist()
     assert [c for c, _, _ in tiles] == np.cumsum([0, *(len(t) for t in taken[:-1])]).tolist()
     assert all(seats < 2**most for _, seats, _ in tiles)
     nodes = np.concatenate([np.arange(t[0], t[-1] + 3) for t in taken])

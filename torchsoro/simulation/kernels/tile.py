@@ -170,8 +170,8 @@ def tile_box(block: ti.template(), fresh, item):
     """What is to be known of a tile, number ``item`` of all simulations; a GPU keeps it at hand until ``fresh``.
 
     Returns:
-        Lowest cell; which seats along x, y, z have a cell; lowest node; where its pairs with chambers begin and end; the simulation, and
-        the tile's number in it.
+        Lowest cell; which seats along x, y, z have a cell; lowest node; where its pairs with chambers begin and end;
+        the simulation, and the tile's number in it.
     """
     box = ti.Vector([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     if ti.static(block.gpu):
