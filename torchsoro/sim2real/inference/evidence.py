@@ -30,7 +30,7 @@ from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Pro
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
 NARROW = 0.05  # of ln s, ln tau and ln c: what they need not be known better than
-FIRST = 0.5  # step in ln s, ln tau and ln c with which their search begins
+FIRST, AGAIN = 0.5, 0.1  # steps in ln s, ln tau and ln c with which their search begins; and where it was before
 APART = 0.15  # of ln s, ln tau and ln c, for second differences
 LEAST_PRICE = 0.1  # of the price of the twin's error, that it has; the noise is above what is less
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
@@ -260,9 +260,9 @@ def infer(data: Data, near: Linearised) -> Posterior:
     def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> Branch:
         """The mode, and the ln s, ln tau and ln c that its residual tells, within bounds."""
         x = start
-        for _ in range(ALTERNATIONS):
+        for k in range(ALTERNATIONS):
             left = near.left(mode_of(data, near, _discrepancy(x)).at)
-            before, x = x, _restricted(data, near, left, x, low, high)
+            before, x = x, _restricted(data, near, left, x, low, high, AGAIN if k else FIRST)
             if np.abs(x - before).max() < NARROW:
                 break
         mode = mode_of(data, near, _discrepancy(x))
@@ -355,9 +355,9 @@ def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: 
 
 
 def _restricted(
-    data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray
+    data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray, step: float
 ) -> np.ndarray:
-    """Ln s, ln tau and ln c with which residuals are most probable, within bounds."""
+    """Ln s, ln tau and ln c with which residuals are most probable, within bounds, near x."""
     moving = np.flatnonzero(high > low)
 
     def at(free: np.ndarray) -> np.ndarray:
@@ -366,7 +366,7 @@ def _restricted(
         return full
 
     start = np.clip(x, low, high)[moving]
-    away = np.where(start > 0.5 * (low + high)[moving], -FIRST, FIRST)
+    away = np.where(start > 0.5 * (low + high)[moving], -step, step)
     found = minimize(
         lambda free: -_ln_likelihood(data, near, left, at(free)),
         start,

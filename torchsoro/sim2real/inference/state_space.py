@@ -19,6 +19,8 @@ import numba
 import numpy as np
 
 ROWS = 20_000  # that are filtered at once, which bounds the memory for a long recording
+EVEN = 1e-7  # of the interval between samples, by which it is the same
+SETTLED = 1e-8  # change of gains and variances from sample to sample, below which they are kept
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -47,44 +49,29 @@ class ErrorModel:
     white: np.ndarray
     processes: tuple[Process, ...] = ()
 
-    def whiten(self, time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, float]:
-        """Innovations of columns over their standard deviation.
-
-        Args:
-            time: [T] s, increasing.
-            values: Columns [T, M, A, C] m; a sample is lost where the first column is not a number.
-
-        Returns:
-            Columns [N, C] of unit covariance, and ln of the determinant of the covariance of the N samples.
-        """
-        parts, ln_det = [], 0.0
-        for axis in range(values.shape[2]):
-            one = Filter(self, axis)
-            _, white, ln_part = one.advance(one.start(values.shape[-1]), time, values[:, :, axis])
-            parts.append(white)
-            ln_det += ln_part
-        return np.concatenate(parts), ln_det
-
     def gram(self, chunks: Iterable[tuple[np.ndarray, np.ndarray]]) -> Gram:
         """Products of columns under the inverse of the covariance, of parts of a recording that follow each other.
 
         Args:
-            chunks: Times [T] s and columns [T, M, A, C] m of each part.
+            chunks: Times [T] s, increasing, and columns [T, M, A, C] m of each part; a sample is lost where the first
+                column is not a number.
         """
-        filters: list[Filter] = []
-        states: list[State] = []
-        product, ln_det, count = np.zeros((0, 0)), 0.0, 0
+        axes, _ = self.white.shape
+        rate = np.concatenate([np.zeros(0), *(np.full(p.loading.shape[2], 1 / p.time) for p in self.processes)])
+        loading = np.concatenate([np.zeros((*self.white.shape, 0)), *(p.loading for p in self.processes)], 2)
+        # Each process begins with the variance that it has at all times.
+        covariance = np.tile(np.eye(len(rate)), (axes, 1, 1))
+        product, mean, last, ln_det, count = np.zeros((0, 0)), np.zeros((0, 0, 0)), -math.inf, 0.0, 0
         for time, values in chunks:
-            if not filters:
-                filters = [Filter(self, axis) for axis in range(values.shape[2])]
-                states = [one.start(values.shape[-1]) for one in filters]
-                product = np.zeros((values.shape[-1],) * 2)
-            for axis, one in enumerate(filters):
-                states[axis], white, ln_part = one.advance(states[axis], time, values[:, :, axis])
-                product += white.T @ white
-                ln_det += ln_part
-                count += len(white)
-        return Gram(product=product, ln_det=ln_det, count=count)
+            if not product.size:
+                columns = values.shape[-1]
+                product, mean = np.zeros((columns, columns)), np.zeros((axes, columns, len(rate)))
+            time, values = (np.ascontiguousarray(x, dtype=np.float64) for x in (time, values))
+            seen = np.isfinite(values[..., 0])
+            ln_det += _filter(time, values, seen, rate, loading, self.white**2, last, mean, covariance, product)
+            count += int(seen.sum())
+            last = float(time[-1])
+        return Gram(product=product + np.tril(product, -1).T, ln_det=ln_det, count=count)
 
     def dense(self, time: np.ndarray, axis: int) -> np.ndarray:
         """The covariance of all samples along an axis [T M, T M] m2, of marker 0 at all times first; for short ones."""
@@ -151,111 +138,85 @@ def total(grams: Sequence[Gram]) -> Gram:
     return first
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class State:
-    """What a filter expects after the samples so far.
+@numba.njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
+def _filter(time, values, seen, rate, loading, variance, last, mean, covariance, product):
+    """Kalman filter of many columns along each axis; returns ln of the product of the innovations' variances.
 
-    Attributes:
-        time: Of the last of them [s]; minus infinity before the first.
-        mean: Of the processes, column by column [K, C].
-        covariance: Of the processes [K, K].
+    ``mean`` and ``covariance`` are changed, and to the lower triangle of ``product`` are added the products of the
+    innovations over their standard deviations. Where samples follow each other evenly, gains settle; they are then
+    kept, until the interval changes or a sample is lost.
     """
-
-    time: float
-    mean: np.ndarray
-    covariance: np.ndarray
-
-
-class Filter:
-    """A Kalman filter of many columns along one axis.
-
-    Args:
-        model: Of the errors.
-        axis: Number of the recorded axis.
-    """
-
-    def __init__(self, model: ErrorModel, axis: int) -> None:
-        rates = [np.full(p.loading.shape[2], 1 / p.time) for p in model.processes]
-        loadings = [p.loading[axis] for p in model.processes]
-        loading = np.concatenate([np.zeros((len(model.white[axis]), 0)), *loadings], 1)
+    rows, markers, axes, columns = values.shape
+    ln_det = 0.0
+    for a in range(axes):
         # A process that no marker sees would only cost time.
-        seen = loading.any(0)
-        self.rate = np.concatenate([np.zeros(0), *rates])[seen]
-        self.loading = np.ascontiguousarray(loading[:, seen])
-        self.variance = model.white[axis] ** 2
-
-    def start(self, columns: int) -> State:
-        """Before the first sample: each process with the variance that it has at all times."""
-        return State(time=-math.inf, mean=np.zeros((len(self.rate), columns)), covariance=np.eye(len(self.rate)))
-
-    def advance(self, state: State, time: np.ndarray, values: np.ndarray) -> tuple[State, np.ndarray, float]:
-        """State, innovations over their standard deviation [N, C], and the ln of the product of their variances.
-
-        Args:
-            state: After the samples so far.
-            time: Of the next samples [T] s.
-            values: Columns [T, M, C].
-        """
-        seen = np.isfinite(values[..., 0])
-        found = np.zeros((int(seen.sum()), values.shape[-1]))
-        mean, covariance = state.mean.copy(), state.covariance.copy()
-        ln_det = _advance(
-            np.ascontiguousarray(time, dtype=np.float64),
-            np.ascontiguousarray(values, dtype=np.float64),
-            seen,
-            self.rate,
-            self.loading,
-            self.variance,
-            state.time,
-            mean,
-            covariance,
-            found,
-        )
-        return State(time=float(time[-1]), mean=mean, covariance=covariance), found, ln_det
-
-
-@numba.njit(cache=True, nogil=True)
-def _advance(time, values, seen, rate, loading, variance, last, mean, covariance, found):
-    """Predict to each time and take in its samples one by one; ``mean`` and ``covariance`` are changed."""
-    states, columns, markers = len(rate), values.shape[2], values.shape[1]
-    keep, gain, left = np.zeros(states), np.zeros(states), np.zeros(columns)
-    ln_det, row = 0.0, 0
-    for t in range(len(time)):
-        lag, last = time[t] - last, time[t]
-        for i in range(states):
-            keep[i] = math.exp(-lag * rate[i])
-        for i in range(states):
-            for j in range(states):
-                covariance[i, j] *= keep[i] * keep[j]
-            covariance[i, i] += 1.0 - keep[i] * keep[i]
-            for c in range(columns):
-                mean[i, c] *= keep[i]
+        some = np.zeros(len(rate), dtype=np.bool_)
         for m in range(markers):
-            if not seen[t, m]:
-                continue
-            for c in range(columns):
-                left[c] = values[t, m, c]
-            for i in range(states):
-                gain[i] = 0.0
+            for k in range(len(rate)):
+                some[k] |= loading[a, m, k] != 0.0
+        used = np.flatnonzero(some)
+        states = len(used)
+        L, x, P = np.zeros((markers, states)), np.zeros((columns, states)), np.zeros((states, states))
+        for i in range(states):
+            L[:, i], x[:, i] = loading[a, :, used[i]], mean[a, :, used[i]]
             for j in range(states):
-                seen_by = loading[m, j]
-                if seen_by != 0.0:
-                    for i in range(states):
-                        gain[i] += covariance[i, j] * seen_by
-                    for c in range(columns):
-                        left[c] -= seen_by * mean[j, c]
-            spread = variance[m]
-            for i in range(states):
-                spread += loading[m, i] * gain[i]
-            ln_det += math.log(spread)
-            root = math.sqrt(spread)
+                P[i, j] = covariance[a, used[i], used[j]]
+        keep, by, gain, white = np.zeros(states), np.zeros(states), np.zeros((markers, states)), np.zeros(columns)
+        spread, root, ln_root = np.zeros(markers), np.zeros(markers), np.zeros(markers)
+        before, lag, settled = last, math.inf, False
+        for t in range(rows):
+            same = lag < math.inf and abs(time[t] - before - lag) <= EVEN * lag
+            if not same:
+                lag = time[t] - before
+                for i in range(states):
+                    keep[i] = math.exp(-lag * rate[used[i]])
+            before = time[t]
+            for m in range(markers):
+                same &= seen[t, m, a]
+            settled &= same
+            change = 0.0 if same else 1.0
             for c in range(columns):
-                found[row, c] = left[c] / root
-            row += 1
-            for i in range(states):
-                share = gain[i] / spread
+                for i in range(states):
+                    x[c, i] *= keep[i]
+            if not settled:
+                for i in range(states):
+                    for j in range(states):
+                        P[i, j] *= keep[i] * keep[j]
+                    P[i, i] += 1.0 - keep[i] * keep[i]
+            for m in range(markers):
+                if not seen[t, m, a]:
+                    continue
+                if not settled:
+                    by[:] = 0.0
+                    for j in range(states):
+                        if L[m, j] != 0.0:
+                            for i in range(states):
+                                by[i] += P[j, i] * L[m, j]
+                    known, spread[m] = spread[m], variance[a, m]
+                    for i in range(states):
+                        spread[m] += L[m, i] * by[i]
+                    root[m], ln_root[m] = math.sqrt(spread[m]), 0.5 * math.log(spread[m])
+                    change = max(change, abs(known / spread[m] - 1.0))
+                    for i in range(states):
+                        share = by[i] / spread[m]
+                        change = max(change, abs(share - gain[m, i]) * root[m])
+                        gain[m, i] = share
+                        for j in range(states):
+                            P[i, j] -= share * by[j]
                 for c in range(columns):
-                    mean[i, c] += share * left[c]
-                for j in range(states):
-                    covariance[i, j] -= share * gain[j]
+                    left = values[t, m, a, c]
+                    for i in range(states):
+                        left -= L[m, i] * x[c, i]
+                    for i in range(states):
+                        x[c, i] += gain[m, i] * left
+                    white[c] = left / root[m]
+                for c in range(columns):
+                    for d in range(c + 1):
+                        product[c, d] += white[c] * white[d]
+                ln_det += 2.0 * ln_root[m]
+            settled = settled or change < SETTLED
+        for i in range(states):
+            mean[a, :, used[i]] = x[:, i]
+            for j in range(states):
+                covariance[a, used[i], used[j]] = P[i, j]
     return ln_det
