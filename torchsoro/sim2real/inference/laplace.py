@@ -23,6 +23,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 from scipy.special import erfcx, roots_legendre
 
@@ -34,6 +35,7 @@ NEAR = 8.0  # standard deviations from a mode, beyond which a bound takes nothin
 FLAT = 1e-4  # weight of a uniform prior over the squared inverse of its width, so that H can be inverted
 EDGE = 1e-6  # of a standard deviation, within which an unknown is at its bound
 ROUNDS = 30  # of iterated least squares, at most
+PATIENT = 10  # times the number of unknowns: changes of the set of those at bounds, at most
 SWEEPS = 50  # of expectation propagation, at most
 SETTLED = 1e-9  # change of ln P in one, below which it is done
 LN_TWO_PI = math.log(2 * math.pi)
@@ -117,8 +119,10 @@ def _bounded(H: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray)
         return x
     scale = 1 / np.sqrt(np.diag(H))
     root = np.linalg.cholesky(H * np.outer(scale, scale)).T
-    found = lsq_linear(root, np.linalg.solve(root.T, pull * scale), bounds=(low / scale, high / scale), tol=1e-12)
-    # From inside, bounds are reached but for the last digits.
+    wanted = solve_triangular(root, pull * scale, trans="T")
+    limits = low / scale, high / scale
+    found = lsq_linear(root, wanted, bounds=limits, method="bvls", tol=1e-12, max_iter=PATIENT * len(x))
+    # Bounds are reached but for the rounding of the scale.
     x = np.where(found.x * scale - low < EDGE * scale, low, found.x * scale)
     return np.where(high - x < EDGE * scale, high, x)
 

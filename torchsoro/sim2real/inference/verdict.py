@@ -24,6 +24,8 @@ FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
 ROUNDS = 3  # of that, at most
+AHEAD = 3  # ends of searches that are always weighed
+FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of the running
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -130,7 +132,7 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *_other_valleys(problem), *ends])
+    known = weigh(problem, [null_model, *strained, *_other_valleys(problem), *_running(problem, ends)])
     weighing = weighing_of(problem, [p for _, p in known], names)
     for _ in range(ROUNDS):
         leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
@@ -169,6 +171,15 @@ def weighed(
         conclusion=found,
     )
     return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
+
+
+def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
+    """Ends of searches that may be the most probable; all of them where the twin is too rough to say."""
+    if problem.rough or not ends:
+        return list(ends)
+    least = min(max(f.chi2, f.samples) for f in ends)
+    order = sorted(ends, key=lambda fit: fit.chi2)
+    return [f for k, f in enumerate(order) if k < AHEAD or f.chi2 < FARTHER * least]
 
 
 def _other_valleys(problem: FitProblem) -> list[Fit]:
