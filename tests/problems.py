@@ -269,15 +269,16 @@ def walls_around(lattice: Lattice, low: tuple[int, int, int], high: tuple[int, i
     )
 
 
-def completed(p: Problem, *, starts: bool = False) -> Problem:
+def completed(p: Problem, *, starts: bool = False, end: tuple[int, int, int] = (2, 2, 2)) -> Problem:
     """A problem of the total-Lagrangian form with all else in it that this form has.
 
-    Softening, quadratic drag, a hollow chamber around the cell (1, 1, 1), held nodes, forces on nodes, springs to mean
-    displacements, and what is attached to nodes.
+    Softening, quadratic drag, a hollow chamber from the cell (1, 1, 1) to before ``end``, held nodes, forces on nodes,
+    springs to mean displacements, and what is attached to nodes.
 
     Args:
         p: The problem; changed.
         starts: Whether forces are constant from a substep on.
+        end: Of the chamber.
     """
     g = torch.Generator().manual_seed(7)
     lattice, batch = p.scene.lattice, len(p.tensors["state"])
@@ -288,7 +289,7 @@ def completed(p: Problem, *, starts: bool = False) -> Problem:
         return torch.rand(*shape, generator=g, dtype=torch.float64)
 
     faces = Faces(touches=rand(nodes) > 0.3, ends=rand(3, 2, nodes), front=rand(nodes, 3))
-    lattice = replace(lattice, faces=faces, walls=walls_around(lattice, (1, 1, 1), (2, 2, 2)))
+    lattice = replace(lattice, faces=faces, walls=walls_around(lattice, (1, 1, 1), end))
     steps = p.tensors["gravity"].shape[0]
     p.scene = replace(
         p.scene,

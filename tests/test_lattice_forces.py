@@ -129,6 +129,18 @@ def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, 
     assert max(off.values()) <= within, off
 
 
+def test_both_engines_agree_on_walls_of_more_points_than_a_tile_has_room_for():
+    axes = (Axis.uniform(5.0, 1.0, 3), Axis.uniform(3.0, 0.5, 16), Axis.uniform(3.0, 0.5, 16))
+    states = []
+    for lanes in (True, False):
+        lattice = Lattice(axes=axes)
+        p = completed(problem(formulation="total", lattice=lattice, steps=3, samples=(), lanes=lanes), end=(2, 15, 15))
+        walls = p.scene.lattice.walls  # type: ignore[union-attr]
+        assert 3 * len(walls.places) > layout.PAD - 2 * layout.TILE  # type: ignore[union-attr]
+        states.append(p.run()[0][0, : 6 * lattice.nodes])
+    assert float((states[0] - states[1]).norm()) < 1e-12 * float(states[0].norm())
+
+
 def on(device, p):
     """Outputs of the kernels of a GPU on a device, and gradients of their sum."""
     torchsoro.init(device)

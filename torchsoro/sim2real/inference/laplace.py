@@ -119,7 +119,7 @@ def _bounded(H: np.ndarray, pull: np.ndarray, low: np.ndarray, high: np.ndarray)
         return x
     scale = 1 / np.sqrt(np.diag(H))
     root = np.linalg.cholesky(H * np.outer(scale, scale)).T
-    wanted = solve_triangular(root, pull * scale, trans="T")
+    wanted = solve_triangular(root.T, pull * scale, lower=True)
     limits = low / scale, high / scale
     found = lsq_linear(root, wanted, bounds=limits, method="bvls", tol=1e-12, max_iter=PATIENT * len(x))
     # Bounds are reached but for the rounding of the scale.

@@ -6,7 +6,6 @@ import dataclasses
 from dataclasses import dataclass
 from functools import cached_property
 
-import torch
 from torch import Tensor
 
 from torchsoro.simulation.actuation import Waveform
@@ -83,5 +82,4 @@ class Scenario:
             ranks.append((self.prony.moduli, 1))
         if self.pressure is not None:
             ranks.append((self.pressure.pressure, 2))
-        lead = torch.broadcast_shapes(*(t.shape[: t.ndim - rank] for t, rank in ranks))
-        return lead[0] if lead else 1
+        return max(t.shape[0] if t.ndim > rank else 1 for t, rank in ranks)

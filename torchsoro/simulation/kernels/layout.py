@@ -96,7 +96,7 @@ BUFFERS = {
     ),
     "fixed": (
         *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
-        *("quadratic", "tie_share", "ties", "node_share", "walls"),
+        *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights"),
     ),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed"),
@@ -113,14 +113,14 @@ BUFFERS = {
 KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(30, 39)
 WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY = range(39, 43)
 NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(43, 52)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS = range(52, 57)
-PRESSURE, GRAVITY, FORCE = range(57, 60)
-VOLUMES, PUSHED = range(60, 62)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(62, 67)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(67, 71)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(71, 79)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(79, 82)
-HEAD = 82
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(52, 58)
+PRESSURE, GRAVITY, FORCE = range(58, 61)
+VOLUMES, PUSHED = range(61, 63)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(63, 68)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(68, 72)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(72, 80)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(80, 83)
+HEAD = 83
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors.

@@ -449,13 +449,31 @@ def fold(block: ti.template(), k):
             block.pad[block.base + TILE + q] = total
     sync(block.gpu)
     for each in range(block.q0, block.q1):
-        q = thread(block, each)
-        if q == 0:
-            total = block.pad[block.base + TILE]
-            for m in ti.static(range(1, PARTS)):
-                total += block.pad[block.base + TILE + m]
-            block.pad[block.base + TOTALS + k] = total
+        if thread(block, each) == 0:
+            fold_last(block, k)
     sync(block.gpu)
+
+
+@ti.func
+def fold_last(block: ti.template(), k):
+    """Sum PARTS numbers at TILE of the pad, to number k of TOTALS."""
+    total = block.pad[block.base + TILE]
+    for m in ti.static(range(1, PARTS)):
+        total += block.pad[block.base + TILE + m]
+    block.pad[block.base + TOTALS + k] = total
+
+
+@ti.func
+def fold_parts(block: ti.template(), k, count):
+    """The same of so many numbers, which are at TILE of the pad, too, where there are PARTS of them at most."""
+    if count > PARTS:
+        fold(block, k)
+    else:
+        sync(block.gpu)
+        for each in range(block.q0, block.q1):
+            if thread(block, each) == 0:
+                fold_last(block, k)
+        sync(block.gpu)
 
 
 @ti.func
@@ -473,4 +491,6 @@ def sum_chambers(block: ti.template(), b):
                 total += block.scratch[swept + one]
                 one += TILE
             block.pad[block.base + q] = total
-        fold(block, k)
+            if q < PARTS:
+                block.pad[block.base + TILE + q] = total
+        fold_parts(block, k, last - first)

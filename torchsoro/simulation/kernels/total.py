@@ -119,7 +119,14 @@ from torchsoro.simulation.kernels.tile import (
     tile_gradient,
     tile_value,
 )
-from torchsoro.simulation.kernels.total_walls import chamber_pressure, tie_pass, tied, wall_force, wall_pass
+from torchsoro.simulation.kernels.total_walls import (
+    chamber_pressure,
+    stage_walls,
+    tie_pass,
+    tied,
+    wall_force,
+    wall_pass,
+)
 
 
 @ti.func
@@ -303,6 +310,8 @@ def node_pass(block: ti.template(), item, t):
     b, chunk = item // node_chunks(head), item % node_chunks(head)
     slot = (t % head[KEPT_RING]) * head[BATCH] + b
     sum_chambers(block, b)
+    if ti.static(block.features & HOLLOW):
+        stage_walls(block, t, b)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
         i = chunk * TILE + q

@@ -17,6 +17,7 @@ from torchsoro.simulation.kernels.layout import (
     CHAMBERS,
     FORCES,
     NORMALS,
+    PAD,
     PRESSURE,
     RING,
     SWEPT,
@@ -36,9 +37,12 @@ from torchsoro.simulation.kernels.layout import (
     WALL_NUMBERS,
     WALL_START,
     WALL_VECTORS,
+    WALL_WEIGHTS,
 )
 from torchsoro.simulation.kernels.tensor import add, load_vector, store_vector
 from torchsoro.simulation.kernels.tile import TOTALS, chamber_slots, fold, sync, thread
+
+AT_HAND = 2 * TILE  # of the pad: where what wall points hand over begins
 
 
 @ti.func
@@ -132,12 +136,13 @@ def wall_point(block: ti.template(), w, at):
     corner, axis = at + block.ints[kind], block.ints[kind + 2]
     x = load_vector(fixed, number, 1)
     one, two = x * 0, x * 0
-    for n in range(27):
-        v = number + 4 + 3 * n
-        d = load_vector(block.state, corner + (n // 9 * m[1] + n // 3 % 3) * m[2] + n % 3, product(m))
-        x += fixed[v] * d
-        one += fixed[v + 1] * d
-        two += fixed[v + 2] * d
+    for row in range(9):
+        for k in ti.static(range(3)):  # loads of three nodes at a time
+            v = number + 4 + 3 * (3 * row + k)
+            d = load_vector(block.state, corner + (row // 3 * m[1] + row % 3) * m[2] + k, product(m))
+            x += fixed[v] * d
+            one += fixed[v + 1] * d
+            two += fixed[v + 2] * d
     for c in ti.static(range(3)):
         if axis == (c + 2) % 3:
             one[c] += 1
@@ -193,16 +198,48 @@ def wall_pass(block: ti.template(), item, t):
 
 
 @ti.func
+def wall_pressed(block: ti.template(), t, b, w):
+    """Pressure times area vector of a wall point, whose chamber's volume is at TOTALS of the pad."""
+    head, ints = ti.static((block.head, block.ints))
+    k = ints[head[WALL_KIND] + w * WALL_INTEGERS + 1]
+    p = chamber_pressure(block, t, block.pad[block.base + TOTALS + k], b * head[CHAMBERS] + k)
+    return p * load_vector(block.scratch, wall_vectors(block, b, w), 1)
+
+
+@ti.func
+def walls_at_hand(block: ti.template()):
+    """Whether what wall points hand over has room in the pad, behind the volumes of the chambers."""
+    room = ti.static(PAD - AT_HAND)
+    return block.head[WALL_CHUNKS] * TILE * 3 <= room and block.head[CHAMBERS] <= ti.static(AT_HAND - TOTALS)
+
+
+@ti.func
+def stage_walls(block: ti.template(), t, b):
+    """Copy what the wall points of a simulation hand over to the pad, if there is room."""
+    if walls_at_hand(block):
+        for each in range(block.q0, block.q1):
+            w = thread(block, each)
+            while w < block.head[WALL_CHUNKS] * TILE:
+                store_vector(block.pad, block.base + AT_HAND + 3 * w, 1, wall_pressed(block, t, b, w))
+                w += TILE
+        sync(block.gpu)
+
+
+@ti.func
 def wall_force(block: ti.template(), t, b, i):
     """Force of the pressure in hollow chambers on node i, against which it must be held."""
     head, ints = ti.static((block.head, block.ints))
     found = load_vector(block.fixed, 0, 1) * 0
-    for e in range(ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1]):
-        w, n = ints[head[WALL_ENTRY] + e] // 27, ints[head[WALL_ENTRY] + e] % 27
-        k = ints[head[WALL_KIND] + w * WALL_INTEGERS + 1]
-        p = chamber_pressure(block, t, block.pad[block.base + TOTALS + k], b * head[CHAMBERS] + k)
-        weight = block.fixed[head[WALL_NUMBERS] + w * WALL + 4 + 3 * n]
-        found -= p * weight * load_vector(block.scratch, wall_vectors(block, b, w), 1)
+    first, last, staged = ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1], walls_at_hand(block)
+    for bundle in range((last - first + 3) // 4):
+        for k in ti.static(range(4)):  # loads of four wall points at a time
+            e = ti.min(first + 4 * bundle + k, last - 1)
+            w, weight = ints[head[WALL_ENTRY] + e] // 27, block.fixed[head[WALL_WEIGHTS] + e]
+            weight = ti.select(first + 4 * bundle + k < last, weight, weight * 0)
+            if staged:
+                found -= weight * load_vector(block.pad, block.base + AT_HAND + 3 * w, 1)
+            else:
+                found -= weight * wall_pressed(block, t, b, w)
     return found
 
 

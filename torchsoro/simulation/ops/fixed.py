@@ -67,7 +67,7 @@ def fixed(scene: Scene, inputs: Inputs) -> Fixed:
                 *(_areas(scene, planes), softening, quadratic),
                 *(none if scene.tie_share is None else scene.tie_share.to(c), ties),
                 none if scene.node_share is None else scene.node_share.to(c),
-                torch.from_numpy(wall_numbers(lattice)).to(c),
+                *(torch.from_numpy(walls).to(c) for walls in wall_numbers(lattice)),
             ),
         )
 

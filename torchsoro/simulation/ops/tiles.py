@@ -135,15 +135,19 @@ def wall_tables(lattice: Lattice, gas: int, pairs: int) -> tuple[list[np.ndarray
     return [pairs + np.arange(len(of)), kind, start, entry[order]], gas + of
 
 
-def wall_numbers(lattice: Lattice) -> np.ndarray:
-    """Numbers of wall points, in the order of :func:`wall_slots`: place, area, values [places, WALL]."""
+def wall_numbers(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of wall points, in the order of :func:`wall_slots`: place, area, values [places, WALL].
+
+    Beside them the weight of each of the entries of :func:`wall_tables`.
+    """
     points, _ = wall_slots(lattice)
     found, there = np.zeros((len(points), layout.WALL)), points >= 0
     if lattice.walls is not None:
         w = lattice.walls
         places, areas, values = (t.numpy()[points[there]] for t in (w.places, w.areas, w.values))
         found[there] = np.concatenate([places, areas[:, None], values.reshape(len(values), -1)], 1)
-    return found
+    *_, entry = wall_tables(lattice, 0, 0)[0]
+    return found, found[entry // 27, 4 + 3 * (entry % 27)]
 
 
 def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:

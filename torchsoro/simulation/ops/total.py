@@ -92,7 +92,7 @@ class TotalSegmentIntegrator:
         in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND]) + self.wall_chunks
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
-        items = self.batch * max(tiles, chunks, self.wall_chunks, self.ties)
+        items = self.batch * max(tiles + self.wall_chunks + self.ties, chunks)
         self.blocks = min(most_blocks(like.device, like.dtype), items) if self.gpu else 0
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, layout.SLOT), (self.batch, in_chambers), (pads, layout.PAD)
