@@ -17,7 +17,7 @@ from setups import CLAMP, marker, material
 
 from torchsoro.sim2real import pipeline
 from torchsoro.sim2real.data.recording import read_table
-from torchsoro.sim2real.inputs import read_inputs
+from torchsoro.sim2real.inputs import chosen, read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
 
@@ -456,3 +456,12 @@ def test_progress_in_a_log_grows_to_the_end_and_says_what_is_left(tmp_path, monk
     lines = (tmp_path / "log").read_text().splitlines()
     assert all(name in " ".join(lines) for name in STAGES) and " s left" in lines[-1]
     assert [span(v) for v in (40.0, 600.0, 7200.0)] == ["40 s", "10 min", "2.0 h"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "seconds", "there", "wanted"),
+    [("auto", 100.0, True, "cuda"), ("auto", 100.0, False, "cpu"), ("auto", 5.0, True, "cpu"), ("cpu", 1e3, True, "cpu")],
+)
+def test_a_gpu_is_chosen_where_there_is_one_and_much_to_simulate(monkeypatch, asked, seconds, there, wanted):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    assert chosen(asked, seconds) == wanted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,7 @@ from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.storage import check_folder
 
 RESULTS = ("report.html", "explanation.json", "model.toml")
+WORTH = 30.0  # s on two cores, of an explanation that is worth a GPU: those of bars wait for each step of a small body
 DEAR = 100.0  # budgets, that a twin with a given edge may take
 
 
@@ -80,6 +82,7 @@ def read_inputs(options: Options) -> Inputs:
     _check_noise(experiment, recordings)
     with named_in(experiment.folder, hints):
         twin = _twin(options, experiment)
+        twin = dataclasses.replace(twin, device=chosen(options.device, cost(twin, len(trials))))
     scenarios = {}
     for room, group in (("trials", trials), ("heldout", experiment.heldout)):
         for trial in group:
@@ -130,6 +133,13 @@ def check_device(name: str) -> None:
         raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
 
 
+def chosen(name: str, seconds: float) -> str:
+    """Where to simulate, of an explanation that takes so long on two cores [s]."""
+    if name != "auto":
+        return name
+    return "cuda" if seconds > WORTH and torch.cuda.is_available() else "cpu"
+
+
 def named(names: tuple[str, ...]) -> list[Hypothesis] | None:
     """Effects of the library by name; None for all.
 
@@ -157,10 +167,10 @@ def _check_noise(experiment: Experiment, recordings: list[Recording]) -> None:
 def _twin(options: Options, experiment: Experiment) -> Twin:
     setup, trials = experiment.setup, len(experiment.trials)
     if not options.edge:
-        return choose_twin(setup, trials, 60 * options.budget, walls=options.walls, device=options.device)
+        return choose_twin(setup, trials, 60 * options.budget, walls=options.walls)
     if options.edge > max(setup.size):
         raise ValueError(f"edge = {options.edge:g} m, wanted at most {max(setup.size):g} m, the body's longest edge")
-    twin = Twin(setup, edge=options.edge, walls=options.walls, device=options.device)
+    twin = Twin(setup, edge=options.edge, walls=options.walls)
     needed = cost(twin, trials) / 60
     if needed > DEAR * options.budget:
         raise ValueError(

@@ -29,7 +29,8 @@ class Options:
     """Cells through each wall around a chamber, at least."""
     effects: tuple[str, ...] = ()
     """Names of the effects to consider; the whole library if none is given."""
-    device: Literal["cpu", "cuda"] = "cpu"
-    """Where twins are simulated: a GPU takes all variations that are asked for at once."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where twins are simulated: a GPU takes all variations that are asked for at once, which is of use where they are
+    many; "auto" takes one if there is one and the body has so many points."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""

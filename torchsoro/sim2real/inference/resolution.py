@@ -29,7 +29,7 @@ def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     return twin.count * steps * trials * simulations / SPEED / CORES
 
 
-def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS, device: str = "cpu") -> Twin:
+def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS) -> Twin:
     """The finest twin with which an explanation takes about the budget.
 
     Args:
@@ -37,7 +37,6 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS,
         trials: To simulate.
         budget: On two cores [s].
         walls: Cells through each wall, at least.
-        device: Of the twin; decides nothing.
 
     Raises:
         ValueError: if the coarsest takes more than three times the budget.
@@ -45,9 +44,7 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS,
     thin, long = min(setup.size), max(setup.size)
     chambers = bool(setup.chambers)
     edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
-    twins = [
-        Twin(setup, edge=edge, walls=walls, across=n, device=device) for edge, n in zip(edges, (3, 2), strict=True)
-    ]
+    twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
     for twin in twins:
         if cost(twin, trials) <= budget / (SLOW_WITH_PLANES if setup.planes else SLOW):
             return twin

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
@@ -34,6 +35,7 @@ TWICE = 0.25  # excess of chi-squared of a pair over that of the best single eff
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
+ENDS_ROUGH = 16  # the same where bodies touch planes
 PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
 FIRST = 2  # of them
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
@@ -103,11 +105,17 @@ def search(
         left = best[0].chi2 - best[0].samples
         pairs = [f for f in _pairs(problem, effects, best, report) if f.chi2 - f.samples < TWICE * left]
         best = _best([*best, *pairs])
-    return problem, null_model, distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)])
+    ends = [*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)]
+    if not problem.rough:
+        return problem, null_model, distinct(ends, ENDS)
+    # What two searches find in turn, so that neither crowds out the other.
+    other = _uncorrected(problem, effects, most, report)
+    mixed = [f for pair in itertools.zip_longest(ends, other) for f in pair if f is not None]
+    return problem, null_model, distinct(mixed, ENDS_ROUGH)
 
 
-def distinct(fits: Iterable[Fit]) -> list[Fit]:
-    """The first of fits that differ, by effects or in where they ended."""
+def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
+    """The first of fits that differ, by effects or in where they ended; so many at most."""
     found: list[Fit] = []
 
     def same(one: Fit, other: Fit) -> bool:
@@ -117,7 +125,30 @@ def distinct(fits: Iterable[Fit]) -> list[Fit]:
     for fit in fits:
         if fit.effects and not any(same(fit, other) for other in found):
             found.append(fit)
-    return found[:ENDS]
+    return found[:most]
+
+
+def _uncorrected(
+    problem: FitProblem, effects: Sequence[Hypothesis], most: int, report: Callable[[str], None]
+) -> list[Fit]:
+    """Ends of searches by the twin as it is, where bodies touch planes.
+
+    What a finer twin adds to the motion as stated holds as long as nodes touch when they do there. An effect that
+    changes this by much has a motion of its own, to which the correction adds an error as large as itself.
+    """
+    bare = problem.only(
+        problem.trials, discretization=problem.discretization.replace(deviation={}, correction=problem.stated, own={})
+    )
+    nothing = [f for f in bare.fit(_null_starts(bare), rounds=3) if f is not None]
+    if not nothing:
+        return []
+    null_model = min(nothing, key=lambda fit: fit.chi2)
+    tasks = _likely(_screened(bare, null_model, effects), null_model, most)
+    tried = _best(bare.fit(tasks, errors=null_model.errors, rounds=TRIED, settle=False))
+    led: list[Task] = [(f.effects, f.point) for f in tried[:COMPLETED]]
+    found = _best(bare.fit(led, errors=null_model.errors, rounds=ROUNDS))
+    report("by the twin as it is: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in found))
+    return found
 
 
 def _refined(
