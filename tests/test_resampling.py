@@ -92,7 +92,8 @@ def test_what_cannot_be_started_from_is_refused_before_a_folder_is_made(recipes,
     for name, changes, message in (
         ("none", {"start_from": "nobody"}, "robot = 'nobody': wanted .*walker"),
         ("size", {"start_from": "climber"}, r"a design of a body of .*0\.0455"),
-        ("slopes", {"slopes": (0.0, 0.1)}, "slopes = .*wanted none without scenarios"),
+        ("few", {"slopes": (0.0, 0.1), "scenarios": 1}, "slopes = .*wanted at least as many scenarios, not 1"),
+        ("steep", {"slopes": (0.0,), "scenarios": 2, "slope": 0.2}, "slopes = .* none .* beside a slope of 0.2"),
     ):
         with pytest.raises(ValueError, match=message):
             recipes["walker"].main(tiny(tmp_path / name, **changes))

@@ -109,8 +109,6 @@ def test_every_slope_has_as_many_scenarios_and_meets_all_of_the_other_ranges():
         Scenarios(slopes=(0.0, 0.1, 0.2, 0.3)).sample(3, 0)
     with pytest.raises(ValueError, match=r"slopes = .*: wanted rise over run"):
         dataclasses.replace(TINY, slopes=(0.0, 30.0))
-    with pytest.raises(ValueError, match=r"slopes = .*: wanted none for a climber, or beside a slope of 0.2"):
-        dataclasses.replace(TINY, slopes=(0.0, 0.1), slope=0.2)
 
 
 def test_a_nominal_scenario_is_the_plain_robot_bit_for_bit(robot):

@@ -334,8 +334,6 @@ class Settings:
             check_range(f"{setting}_range", getattr(self, f"{setting}_range"), least, most, unit)
         if any(slope > _STEEPEST for slope in self.slopes):
             raise ValueError(f"slopes = {self.slopes}: wanted rise over run, at most {_STEEPEST:g}; 30 % is 0.3")
-        if self.slopes and (self.slope or self.robot == "climber"):
-            raise ValueError(f"slopes = {self.slopes}: wanted none for a climber, or beside a slope of {self.slope:g}")
         if self.risk != "mean":
             from torchsoro.design.risk import parse_risk
 

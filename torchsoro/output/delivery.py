@@ -49,12 +49,15 @@ def design(robot: Robot, name: str) -> dict[str, float]:
 
     Raises:
         ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, if
-            there are more processes than scenarios, slopes without scenarios, or no robot to start from.
+            there are more processes or slopes than scenarios, or no robot to start from.
         ConnectionError: if another process ends before this one.
     """
     s = robot.settings
-    if s.slopes and not s.scenarios:
-        raise ValueError(f"slopes = {s.slopes}: wanted none without scenarios, or at least {len(s.slopes)} scenarios")
+    if s.slopes and (s.scenarios < len(s.slopes) or s.slope or s.robot == "climber"):
+        raise ValueError(
+            f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or beside "
+            f"a slope of {s.slope:g}"
+        )
     if s.start_from and not (s.resume and (s.out / "checkpoint.pt").exists()):
         begin_with(robot.field, s.start_from)
     if world_size() > 1:
