@@ -55,8 +55,8 @@ def design(robot: Robot, name: str) -> dict[str, float]:
     s = robot.settings
     if s.slopes and (s.scenarios < len(s.slopes) or s.slope or s.robot == "climber"):
         raise ValueError(
-            f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or beside "
-            f"a slope of {s.slope:g}"
+            f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or "
+            f"beside a slope of {s.slope:g}"
         )
     if s.start_from and not (s.resume and (s.out / "checkpoint.pt").exists()):
         begin_with(robot.field, s.start_from)
