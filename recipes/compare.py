@@ -4,6 +4,7 @@
     python recipes/compare.py runs/walker --out runs/compare       # one of your own
     python recipes/compare.py walker --out runs/compare --only design half_cell
     python recipes/compare.py walker --out runs/robust --scenarios 64    # friction, tilt, pressure, modulus, tube
+    python recipes/compare.py runs/coarse --out runs/fine --scenarios 64 --particles 40 40 40 --wall 0.00175
 
 A row for each check goes to ``compare.json``, and the motion of some to ``motion_<check>.npz``, from which
 ``recipes/validate/pages.py`` draws. Checks that are there already are not repeated. Meant for a GPU: on two cores a
@@ -20,7 +21,7 @@ from typing import Any, Literal
 
 import tyro
 
-from torchsoro.command_line import CountOrZero, options, program
+from torchsoro.command_line import Count, CountOrZero, Positive, options, program
 
 
 @options
@@ -41,6 +42,10 @@ class Options:
     """Of these scenarios; one that no iteration of the design run had, if left out."""
     void: bool = True
     """Simulate void, too, in the scenarios."""
+    particles: tuple[Count, Count, Count] | None = None
+    """Simulate it on another lattice in the scenarios: particles along the edges."""
+    wall: Positive | None = None
+    """Thickness of the chamber wall there [m], a whole number of spacings; as designed if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
 
@@ -59,9 +64,13 @@ def main(chosen: Options) -> dict[str, dict[str, Any]]:
                 count=chosen.scenarios,
                 seed=chosen.seed,
                 void=chosen.void,
+                particles=chosen.particles,
+                wall=chosen.wall,
                 device=chosen.device,
             )
         }
+    if chosen.particles is not None or chosen.wall is not None:
+        raise ValueError("particles, wall: wanted with --scenarios only; the check half_cell has a lattice of its own")
     how = {"only": chosen.only, "iterations": chosen.iterations, "device": chosen.device}
     return compare(chosen.robot, chosen.out, **how)
 

@@ -92,6 +92,25 @@ def test_what_does_not_vary_is_left_to_the_robot_and_does_not_change_the_rest():
     assert constant.tube_mass.tolist() == [0.002] * 3 and constant.friction.tolist() == [STICK] * 3
 
 
+def test_every_slope_has_as_many_scenarios_and_meets_all_of_the_other_ranges():
+    plain, sloping = WIDE.sample(16, 5), dataclasses.replace(WIDE, slopes=(0.0, 0.3)).sample(16, 5)
+    added = torch.deg2rad(sloping.tilt_x - plain.tilt_x).tan()
+    assert added.tolist() == pytest.approx([0.0] * 8 + [0.3] * 8, abs=1e-12)
+    for name in set(NOMINAL) - {"tilt_x", "friction"}:
+        assert torch.equal(sloping.given[name], plain.given[name])
+        low, high = getattr(WIDE, name)
+        for half in (sloping.given[name][:8], sloping.given[name][8:]):
+            eighths = (8 * (half - low) / (high - low)).floor().sort().values
+            assert torch.equal(eighths, torch.arange(8.0, dtype=torch.float64)), name
+    exact = Scenarios(slopes=(0.0, 0.1, 0.2, 0.3)).sample(4, 0)
+    assert list(exact.given) == ["tilt_x"]
+    assert torch.deg2rad(exact.tilt_x).tan().tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    with pytest.raises(ValueError, match=r"count = 3: wanted at least one scenario for each of 4 slopes"):
+        Scenarios(slopes=(0.0, 0.1, 0.2, 0.3)).sample(3, 0)
+    with pytest.raises(ValueError, match=r"slopes = .*: wanted rise over run"):
+        dataclasses.replace(TINY, slopes=(0.0, 30.0))
+
+
 def test_a_nominal_scenario_is_the_plain_robot_bit_for_bit(robot):
     plain = run(robot)
     nominal = {name: [value] for name, value in NOMINAL.items() if value is not None}

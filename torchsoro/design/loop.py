@@ -274,6 +274,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     best: dict[str, Any] | None = None
     ensemble = Ensemble(robot, processes) if s.scenarios else None
     lost = 0  # iterations in a row without a gradient
+    end_at = time.perf_counter() + s.seconds if s.seconds else math.inf
     folder = RunFolder(s.out, dataclasses.asdict(s), resume=s.resume, overwrite=s.overwrite, free=s.free, amend=s.amend)
     with folder as run:
         if state := run.load():
@@ -365,7 +366,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                 observe(run, robot, gamma.detach(), k)
             more = {"supply": supply} if timing else {}
             run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good, **more)
-            if stopped:
+            if stopped or time.perf_counter() > end_at:
                 break
         if best is not None:
             with torch.no_grad():

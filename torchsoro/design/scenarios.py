@@ -145,6 +145,9 @@ class Scenarios:
         pitch: [degrees].
         roll: [degrees].
         drop: [m].
+        slopes: Uphill slopes, rise over run, whose angles are added to ``tilt_x``: in the order of the scenarios, the
+            same number of them each, to one. Consecutive points of the sequence are spread evenly, so that each slope
+            meets all of the other ranges.
 
     Raises:
         ValueError: for bounds that do not increase, or out of range; names the quantity.
@@ -161,6 +164,7 @@ class Scenarios:
     pitch: tuple[float, float] = (0.0, 0.0)
     roll: tuple[float, float] = (0.0, 0.0)
     drop: tuple[float, float] = (0.0, 0.0)
+    slopes: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check the bounds."""
@@ -183,12 +187,14 @@ class Scenarios:
             The scenarios, float64, on the CPU; None for quantities that stay at their nominal value.
 
         Raises:
-            ValueError: for a count below 1 or a negative seed.
+            ValueError: for a count below 1 or that of the slopes, or a negative seed.
         """
         import torch
 
         if count < 1:
             raise ValueError(f"count = {count}: wanted at least one scenario")
+        if count < len(self.slopes):
+            raise ValueError(f"count = {count}: wanted at least one scenario for each of {len(self.slopes)} slopes")
         if seed < 0:
             raise ValueError(f"seed = {seed}: wanted at least 0")
         engine = torch.quasirandom.SobolEngine(len(NOMINAL), scramble=True, seed=seed)
@@ -204,6 +210,10 @@ class Scenarios:
                 found[name] = torch.where(angle < math.pi / 2 - 1e-9, angle.tan(), STICK)
             else:
                 found[name] = torch.lerp(torch.full_like(share, bounds[0]), torch.full_like(share, bounds[1]), share)
+        if self.slopes:
+            place = torch.arange(count) * len(self.slopes) // count
+            angle = torch.rad2deg(torch.tensor(self.slopes, dtype=torch.float64).atan())[place]
+            found["tilt_x"] = angle + found["tilt_x"] if "tilt_x" in found else angle
         return ScenarioBatch(count=count, **found)
 
 

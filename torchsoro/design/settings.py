@@ -61,6 +61,10 @@ class Settings:
     """Most iterations; the stopping rule may end earlier."""
     starts: Count = 1
     """Designs from initial fields that differ by a millionth, of which the best is delivered; side by side on a CPU."""
+    start_from: str = ""
+    """Archived robot or finished run whose design is the first, on whatever lattice; an even grey if left out."""
+    seconds: AtLeastZero = 0.0
+    """Time after which no further iteration begins and the best design is delivered [s]; 0 for any."""
 
     size: tuple[_Length, _Length, _Length] = (0.035, 0.035, 0.035)
     """Edges of the body [m]."""
@@ -152,6 +156,8 @@ class Settings:
     """Coulomb coefficient, at even steps of the friction angle."""
     tilt_range: _Range = (-5.0, 5.0)
     """Slope of the floor beyond ``slope``, along x and across [degrees]."""
+    slopes: tuple[AtLeastZero, ...] = ()
+    """Uphill slopes to which the tilt is added, of as many scenarios each, as fractions; ``slope`` if left out."""
     pressure_range: _Range = (0.85, 1.15)
     """Factor of the supply's pressure."""
     lag_range: _Range = (0.0, 0.0)
@@ -326,6 +332,8 @@ class Settings:
         for name, (least, most, unit) in LIMITS.items():
             setting = {"tilt_x": "tilt", "tilt_y": "tilt"}.get(name, name.partition("_")[0])
             check_range(f"{setting}_range", getattr(self, f"{setting}_range"), least, most, unit)
+        if any(slope > _STEEPEST for slope in self.slopes):
+            raise ValueError(f"slopes = {self.slopes}: wanted rise over run, at most {_STEEPEST:g}; 30 % is 0.3")
         if self.risk != "mean":
             from torchsoro.design.risk import parse_risk
 
@@ -338,6 +346,7 @@ class Settings:
             friction=self.friction_range,
             tilt_x=self.tilt_range,
             tilt_y=self.tilt_range,
+            slopes=self.slopes,
             pressure_gain=self.pressure_range,
             lag=self.lag_range,
             modulus_factor=self.modulus_range,
@@ -401,7 +410,7 @@ class Settings:
     @property
     def free(self) -> tuple[str, ...]:
         """Names of settings that do not change the numbers of a run and may differ on resume."""
-        here = ("out", "resume", "amend", "overwrite", "iterations", "starts", "device", "memory")
+        here = ("out", "resume", "amend", "overwrite", "iterations", "starts", "seconds", "device", "memory")
         return (
             *here,
             "picture_every",

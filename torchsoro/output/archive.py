@@ -13,7 +13,10 @@ import torch
 from torch import Tensor
 
 from torchsoro.design.domain import Domain
+from torchsoro.design.field import DesignField
 from torchsoro.design.reading import read_settings
+from torchsoro.design.resampling import fit_, resampled
+from torchsoro.design.robot import build
 from torchsoro.design.supply import Supply
 from torchsoro.storage import atomic_write
 
@@ -120,6 +123,40 @@ def load_supply(path: Path, supply: Supply) -> None:
     except Exception as error:  # a damaged archive can fail in any way
         chambers = f"amplitude, phase and duty of {supply.chambers} chambers"
         raise ValueError(f"path: {path} has no timing ({error}), wanted an .npz with {chambers}") from error
+
+
+def load_resampled(folder: Path, domain: Domain, *, mended: bool = True) -> Tensor:
+    """Read the design of an archived robot or a run on another lattice; see :func:`resampled`.
+
+    Args:
+        folder: With ``design.npz`` and ``settings.json``.
+        domain: The lattice that is wanted.
+        mended: See :func:`load_design`.
+
+    Returns:
+        Density [N], float32; on the design's own lattice as it is stored.
+
+    Raises:
+        ValueError: see :func:`load_design`; also for a body of another size.
+    """
+    source = build(read_settings(folder / "settings.json", device="cpu", resume=False, scenarios=0)).domain
+    return resampled(load_design(folder / "design.npz", source, mended=mended), source, domain)
+
+
+def begin_with(field: DesignField, robot: str) -> float:
+    """Let a field begin with the design of an archived robot or a run, on whatever lattice.
+
+    Args:
+        field: Its ``phi`` is changed.
+        robot: See :func:`find`.
+
+    Returns:
+        Root mean square of what the field's density misses (see :func:`torchsoro.design.resampling.fit_`).
+
+    Raises:
+        ValueError: if there is no such robot, its design is damaged, or its body has another size.
+    """
+    return fit_(field, load_resampled(find(robot), field.domain, mended=False))
 
 
 def kept_iterations(folder: Path) -> list[int]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import statistics
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
-from torchsoro.output.archive import save_design
+from torchsoro.output.archive import begin_with, save_design
 from torchsoro.output.fabricate import fabricate, surface
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
@@ -47,11 +48,18 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
 
     Raises:
-        ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, or
-            there are more processes than scenarios.
+        ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, if
+            there are more processes or slopes than scenarios, or no robot to start from.
         ConnectionError: if another process ends before this one.
     """
     s = robot.settings
+    if s.slopes and (s.scenarios < len(s.slopes) or s.slope or s.robot == "climber"):
+        raise ValueError(
+            f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or "
+            f"beside a slope of {s.slope:g}"
+        )
+    if s.start_from and not (s.resume and (s.out / "checkpoint.pt").exists()):
+        begin_with(robot.field, s.start_from)
     if world_size() > 1:
         if s.starts > 1:
             raise ValueError(f"starts = {s.starts}: wanted 1 in several processes, which share scenarios")
@@ -69,8 +77,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
             raise
         end(processes)
     history = optimized.metrics
-    found = {
-        **deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration),
+    more = {
         "iteration": len(history["iteration"]) - 1 if optimized.iteration is None else optimized.iteration,
         "iterations": len(history["iteration"]),
         "forward": statistics.median(history["time/forward"]),
@@ -78,9 +85,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         "seconds": sum(history["time/iteration"]),
         **(robot.supply.numbers() if designed_supply(robot) is not None else {}),
     }
-    with atomic_write(s.out / "result.json") as file:
-        plain = {name: None if math.isnan(value) else value for name, value in found.items()}
-        file.write((json.dumps(plain, indent=2) + "\n").encode())
+    found = deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration, more=more)
     print(report(found, s))
     return found
 
@@ -152,8 +157,11 @@ def deliver(
     *,
     name: str,
     chosen: int | None = None,
+    more: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Write the design of a finished run into its folder, as ``design.npz``, and show it there: see :func:`show`.
+
+    The design comes first, then its numbers and the part, pictures last.
 
     Args:
         path: The folder.
@@ -162,12 +170,13 @@ def deliver(
         history: Metrics of the run, for the summary.
         name: Of the robot: names the movie and the page.
         chosen: Iteration that the design is of; the last if None.
+        more: What else ``result.json`` is to tell.
 
     Returns:
-        What :func:`show` measured.
+        What :func:`show` measured, and ``more``.
 
     Raises:
-        ValueError: if the design has no connected body to print; the design and the movie are written before.
+        ValueError: if the design has no connected body to print; all but the part is written before.
     """
     s = robot.settings
     gamma = save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot))
@@ -179,8 +188,9 @@ def deliver(
         with progress_bar(f"{s.scenarios} scenarios") as progress:
             batch = s.distribution.sample(s.scenarios, s.scenario_seed)
             found = evaluate(robot, delivered, batch, progress=progress)
-    shown = show(path, robot, gamma, history=history, chosen=chosen, name=name, scenarios=found, part=part)[0]
-    return shown if found is None else {**shown, **found.numbers()}
+    told = {**({} if found is None else found.numbers()), **(more or {})}
+    how: dict[str, Any] = {"history": history, "chosen": chosen, "scenarios": found, "part": part, "more": told}
+    return show(path, robot, gamma, name=name, **how)[0]
 
 
 def mended(robot: Robot, gamma: torch.Tensor, part: Part | None = None) -> tuple[Part | None, torch.Tensor]:
@@ -212,8 +222,11 @@ def show(
     void: bool = True,
     scenarios: Evaluation | None = None,
     part: Part | None = None,
+    more: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, float], Part]:
     """Simulate a gait with every particle recorded, and write what people look at and print.
+
+    Numbers and part come first. A movie or a page that cannot be drawn, for want of an encoder, is told and left out.
 
     Files: ``<name>.mp4``, ``motion.npz`` and ``motion.html`` (the motion, for recipes/view.py and for a browser), with
     a history ``summary.png``, and ``shape.stl`` and ``shape.3mf`` with ``shape.json`` (what the part weighs and how
@@ -229,15 +242,16 @@ def show(
         void: Simulate void, too.
         scenarios: What the design does in its scenarios, for the summary.
         part: Of a design whose settings ask for a least wall, if it has been made already.
+        more: What ``result.json`` is to tell beside what is measured; not written if None.
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
         whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
         [rad], thinnest wall and gap of the part [m] (NaN if there is none), of one whose walls were to be mended what
-        :func:`told_of` says; and the printable part. All but C are those of the part with its walls mended.
+        :func:`told_of` says, ``more``; and the printable part. All but C are those of the part with its walls mended.
 
     Raises:
-        ValueError: if the design has no connected body to print; movie and motion are written before.
+        ValueError: if the design has no connected body to print; all but the part is written before.
     """
     s = robot.settings
     part, delivered = mended(robot, gamma, part)
@@ -266,6 +280,20 @@ def show(
     if part is not None:
         with progress_bar(f"simulating {name}, not mended") as progress:
             found |= told_of(part, robot(gamma, void=void, progress=progress))
+    found |= more or {}
+    bodiless: ValueError | None = None
+    try:
+        part = part or print_part(robot, density)
+    except ValueError as error:
+        bodiless = error
+    else:
+        found["thinnest_wall"] = 1e-3 * part.report.thinnest_wall_mm
+        found["thinnest_gap"] = 1e-3 * part.report.thinnest_gap_mm
+        save_part(path, part)
+    if more is not None:
+        with atomic_write(path / "result.json") as file:
+            plain = {key: None if math.isnan(value) else value for key, value in found.items()}
+            file.write((json.dumps(plain, indent=2) + "\n").encode())
     begin = np.array([np.interp(s.settle, time, component) for component in center.T])
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = mean_pressure(robot, trajectory.time)
@@ -277,50 +305,65 @@ def show(
         "direction": robot.direction,
         "tilt": math.degrees(math.atan(s.slope)),
     }
-    print(f"writing {path / name}.mp4", file=sys.stderr, flush=True)
     way = f"travel L = {1e3 * found['L']:.2f} mm"
     if s.robot == "turner":
         way = f"turns by {math.degrees(found['turn_left']):.1f} degrees to the left"
     title = f"{name}: {way} in {s.duration:g} s"
-    movie(
-        path / f"{name}.mp4",
-        **shown,
-        frames=frames[drawn],
-        time=time[drawn],
-        pressure=supply[drawn],
-        displacement=(center - begin)[drawn],
-        fps=s.fps,
-        width=width,
-        height=height,
-        follow=s.follow,
-        title=title,
-    )
     record(path, name, robot, shown, frames, time, supply)
     if history is not None:
-        summary(
-            path / "summary.png",
+        with or_told(path / "summary.png"):
+            summary(
+                path / "summary.png",
+                **shown,
+                frames=frames,
+                time=time,
+                pressure=supply,
+                displacement=center - begin,
+                start=s.settle,
+                history=history,
+                chosen=chosen,
+                limit=s.c_max,
+                period=1 / s.frequency,
+                title=title,
+                note=numbers(found),
+                scenarios=None if scenarios is None else scenarios.travel,
+            )
+    print(f"writing {path / name}.mp4", file=sys.stderr, flush=True)
+    with or_told(path / f"{name}.mp4"):
+        movie(
+            path / f"{name}.mp4",
             **shown,
-            frames=frames,
-            time=time,
-            pressure=supply,
-            displacement=center - begin,
-            start=s.settle,
-            history=history,
-            chosen=chosen,
-            limit=s.c_max,
-            period=1 / s.frequency,
+            frames=frames[drawn],
+            time=time[drawn],
+            pressure=supply[drawn],
+            displacement=(center - begin)[drawn],
+            fps=s.fps,
+            width=width,
+            height=height,
+            follow=s.follow,
             title=title,
-            note=numbers(found),
-            scenarios=None if scenarios is None else scenarios.travel,
         )
-    part = part or print_part(robot, density)
-    found["thinnest_wall"] = 1e-3 * part.report.thinnest_wall_mm
-    found["thinnest_gap"] = 1e-3 * part.report.thinnest_gap_mm
+    if part is None:
+        assert bodiless is not None
+        raise bodiless
+    return found, part
+
+
+@contextlib.contextmanager
+def or_told(picture: Path) -> Iterator[None]:
+    """Say which picture cannot be drawn, and why, and go on without it: it is drawn of what is kept elsewhere."""
+    try:
+        yield
+    except (ImportError, OSError, RuntimeError) as error:  # no encoder, or one that does not know the codec
+        print(f"{picture} is left out: {error}", file=sys.stderr, flush=True)
+
+
+def save_part(path: Path, part: Part) -> None:
+    """Write a part into a folder: ``shape.stl``, ``shape.3mf`` and ``shape.json``."""
     part.save(path / "shape.stl")
     part.save(path / "shape.3mf")
     with atomic_write(path / "shape.json") as file:
         file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
-    return found, part
 
 
 def told_of(part: Part, plain: Outcome) -> dict[str, float]:

@@ -17,7 +17,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import imageio_ffmpeg
 import numpy as np
 from PIL import Image
 
@@ -230,6 +229,8 @@ def _pictures(
 
 
 def _write_mp4(path: Path, pictures: Iterator[np.ndarray], size: tuple[int, int], fps: int) -> None:
+    import imageio_ffmpeg  # here, so that robots are designed and STLs written without it
+
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-"]
     command += ["-an", "-c:v", "libx264", "-crf", "20", "-pix_fmt", "yuv420p", "-movflags", "+faststart", str(path)]

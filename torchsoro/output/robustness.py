@@ -19,7 +19,7 @@ from torchsoro.design.ensemble import Evaluation, evaluate
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.design.scenarios import LIMITS, NOMINAL
-from torchsoro.output.archive import find, load_design, load_supply
+from torchsoro.output.archive import find, load_resampled, load_supply
 from torchsoro.output.delivery import spread_line
 from torchsoro.output.page import canvas_of, heading, pixels, plain, scenario_panel
 from torchsoro.output.scene import INK, REST
@@ -51,6 +51,8 @@ def compare_scenarios(
     count: int,
     seed: int | None = None,
     void: bool = True,
+    particles: tuple[int, int, int] | None = None,
+    wall: float | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> dict[str, Any]:
     """Simulate a finished robot in scenarios drawn from the ranges of its settings, and write what it does.
@@ -61,21 +63,25 @@ def compare_scenarios(
         count: Number of scenarios.
         seed: Of the scenarios; one that no iteration of the design run had if None.
         void: Simulate void, too.
+        particles: Along the edges, instead of the design's.
+        wall: Thickness of the chamber wall [m], instead of the design's; a whole number of spacings.
         device: Where to compute.
 
     Returns:
         Spread of the travel [m], numbers of falls and of breakdowns, seed; also in ``scenarios.json``.
 
     Raises:
-        ValueError: for a robot that does not exist, or a folder that cannot be written.
+        ValueError: for a robot that does not exist, a wall that does not fit the particles, or a folder that cannot be
+            written.
     """
     folder = find(robot)
     # Not the number of the design run's scenarios, on which the memory of that run depends.
     s = dataclasses.replace(read_settings(folder / "settings.json", device=device, resume=False), scenarios=0)
     check_folder("out", out, (TABLE, PICTURE, NUMBERS))
-    step: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
-    built = build(dataclasses.replace(s, **step))
-    gamma = load_design(folder / "design.npz", built.domain).to(s.target)
+    changes: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
+    changes |= {name: one for name, one in (("particles", particles), ("wall", wall)) if one is not None}
+    built = build(dataclasses.replace(s, **changes))
+    gamma = load_resampled(folder, built.domain).to(s.target)
     load_supply(folder / "design.npz", built.supply)
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # the threads of the kernels do the work
@@ -84,6 +90,8 @@ def compare_scenarios(
     with progress_bar(f"{count} scenarios of {folder.name}") as progress:
         found = evaluate(built, gamma, batch, void=void, progress=progress)
     result = {"robot": folder.name, "count": count, "seed": chosen, "duration": s.duration, **found.numbers()}
+    if particles is not None:
+        result["particles"] = list(particles)
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / TABLE) as file:
         file.write(table(found).encode())
