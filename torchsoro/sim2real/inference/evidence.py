@@ -17,7 +17,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.optimize import minimize
@@ -208,18 +208,22 @@ def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> list[Er
         numerics: The twin's own error.
         discrepancy: What the model does not explain.
     """
-    one = np.full_like(numerics.amplitude, data.noise)
-    known = (
-        Process(time=NOISE_TIME, loading=_each(math.sqrt(LASTING) * one)),
-        Process(time=numerics.time, loading=_moving(discrepancy.twin * numerics.amplitude)),
-    )
+    white, lasting, twin, unexplained = _unscaled(data, numerics)
+    known = Process(time=NOISE_TIME, loading=lasting), Process(time=numerics.time, loading=twin, scale=discrepancy.twin)
     return [
         ErrorModel(
-            white=math.sqrt(1 - LASTING) * one,
-            processes=(*known, Process(time=discrepancy.time, loading=_moving(discrepancy.share * amplitude))),
+            white=white, processes=(*known, Process(time=discrepancy.time, loading=own, scale=discrepancy.share))
         )
-        for amplitude in data.amplitudes
+        for own in unexplained
     ]
+
+
+@lru_cache(maxsize=64)  # s, tau and c are searched for in some hundred steps
+def _unscaled(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
+    """White noise, and loadings of the noise that lasts, of the twin's error and of what is left of each trial."""
+    one = np.full_like(numerics.amplitude, data.noise)
+    lasting = _each(math.sqrt(LASTING) * one)
+    return math.sqrt(1 - LASTING) * one, lasting, _moving(numerics.amplitude), tuple(map(_moving, data.amplitudes))
 
 
 def _moving(deviation: np.ndarray) -> np.ndarray:

@@ -31,10 +31,12 @@ class Process:
         time: Correlation time [s].
         loading: Standard deviation with which each of K processes is seen at each marker [A, M, K] m; a process belongs
             to one axis.
+        scale: Of the loading.
     """
 
     time: float
     loading: np.ndarray
+    scale: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +60,7 @@ class ErrorModel:
         """
         axes, _ = self.white.shape
         rate = np.concatenate([np.zeros(0), *(np.full(p.loading.shape[2], 1 / p.time) for p in self.processes)])
-        loading = np.concatenate([np.zeros((*self.white.shape, 0)), *(p.loading for p in self.processes)], 2)
+        loading = np.concatenate([np.zeros((*self.white.shape, 0)), *(p.scale * p.loading for p in self.processes)], 2)
         # Each process begins with the variance that it has at all times.
         covariance = np.tile(np.eye(len(rate)), (axes, 1, 1))
         product, mean, last, ln_det, count = np.zeros((0, 0)), np.zeros((0, 0, 0)), -math.inf, 0.0, 0
@@ -78,7 +80,7 @@ class ErrorModel:
         lag = np.abs(time[:, None] - time)
         found = np.kron(np.diag(self.white[axis] ** 2), np.eye(len(time)))
         for p in self.processes:
-            found += np.kron(p.loading[axis] @ p.loading[axis].T, np.exp(-lag / p.time))
+            found += p.scale**2 * np.kron(p.loading[axis] @ p.loading[axis].T, np.exp(-lag / p.time))
         return found
 
 
