@@ -133,14 +133,15 @@ def test_checks_and_robots_that_do_not_exist_are_refused_before_any_work(compare
         check(compare, straight[0], tmp_path / "out", "iteration_10")
 
 
-def test_only_a_walker_on_the_level_is_sent_uphill(compare):
+def test_a_walker_is_sent_up_other_slopes_than_its_own(compare):
     def slopes(**changes: Any) -> list[float]:
         known = compare.checks(dataclasses.replace(TINY, **changes), (0, 3))
         assert {"iteration_0", "iteration_3"} < set(known)
         return [c.changes["slope"] for c in known.values() if "slope" in c.changes]
 
     assert slopes() == [0.1, 0.2, 0.3]
-    assert slopes(slope=0.3) == slopes(robot="climber") == []
+    assert slopes(slope=0.3) == [0.0, 0.1, 0.2]
+    assert slopes(robot="climber") == []
 
 
 @pytest.mark.parametrize("times", [1, 2, 3])

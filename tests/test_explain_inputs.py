@@ -460,7 +460,12 @@ def test_progress_in_a_log_grows_to_the_end_and_says_what_is_left(tmp_path, monk
 
 @pytest.mark.parametrize(
     ("asked", "seconds", "there", "wanted"),
-    [("auto", 100.0, True, "cuda"), ("auto", 100.0, False, "cpu"), ("auto", 5.0, True, "cpu"), ("cpu", 1e3, True, "cpu")],
+    [
+        ("auto", 100.0, True, "cuda"),
+        ("auto", 100.0, False, "cpu"),
+        ("auto", 5.0, True, "cpu"),
+        ("cpu", 1e3, True, "cpu"),
+    ],
 )
 def test_a_gpu_is_chosen_where_there_is_one_and_much_to_simulate(monkeypatch, asked, seconds, there, wanted):
     monkeypatch.setattr("torch.cuda.is_available", lambda: there)

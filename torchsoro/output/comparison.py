@@ -60,10 +60,14 @@ def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
     """
     updated = {"formulation": "updated", "transfer": "apic", "air_density": "auto"}
     found = {"design": Check(title="as designed", long=True, motion=True)}
-    if s.robot == "walker" and s.slope == 0:
+    if s.robot == "walker":
+        slopes = {"level": 0.0, **{f"uphill_{p}": p / 100 for p in (10, 20, 30)}}
         found |= {
-            f"uphill_{p}": Check(title=f"uphill {p} %", changes={"slope": p / 100}, long=True, motion=True)
-            for p in (10, 20, 30)
+            name: Check(
+                title=name.replace("_", " ") + " %" * (slope > 0), changes={"slope": slope}, long=True, motion=True
+            )
+            for name, slope in slopes.items()
+            if slope != s.slope
         }
     found |= {
         "double_modulus": Check(title="double modulus", changes={"youngs_modulus": 2 * s.youngs_modulus}),

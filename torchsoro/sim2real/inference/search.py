@@ -13,6 +13,7 @@ from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE, Request
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
 
 BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
@@ -28,8 +29,9 @@ CORRECTED = 1.5  # chi-squared per sample of the null model, above which the fin
 REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
-MOST_ROUGH = 24  # the same where bodies touch planes and most searches end in valleys nearby
-SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
+SCREENED = 8  # points of each effect that a finer twin simulates of rough motions; of a local one four times as many
+FINER = 8  # effects that are then searched for by the finer twin
+FINER_ROUNDS = 3  # of it
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
@@ -61,7 +63,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough else MOST))
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -84,8 +86,6 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
-    if problem.rough:
-        tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
     if len(tasks) > COMPLETED:
@@ -109,9 +109,9 @@ def search(
     if not problem.rough:
         return problem, null_model, distinct(ends, ENDS)
     # What two searches find in turn, so that neither crowds out the other.
-    other = _uncorrected(problem, effects, most, report)
-    mixed = [f for pair in itertools.zip_longest(ends, other) for f in pair if f is not None]
-    return problem, null_model, distinct(mixed, ENDS_ROUGH)
+    nothing, finer = _by_finer(problem, effects, null_model, report)
+    mixed = [f for pair in itertools.zip_longest(finer, ends) for f in pair if f is not None]
+    return problem, null_model, [*nothing, *distinct(mixed, ENDS_ROUGH)]
 
 
 def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
@@ -128,27 +128,30 @@ def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
     return found[:most]
 
 
-def _uncorrected(
-    problem: FitProblem, effects: Sequence[Hypothesis], most: int, report: Callable[[str], None]
-) -> list[Fit]:
-    """Ends of searches by the twin as it is, where bodies touch planes.
+def _by_finer(
+    problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit, report: Callable[[str], None]
+) -> tuple[list[Fit], list[Fit]]:
+    """Fits by the finer twin, without an effect and with one, where bodies touch planes.
 
-    What a finer twin adds to the motion as stated holds as long as nodes touch when they do there. An effect that
-    changes this by much has a motion of its own, to which the correction adds an error as large as itself.
+    A twin with large cells is off by as much as effects are. What a finer one adds to its motion as stated holds as
+    long as nodes touch when they do there, so that no correction makes up for it. And no response tells an effect
+    from afar: chi-squared itself is simulated, at evenly spread points.
     """
-    bare = problem.only(
-        problem.trials, discretization=problem.discretization.replace(deviation={}, correction=problem.stated, own={})
-    )
-    nothing = [f for f in bare.fit(_null_starts(bare), rounds=3) if f is not None]
+    if problem.fine is None or problem.stated:
+        return [], []
+    fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
+    begin = [((), null_model.point), *_null_starts(fine)]
+    nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:
-        return []
-    null_model = min(nothing, key=lambda fit: fit.chi2)
-    tasks = _likely(_screened(bare, null_model, effects), null_model, most)
-    tried = _best(bare.fit(tasks, errors=null_model.errors, rounds=TRIED, settle=False))
-    led: list[Task] = [(f.effects, f.point) for f in tried[:COMPLETED]]
-    found = _best(bare.fit(led, errors=null_model.errors, rounds=ROUNDS))
-    report("by the twin as it is: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in found))
-    return found
+        return [], []
+    best = min(nothing, key=lambda fit: fit.chi2)
+    looks = sorted(_screened(fine, best, effects), key=lambda look: look[0])
+    first = {effect.name: ((effect,), point) for _, effect, point in reversed(looks)}
+    order = list(dict.fromkeys(effect.name for _, effect, _ in looks))
+    tasks = [first[name] for name in order[:FINER]]
+    found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))
+    report(f"by the finer twin: nothing {best.chi2:.0f}, " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in found))
+    return nothing, found
 
 
 def _refined(
@@ -210,9 +213,13 @@ def _probe_points(
 def _screened(
     problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
 ) -> list[tuple[float, Hypothesis, np.ndarray]]:
-    """Chi-squared of each effect at evenly spread points: of a rough motion, no response tells it from afar."""
+    """Chi-squared of each effect at evenly spread points, where the effect stands in for what is stated, and beside it.
+
+    In turn, modulus and pressure are as stated, and as they explain most by themselves.
+    """
     points = [spread(problem.twin, e) for e in effects]
-    at = [np.concatenate([np.tile(null_model.point, (len(x), 1)), x], 1) for x in points]
+    stated = np.stack([np.zeros_like(null_model.point), null_model.point])
+    at = [np.concatenate([stated[np.arange(len(x)) % 2], x], 1) for x in points]
     asked = [((e,), x) for e, x in zip(effects, at, strict=True)]
     rows = zip(effects, at, _simulated(problem, asked, null_model.errors), strict=True)
     return [(chi2, effect, x[k]) for effect, x, left in rows for k, chi2 in left.items()]
@@ -252,7 +259,7 @@ def spread(twin: Twin, effect: Hypothesis) -> np.ndarray:
     if effect.local:
         origin, size = np.array(twin.setup.origin), np.array(twin.setup.size)
         values = np.concatenate([values, 10 * origin / size + 10 * u[:, kinds:]], 1)
-    return np.unique(values, axis=0)
+    return values[np.sort(np.unique(values, axis=0, return_index=True)[1])]
 
 
 def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most: int) -> list[Task]:
