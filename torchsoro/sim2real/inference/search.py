@@ -219,7 +219,8 @@ def _screened(
     """
     points = [spread(problem.twin, e) for e in effects]
     stated = np.stack([np.zeros_like(null_model.point), null_model.point])
-    at = [np.concatenate([stated[np.arange(len(x)) % 2], x], 1) for x in points]
+    turn = [np.arange(len(x)) // len(e.starts) % 2 for e, x in zip(effects, points, strict=True)]
+    at = [np.concatenate([stated[k], x], 1) for k, x in zip(turn, points, strict=True)]
     asked = [((e,), x) for e, x in zip(effects, at, strict=True)]
     rows = zip(effects, at, _simulated(problem, asked, null_model.errors), strict=True)
     return [(chi2, effect, x[k]) for effect, x, left in rows for k, chi2 in left.items()]
