@@ -145,7 +145,8 @@ def _by_finer(
     if not nothing:
         return [], []
     best = min(nothing, key=lambda fit: fit.chi2)
-    looks = sorted(_screened(fine, best, effects), key=lambda look: look[0])
+    one = fine.only(fine.trials[:1])  # the others are as good, and take as long
+    looks = sorted(_screened(one, best, effects), key=lambda look: look[0])
     first = {effect.name: ((effect,), point) for _, effect, point in reversed(looks)}
     order = list(dict.fromkeys(effect.name for _, effect, _ in looks))
     tasks = [first[name] for name in order[:FINER]]
@@ -222,7 +223,8 @@ def _screened(
     turn = [np.arange(len(x)) // len(e.starts) % 2 for e, x in zip(effects, points, strict=True)]
     at = [np.concatenate([stated[k], x], 1) for k, x in zip(turn, points, strict=True)]
     asked = [((e,), x) for e, x in zip(effects, at, strict=True)]
-    rows = zip(effects, at, _simulated(problem, asked, null_model.errors), strict=True)
+    errors = np.zeros(len(problem.observation.deviations))
+    rows = zip(effects, at, _simulated(problem, asked, errors), strict=True)
     return [(chi2, effect, x[k]) for effect, x, left in rows for k, chi2 in left.items()]
 
 
