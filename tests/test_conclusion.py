@@ -99,6 +99,26 @@ def weighed(data, *models, names=10):
     )
 
 
+def shifted(found, by):
+    """The same mode, whose evidence was found higher by so much."""
+    some, none = (dataclasses.replace(b, ln_occam=b.ln_occam + by) for b in (found.some, found.none))
+    return dataclasses.replace(found, some=some, none=none)
+
+
+def test_evidence_that_scatters_where_a_mode_is_looked_at_again_decides_by_no_more_than_that():
+    data, nothing, drag = recorded(0.0, 1, effect=0.02)
+    sure = weighed(data, nothing, drag)
+    off = (40.0, 0.0, -40.0)
+    again = dataclasses.replace(sure, effects=tuple(shifted(p, d) for p in sure.effects for d in off))
+    assert sure.scatter == 0.0
+    assert again.scatter == pytest.approx(40.0)  # sample deviation of the three; the model without an effect adds none
+    assert again.kappa == pytest.approx(40.0)
+    # Neither the best nor the last of them counts, but the middle.
+    assert [p.ln_evidence for p in again.groups["drag"]] == [sure.groups["drag"][0].ln_evidence]
+    odds = [w.candidates()[0] for w in (sure, again)]
+    assert odds[0]["drag"] > 0.99 > odds[1]["drag"]
+
+
 def test_an_effect_that_is_there_is_explained():
     data, nothing, drag = recorded(0.0, 4, effect=0.3)
     found = conclude(weighed(data, nothing, drag), limit=0.0)

@@ -68,9 +68,9 @@ def test_ends_of_one_name_count_once_where_they_are_the_same_place(still):
     drag = dataclasses.replace(null_model, effects=(effect("drag"),), point=np.array([0.1, 20.0]))
     near, far = (dataclasses.replace(drag, point=np.array([0.1, x])) for x in (22.0, 40.0))
     other = dataclasses.replace(drag, effects=(effect("density"),))
-    assert distinct([drag, near, null_model, far, other]) == [drag, far, other]
+    assert distinct([drag, near, null_model, far, other], ENDS) == [drag, far, other]
     many = [dataclasses.replace(drag, point=np.array([0.1, 2.0**k])) for k in range(2 * ENDS)]
-    assert distinct(many) == many[:ENDS]
+    assert distinct(many, ENDS) == many[:ENDS]
 
 
 def test_drag_is_named_with_its_number_and_its_probability(dragged):

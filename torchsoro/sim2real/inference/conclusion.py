@@ -127,7 +127,17 @@ class Weighing:
     @cached_property
     def null(self) -> Posterior:
         """The most probable mode of the model without an effect."""
-        return max(self.nothing, key=lambda p: p.ln_evidence)
+        return max(map(_middle, _alike(self.nothing)), key=lambda p: p.ln_evidence)
+
+    @cached_property
+    def scatter(self) -> float:
+        """Standard deviation of ln evidence where a mode was linearised more than once, a little beside itself.
+
+        Of rough motions that says how much of it hangs on which node touches when.
+        """
+        again = [[p.ln_evidence for p in same] for same in (*_alike(self.nothing), *_alike(self.effects))]
+        free = sum(len(same) - 1 for same in again)
+        return math.sqrt(sum(len(same) * float(np.var(same)) for same in again) / free) if free else 0.0
 
     def change(self, found: Posterior) -> Motions:
         """Of the motion, by an effect: from what is believed, within its tolerances."""
@@ -150,25 +160,26 @@ class Weighing:
 
     @cached_property
     def kappa(self) -> float:
-        """Mean adjustment over the changes by all names, by the errors of the most probable model."""
+        """Mean adjustment over the changes by all names, by the errors of the most probable model.
+
+        Differences of ln evidence are no more certain than it scatters.
+        """
         changes = [self.change(modes[0]) for modes in self.groups.values()]
         columns = tuple(np.stack(same, -1) for same in zip(*changes, strict=True))
-        return adjustment(self.data, self.best, columns) if changes else 1.0
+        return max(adjustment(self.data, self.best, columns), self.scatter) if changes else 1.0
 
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
         """Distinct modes of each name, most probable first."""
         found: dict[str, list[Posterior]] = {}
-        for p in sorted(self.effects, key=lambda p: -p.ln_evidence):
-            mine = found.setdefault(p.near.model.name, [])
-            if not any(_same(p, q) for q in mine):
-                mine.append(p)
+        for p in sorted(map(_middle, _alike(self.effects)), key=lambda p: -p.ln_evidence):
+            found.setdefault(p.near.model.name, []).append(p)
         return {name: tuple(modes) for name, modes in found.items()}
 
     @cached_property
     def best(self) -> Posterior:
         """The most probable of all."""
-        return max((*self.effects, *self.nothing), key=lambda p: p.ln_evidence)
+        return max((*(p for modes in self.groups.values() for p in modes), self.null), key=lambda p: p.ln_evidence)
 
     @cached_property
     def unexplained(self) -> float:
@@ -252,9 +263,26 @@ def _summed(modes: Sequence[Posterior]) -> float:
     return float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
 
 
+def _alike(found: Sequence[Posterior]) -> list[list[Posterior]]:
+    """Those of each mode, most probable first."""
+    modes: list[list[Posterior]] = []
+    for p in sorted(found, key=lambda p: -p.ln_evidence):
+        mine = [same for same in modes if same[0].near.model.name == p.near.model.name and _same(p, same[0])]
+        if mine:
+            mine[0].append(p)
+        else:
+            modes.append([p])
+    return modes
+
+
+def _middle(same: Sequence[Posterior]) -> Posterior:
+    """Of those of one mode the one in the middle, the less probable of two."""
+    return sorted(same, key=lambda p: p.ln_evidence)[(len(same) - 1) // 2]
+
+
 def _same(one: Posterior, other: Posterior) -> bool:
-    """Whether two modes of a name are one, by the narrower of them."""
-    own = list(one.near.model.own)
+    """Whether two modes of a name are one, in beliefs and in the numbers of effects, by the narrower of them."""
+    own = [*range(one.near.model.beliefs), *one.near.model.own]
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
     return bool((np.abs(off) < SAME * spread).all())

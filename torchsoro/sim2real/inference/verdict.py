@@ -136,13 +136,14 @@ def weighed(
     weighing = weighing_of(problem, [p for _, p in known], names)
     for _ in range(ROUNDS):
         leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
-        far = [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]
+        # Of rough motions each is looked at again, to see how far its evidence hangs on which node touches when.
+        far = [p for p in (weighing.null, *leading[:POLISHED]) if problem.rough or _moved(p)]
         if not far:
             break
         again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far])
         sound = {p.near.model.name for _, p in again}
-        # What breaks down there stays as it was.
-        known = [k for k in known if k[1] not in far or k[1].near.model.name not in sound] + again
+        # What breaks down there stays as it was; so does what is looked at again.
+        known = [k for k in known if not _moved(k[1]) or k[1] not in far or k[1].near.model.name not in sound] + again
         weighing = weighing_of(problem, [p for _, p in known], names)
     changes = responses(problem, effects, _fit_of(known, weighing.null))
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
