@@ -42,6 +42,7 @@ from torchsoro.sim2real.inference.state_space import total
 
 NOTHING, UNKNOWN = "nothing", "unknown"
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
+CLOSE = 0.2  # of a tolerance, of a noticeable change, or of a tenth of the body, below which they are, too
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -281,11 +282,14 @@ def _middle(same: Sequence[Posterior]) -> Posterior:
 
 
 def _same(one: Posterior, other: Posterior) -> bool:
-    """Whether two modes of a name are one, in beliefs and in the numbers of effects, by the narrower of them."""
+    """Whether two modes of a name are one, in beliefs and in the numbers of effects.
+
+    They are if they are near by the narrower of them, or by what is noticeable: that of rough motions is too narrow.
+    """
     own = [*range(one.near.model.beliefs), *one.near.model.own]
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
-    return bool((np.abs(off) < SAME * spread).all())
+    return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())
 
 
 def apart(one: Posterior, other: Posterior) -> float:

@@ -29,7 +29,8 @@ CORRECTED = 1.5  # chi-squared per sample of the null model, above which the fin
 REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
-SCREENED = 8  # points of each effect that a finer twin simulates of rough motions; of a local one four times as many
+MOST_ROUGH = 24  # the same where bodies touch planes and most searches end in valleys nearby
+SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
@@ -63,7 +64,9 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST))
+    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.fine is not None
+    by_finer = by_finer and not problem.stated
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough and not by_finer else MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -86,6 +89,8 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
+    if problem.rough and not by_finer:
+        tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
     if len(tasks) > COMPLETED:
@@ -106,7 +111,7 @@ def search(
         pairs = [f for f in _pairs(problem, effects, best, report) if f.chi2 - f.samples < TWICE * left]
         best = _best([*best, *pairs])
     ends = [*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)]
-    if not problem.rough:
+    if not by_finer:
         return problem, null_model, distinct(ends, ENDS)
     # What two searches find in turn, so that neither crowds out the other.
     nothing, finer = _by_finer(problem, effects, null_model, report)
@@ -131,14 +136,13 @@ def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
 def _by_finer(
     problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit, report: Callable[[str], None]
 ) -> tuple[list[Fit], list[Fit]]:
-    """Fits by the finer twin, without an effect and with one, where bodies touch planes.
+    """Fits by the finer twin, without an effect and with one, of bodies with chambers that touch planes.
 
-    A twin with large cells is off by as much as effects are. What a finer one adds to its motion as stated holds as
-    long as nodes touch when they do there, so that no correction makes up for it. And no response tells an effect
-    from afar: chi-squared itself is simulated, at evenly spread points.
+    A twin whose cells are as large as walls is off by as much as effects are. What a finer one adds to its motion as
+    stated holds as long as nodes touch when they do there, so that no correction makes up for it. And no response tells
+    an effect from afar: chi-squared itself is simulated, at evenly spread points.
     """
-    if problem.fine is None or problem.stated:
-        return [], []
+    assert problem.fine is not None
     fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
     begin = [((), null_model.point), *_null_starts(fine)]
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]

@@ -142,8 +142,9 @@ def weighed(
             break
         again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far])
         sound = {p.near.model.name for _, p in again}
-        # What breaks down there stays as it was; so does what is looked at again.
-        known = [k for k in known if not _moved(k[1]) or k[1] not in far or k[1].near.model.name not in sound] + again
+        # What breaks down there stays as it was, and so does what is one of several looks.
+        kept = [k for k in known if problem.rough or k[1] not in far or k[1].near.model.name not in sound]
+        known = [*kept, *again]
         weighing = weighing_of(problem, [p for _, p in known], names)
     changes = responses(problem, effects, _fit_of(known, weighing.null))
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
