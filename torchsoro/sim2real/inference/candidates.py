@@ -112,7 +112,7 @@ def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
     Returns:
         A model of each; None where a simulation breaks down.
     """
-    finer = None if problem.stated else problem.fine
+    finer = problem.finer_twin
     bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
     steps = [np.where(f.point + STEP > coarse.bounds(f.effects)[1], -STEP, STEP) for f in fits]

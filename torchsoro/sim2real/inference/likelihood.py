@@ -186,6 +186,11 @@ class Likelihood:
         trials, known = (*self.experiment.trials, *self.experiment.heldout), self.discretization.correction
         return {t.name: known[t.name] for t in trials if t.simulated and t.name in known}
 
+    @property
+    def finer_twin(self) -> Twin | None:
+        """The finer twin; none where trials come with a simulation of their own, which stands in for it."""
+        return None if self.stated else self.fine
+
     def thought_of(self, effects: Sequence[Hypothesis]) -> list[Hypothesis]:
         """Those of the effects that apply to a trial."""
         return [e for e in effects if any(e.applies(scenario, self.twin) for scenario in self.scenarios)]

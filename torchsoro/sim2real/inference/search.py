@@ -64,8 +64,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.fine is not None
-    by_finer = by_finer and not problem.stated
+    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough and not by_finer else MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:

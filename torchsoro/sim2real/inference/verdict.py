@@ -190,7 +190,7 @@ def _other_valleys(problem: FitProblem) -> list[Fit]:
     The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
     it into a deep one must not be told where what is stated, a little different, does so, too.
     """
-    if problem.fine is None or problem.stated or not problem.rough:
+    if problem.finer_twin is None or not problem.rough:
         return []
     tasks = [((), point) for point in within_tolerances(problem)]
     return [f for f in problem.fit(tasks, rounds=0, settle=False) if f is not None]
