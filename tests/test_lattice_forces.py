@@ -15,8 +15,10 @@ from test_ops import TENSORS, check, combined, gradients
 import torchsoro
 from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.kernels.tile import KEPT
+from torchsoro.simulation.ops import total
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.tiles import tables, tiles_along
+from torchsoro.simulation.ops.tiles import LIMIT, tables, tiles_along, tiles_of
 
 
 def axis(*widths: float, creases: tuple[int, ...] = ()) -> Axis:
@@ -41,6 +43,17 @@ def wide() -> Lattice:
             axis(1.2, 0.8, 1.0, 0.9, 1.1, creases=(1,)),
             Axis.uniform(5.0, 0.9, 6),
             axis(*(0.8 + 0.1 * (i % 4) for i in range(9)), creases=(3, 4)),
+        )
+    )
+
+
+def filled(shape: layout.Shape) -> Lattice:
+    """A tile of that shape with all its cells and nodes."""
+    more = (n - c - 2 for c, n in zip(shape.cells, shape.nodes, strict=True))
+    return Lattice(
+        axes=tuple(
+            axis(*np.linspace(0.9, 1.1, c), creases=tuple(range(1, 1 + k)))
+            for c, k in zip(shape.cells, more, strict=True)
         )
     )
 
@@ -120,8 +133,11 @@ def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole:
 @pytest.mark.parametrize(("dtype", "within"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize(
     ("lattice", "whole"),
-    [(None, False), (uneven(), False), (wide(), False), (hollow(), True)],
-    ids=["uniform", "uneven", "wide", "whole"],
+    [
+        *((None, False), (uneven(), False), (wide(), False), (hollow(), True)),
+        *(pytest.param(filled(shape), False, marks=pytest.mark.slow) for shape in layout.SHAPES),
+    ],
+    ids=["uniform", "uneven", "wide", "whole", *("x".join(map(str, shape.nodes)) for shape in layout.SHAPES)],
 )
 def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, within):
     one, other = (compared(lattice, dtype, lanes=lanes, whole=whole) for lanes in (True, False))
@@ -129,14 +145,22 @@ def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, 
     assert max(off.values()) <= within, off
 
 
+@pytest.mark.parametrize("lattice", [uneven(), hollow()], ids=["uneven", "whole"])
+def test_kernels_for_any_load_move_a_body_like_its_own(lattice, monkeypatch):
+    p = problem(formulation="total", lattice=lattice, steps=5, samples=(), lanes=False)
+    own = p.run()[0]
+    monkeypatch.setattr(total, "_features", lambda scene, of=total._features: of(scene) | layout.ANY_LOAD)
+    assert float((p.run()[0] - own).abs().max()) <= 1e-14 * float(own.abs().max())
+
+
 def test_both_engines_agree_on_walls_of_more_points_than_a_tile_has_room_for():
-    axes = (Axis.uniform(5.0, 1.0, 3), Axis.uniform(3.0, 0.5, 16), Axis.uniform(3.0, 0.5, 16))
+    axes = (Axis.uniform(5.0, 1.0, 3), Axis.uniform(3.0, 0.5, 18), Axis.uniform(3.0, 0.5, 18))
     states = []
     for lanes in (True, False):
         lattice = Lattice(axes=axes)
-        p = completed(problem(formulation="total", lattice=lattice, steps=3, samples=(), lanes=lanes), end=(2, 15, 15))
+        p = completed(problem(formulation="total", lattice=lattice, steps=3, samples=(), lanes=lanes), end=(2, 17, 17))
         walls = p.scene.lattice.walls  # type: ignore[union-attr]
-        assert 3 * len(walls.places) > layout.PAD - 2 * layout.TILE  # type: ignore[union-attr]
+        assert 3 * len(walls.places) > max(t.pad for t in layout.SHAPES) - 2 * layout.TILE  # type: ignore[union-attr]
         states.append(p.run()[0][0, : 6 * lattice.nodes])
     assert float((states[0] - states[1]).norm()) < 1e-12 * float(states[0].norm())
 
@@ -214,21 +238,50 @@ def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamb
 # --------------------------------------------------------------------------------------------------------------- tiles
 
 
-@given(cells=st.integers(1, 13), creased=st.sets(st.integers(1, 12)), most=st.sampled_from([2, 4]))
-def test_tiles_cover_an_axis_and_no_node_belongs_to_more_than_two(cells, creased, most):
+@given(
+    cells=st.integers(1, 13),
+    creased=st.sets(st.integers(1, 12)),
+    most=st.sampled_from(layout.SHAPES),
+    way=st.integers(0, 2),
+)
+def test_tiles_cover_an_axis_and_no_node_belongs_to_more_than_two(cells, creased, most, way):
     a = axis(*np.ones(cells), creases=tuple(c for c in creased if c < cells))
-    tiles = tiles_along(a, most)
-    taken = [[first + k for k in range(most) if seats >> k & 1] for _, seats, first in tiles]
-    assert [c for t in taken for c in t] == a.first.tolist()
-    assert [c for c, _, _ in tiles] == np.cumsum([0, *(len(t) for t in taken[:-1])]).tolist()
-    assert all(seats < 2**most for _, seats, _ in tiles)
-    nodes = np.concatenate([np.arange(t[0], t[-1] + 3) for t in taken])
-    count = np.bincount(nodes, minlength=a.nodes)
+    tiles = tiles_along(a, most.cells[way], most.nodes[way])
+    assert [c for cell, count, _ in tiles for c in range(cell, cell + count)] == list(range(cells))
+    assert [first for _, _, first in tiles] == [a.first[cell] for cell, _, _ in tiles]
+    nodes = [np.arange(first, a.first[cell + count - 1] + 3) for cell, count, first in tiles]
+    assert all(len(n) <= most.nodes[way] for n in nodes)
+    count = np.bincount(np.concatenate(nodes), minlength=a.nodes)
     assert 1 <= count.min() <= count.max() <= 2
 
 
-def test_a_tile_goes_on_beyond_a_crease_and_leaves_a_seat_free_there():
-    assert tiles_along(axis(1, 1, 1, 1, creases=(1,)), 4).tolist() == [[0, 0b1101, 0], [3, 0b1, 4]]
+def test_a_tile_with_room_for_more_nodes_goes_on_beyond_creases():
+    creased = axis(1, 1, 1, 1, creases=(1, 3))
+    assert tiles_along(creased, 4, 8).tolist() == [[0, 4, 0]]
+    assert tiles_along(creased, 4, 7).tolist() == [[0, 3, 0], [3, 1, 5]]
+    assert tiles_along(creased, 4, 6).tolist() == [[0, 1, 0], [1, 2, 2], [3, 1, 5]]
+
+
+@pytest.mark.parametrize("shape", layout.SHAPES)
+def test_a_tile_has_a_thread_for_each_of_its_points_lines_sheets_and_nodes(shape):
+    points = 8 * np.prod(shape.cells)
+    assert max(points, shape.lines, shape.sheets, shape.count) <= layout.TILE
+    assert 4 * KEPT + 4 * shape.pad <= LIMIT
+
+
+@pytest.mark.parametrize("shape", layout.SHAPES)
+def test_a_body_that_fills_a_tile_gets_it(shape):
+    found = tiles_of(filled(shape), torch.zeros(0))
+    assert (found.of, found.count) == (shape, 1)
+
+
+def test_a_lattice_takes_the_shape_of_which_it_needs_least():
+    across = axis(1, 1, 1, 1, creases=(1, 3))
+    finger = Lattice(axes=(axis(*np.ones(8)), across, across))
+    found = tiles_of(finger, torch.zeros(0))
+    assert (found.of.nodes, found.counts) == ((4, 8, 8), (4, 1, 1))
+    bar = Lattice(axes=(axis(*np.ones(8)), axis(1, 1), axis(1, 1)))
+    assert tiles_of(bar, torch.zeros(0)).counts == (1, 1, 1)
 
 
 def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
@@ -236,13 +289,16 @@ def test_every_share_of_a_tile_goes_to_the_node_that_it_is_of():
     lat = wide()
     kind = torch.full((lat.count,), -1, dtype=torch.int32)
     kind[: lat.count // 3], kind[-9:] = 0, layout.ABSENT
-    _, _, chamber_start, slot_start, slots, sources, near, *_ = tables(lat, kind, 2)
+    tiles = tiles_of(lat, torch.zeros(0))
+    _, _, chamber_start, slot_start, slots, sources, near, *_ = tables(lat, tiles, kind, 2)
     many = len(slot_start) - 1 + len(slots)
     at = np.sort(sources[sources >= 0])
     assert len(np.unique(at)) == len(at)
-    assert at.max() < many * layout.SLOT
-    tiles = [tiles_along(a, n) for a, n in zip(lat.axes, layout.TILE_CELLS, strict=True)]
-    counts = [np.bincount(np.concatenate([np.arange(f, f + int(n).bit_length() + 2) for _, n, f in t])) for t in tiles]
+    assert at.max() < many * tiles.of.slot
+    counts = [
+        np.bincount(np.concatenate([np.arange(first, a.first[cell + n - 1] + 3) for cell, n, first in t]))
+        for a, t in zip(lat.axes, tiles.along, strict=True)
+    ]
     wanted = counts[0][:, None, None] * counts[1][None, :, None] * counts[2][None, None, :]
     assert (sources[0] >= 0).sum(0).tolist() == wanted.reshape(-1).tolist()
     assert chamber_start.tolist() == [0, len(slots), len(slots)]

@@ -4,6 +4,8 @@ Particle buffers are structures of arrays: component ``c`` of particle ``p`` of 
 lies at ``((r * batch + b) * components + c) * particles + p``. Node buffers keep a node's components together.
 """
 
+from typing import NamedTuple
+
 # State: position, velocity, affine velocity C, deformation gradient F (a gas keeps J in F[0, 0]), then one symmetric
 # history tensor H (xx, yy, zz, xy, yz, xz) for every Maxwell element.
 POSITION, VELOCITY, AFFINE, DEFORMATION, HISTORY = 0, 3, 6, 15, 24
@@ -76,15 +78,16 @@ COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
-    *("faced", "ties", "pushes", "wall_chunks"),
+    *("faced", "ties", "pushes", "wall_chunks", "fluid"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
 VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
-FACED, TIES, PUSHES, WALL_CHUNKS = range(26, 30)
+FACED, TIES, PUSHES, WALL_CHUNKS, FLUID = range(26, 31)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers.
 LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW = (2**n for n in range(7))
+ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
 # kept of every substep beside the states; what points and nodes hand each other, forward and (from FORCES) backward;
@@ -110,17 +113,17 @@ BUFFERS = {
         )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(30, 39)
-WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY = range(39, 43)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(43, 52)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(52, 58)
-PRESSURE, GRAVITY, FORCE = range(58, 61)
-VOLUMES, PUSHED = range(61, 63)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(63, 68)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(68, 72)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(72, 80)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(80, 83)
-HEAD = 83
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(31, 40)
+WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY = range(40, 44)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(44, 53)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(53, 59)
+PRESSURE, GRAVITY, FORCE = range(59, 62)
+VOLUMES, PUSHED = range(62, 64)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(64, 69)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(69, 73)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(73, 81)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(81, 84)
+HEAD = 84
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors.
@@ -133,35 +136,103 @@ WALL_VECTORS = 15
 STEP_SIZE, EDGE, AXES = 0, 1, 2
 AXIS = 6
 
-# A tile is a box of seats for cells whose points a block of threads works on, one each. Its nodes are two more along
-# each axis than its seats, of which one stays free where a crease crosses the tile. A node belongs to two tiles along
-# each axis at most.
-TILE_CELLS = (2, 4, 4)
-TILE = 256  # points of a tile
-TILE_X, TILE_Y, TILE_Z = (n + 2 for n in TILE_CELLS)  # nodes
-TILE_NODES = TILE_X * TILE_Y * TILE_Z
-TILE_LINES = 2 * TILE_CELLS[0] * 2 * TILE_CELLS[1] * TILE_Z
-TILE_SHEETS = 2 * TILE_CELLS[0] * TILE_Y * TILE_Z
-SHARED = 8  # tiles that a node belongs to
-# What a tile hands to one of its nodes: its share of a force, by all its points or by those of a chamber (a "slot").
-SLOT = 3 * TILE_NODES
-
-# A node's mass, the way from it to the surface of the matter that it carries, in cells, and its drag factor: the share
-# of its velocity that implicit drag leaves in a substep.
-NODAL_MASS, NODAL_REACH, NODAL_DRAG_FACTOR = 0, 1, 4
-NODAL = 5
-
 # What a point hands to the nodes: a tensor that goes with the slopes and a vector that goes with the weights; the same
 # after the sum along z: three vectors, for slopes along x, y and z; after the sum along y: for slopes along x and not.
 BUNDLE = 12
 LINE = 9
 SHEET = 6
-# Numbers that a tile shares: of its points, and then of its sheets; of its lines, and before of a third vector at its
-# nodes; two vectors at its nodes; of the axes.
-PAD_POINTS, PAD_LINES = 0, BUNDLE * TILE
-PAD_NODES = PAD_LINES + LINE * TILE_LINES
-PAD_AXES = PAD_NODES + 2 * SLOT
-PAD = PAD_AXES + AXIS * 2 * sum(TILE_CELLS)
+TILE = 256  # points of a tile at most, and threads that work on them, one each
+PAD_AXIS = (
+    AXIS + 1
+)  # numbers of a point along an axis that a tile shares: also the lowest node of its cell, in the tile
+SHARED = 8  # tiles that a node belongs to
+
+
+class Shape(NamedTuple):
+    """How many cells and nodes a tile has along each axis at most; more than two nodes beyond its cells for creases.
+
+    Points, lines of them along z, sheets of lines and nodes are at most ``TILE`` each.
+    """
+
+    cells: tuple[int, int, int]
+    nodes: tuple[int, int, int]
+
+    @property
+    def wide(self) -> int:
+        """Points along x."""
+        return 2 * self.cells[0]
+
+    @property
+    def deep(self) -> int:
+        """Points along y."""
+        return 2 * self.cells[1]
+
+    @property
+    def high(self) -> int:
+        """Points along z."""
+        return 2 * self.cells[2]
+
+    @property
+    def layer(self) -> int:
+        """Nodes across x."""
+        return self.nodes[1] * self.nodes[2]
+
+    @property
+    def count(self) -> int:
+        """Nodes in all."""
+        return self.nodes[0] * self.layer
+
+    @property
+    def lines(self) -> int:
+        """Sums along z."""
+        return self.wide * self.deep * self.nodes[2]
+
+    @property
+    def sheets(self) -> int:
+        """Sums along z and y."""
+        return self.wide * self.layer
+
+    @property
+    def slot(self) -> int:
+        """What a tile hands to its nodes: its share of a force, by all its points or by those of a chamber."""
+        return 3 * self.count
+
+    # Numbers that a tile shares: of its points, and then of its sheets; of its lines, and before of a third vector at
+    # its nodes; two vectors at its nodes; of the axes.
+    @property
+    def pad_nodes(self) -> int:
+        """Where vectors at the nodes begin."""
+        return PAD_LINES + LINE * self.lines
+
+    def axis_at(self, axis: int) -> int:
+        """Where weights and slopes of the points along an axis begin."""
+        return self.pad_nodes + 2 * self.slot + PAD_AXIS * 2 * sum(self.cells[:axis])
+
+    def cells_at(self, axis: int) -> int:
+        """Where, for nodes along an axis, the number of the cell begins of which each is the lowest; -1 for none."""
+        return self.axis_at(3) + sum(self.nodes[:axis])
+
+    @property
+    def pad(self) -> int:
+        """All numbers that a tile shares."""
+        return self.cells_at(3)
+
+
+PAD_LINES = BUNDLE * TILE
+# For bodies without creases; across two creases; for bodies of a few cells across, and for slender ones.
+SHAPES = (
+    Shape((2, 4, 4), (4, 6, 6)),
+    Shape((2, 4, 4), (4, 8, 8)),
+    Shape((3, 3, 3), (6, 6, 6)),
+    Shape((2, 5, 3), (4, 8, 6)),
+    Shape((2, 3, 5), (4, 6, 8)),
+    Shape((8, 2, 2), (10, 4, 4)),
+)
+
+# A node's mass, the way from it to the surface of the matter that it carries, in cells, and its drag factor: the share
+# of its velocity that implicit drag leaves in a substep.
+NODAL_MASS, NODAL_REACH, NODAL_DRAG_FACTOR = 0, 1, 4
+NODAL = 5
 
 # A chamber: mean air stiffness, reference volume.
 CHAMBER_STIFFNESS, CHAMBER_VOLUME = 0, 1

@@ -22,40 +22,35 @@ from torchsoro.simulation.kernels.layout import (
     AXIS,
     CHAMBER_START,
     CHAMBERS,
+    FIRSTS,
     HEAD,
     LOADED,
+    NX,
     NY,
     NZ,
-    PAD,
-    PAD_AXES,
+    PAD_AXIS,
     PAD_LINES,
-    PAD_NODES,
+    SHAPES,
     SHARED,
-    SLOT,
     SLOT_START,
     STEP_SIZE,
     SWEPT,
     TILE,
-    TILE_CELLS,
-    TILE_LINES,
-    TILE_NODES,
-    TILE_SHEETS,
-    TILE_Y,
-    TILE_Z,
     TILES,
     TX,
     TY,
     TZ,
+    Shape,
 )
 
-# Points of a tile along x, y, z.
-WIDE, DEEP, HIGH = (2 * n for n in TILE_CELLS)
 # Where parts of a chamber's sum lie in the pad: after the bundles that go with slopes; likewise of one over tiles.
 ALONE = 9 * TILE
 PARTS = 16
 TOTALS = TILE + PARTS
 # Integers that a block keeps at hand: the head, a zero, and those of a tile.
 KEPT = HEAD + 14
+# A power of two above all places in a pad.
+ROOM = 2 ** max(shape.pad for shape in SHAPES).bit_length()
 
 
 class Block(NamedTuple):
@@ -66,12 +61,14 @@ class Block(NamedTuple):
     Attributes:
         gpu: Whether threads are those of a GPU, from ``q0`` to before ``q1``: one each; else a loop runs over all.
         features: What the kernel is compiled for.
+        tile: Shape of a tile.
         head: Beginning of ``ints``, at hand.
         pad: Where the block works, from ``base`` on.
     """
 
     gpu: bool
     features: int
+    tile: Shape
     head: Any
     pad: Any
     base: Any
@@ -88,14 +85,14 @@ class Block(NamedTuple):
     sums: Any = None
 
 
-def on_cpu(features, base, ints, *buffers):
+def on_cpu(features, shape, base, ints, *buffers):
     """The block of an iteration of a parallel loop on a CPU, whose pad begins at ``base`` of ``scratch``."""
-    return Block(False, features, ints, buffers[4], base, 0, TILE, ints, *buffers)
+    return Block(False, features, SHAPES[shape], ints, buffers[4], base, 0, TILE, ints, *buffers)
 
 
-def on_gpu(features, head, pad, q, *buffers):
+def on_gpu(features, shape, head, pad, q, *buffers):
     """The block of a thread on a GPU."""
-    return Block(True, features, head, pad, 0, q, q + 1, *buffers)
+    return Block(True, features, SHAPES[shape], head, pad, 0, q, q + 1, *buffers)
 
 
 @ti.func
@@ -170,8 +167,8 @@ def tile_box(block: ti.template(), fresh, item):
     """What is to be known of a tile, number ``item`` of all simulations; a GPU keeps it at hand until ``fresh``.
 
     Returns:
-        Lowest cell; which seats along x, y, z have a cell; lowest node; where its pairs with chambers begin and end;
-        the simulation, and the tile's number in it.
+        Lowest cell and number of cells along x, y, z; lowest node; where its pairs with chambers begin and end; the
+        simulation, and the tile's number in it.
     """
     box = ti.Vector([0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])
     if ti.static(block.gpu):
@@ -183,42 +180,39 @@ def tile_box(block: ti.template(), fresh, item):
     else:
         for k in ti.static(range(13)):
             box[k] = tile_number(block.head, block.ints, item, k)
-    cell, seats = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
-    return cell, seats, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
+    cell, counts = ti.Vector([box[0], box[1], box[2]]), ti.Vector([box[3], box[4], box[5]])
+    return cell, counts, ti.Vector([box[6], box[7], box[8]]), box[9], box[10], box[11], box[12]
 
 
 @ti.func
-def number_along(cell, seats, most: ti.template(), at):
-    """Along an axis, the number of a tile's point ``at`` among those of the lattice; -1 at a free seat."""
-    seat = at // 2
-    found = 2 * cell + at % 2
-    for k in ti.static(range(most - 1)):
-        found += ti.select(k < seat, 2 * (seats >> k & 1), 0)
-    return ti.select(seats >> seat & 1 == 1, found, -1)
+def number_along(cell, count, at):
+    """Along an axis, the number of a tile's point ``at`` among those of the lattice; -1 if the tile has none there."""
+    return ti.select(at < 2 * count, 2 * cell + at, -1)
 
 
 @ti.func
-def point_of(head: ti.template(), cell, seats, q):
+def point_of(block: ti.template(), cell, counts, q):
     """The point that thread q works on; -1 if the tile has none there."""
-    x = number_along(cell[0], seats[0], TILE_CELLS[0], q // ti.static(DEEP * HIGH))
-    y = number_along(cell[1], seats[1], TILE_CELLS[1], (q // HIGH) % DEEP)
-    z = number_along(cell[2], seats[2], TILE_CELLS[2], q % HIGH)
+    deep, high = ti.static((block.tile.deep, block.tile.high))
+    x = number_along(cell[0], counts[0], q // ti.static(deep * high))
+    y = number_along(cell[1], counts[1], (q // high) % deep)
+    z = number_along(cell[2], counts[2], q % high)
     p = ti.cast(-1, ti.i32)
     if x >= 0 and y >= 0 and z >= 0:
-        p = (x * head[NY] + y) * head[NZ] + z
+        p = (x * block.head[NY] + y) * block.head[NZ] + z
     return p
 
 
 @ti.func
-def field_start(number: ti.template()):
+def field_start(block: ti.template(), number: ti.template()):
     """Where a staged field begins in the pad."""
-    return ti.static(PAD_LINES if number == 2 else PAD_NODES + number * SLOT)
+    return ti.static(PAD_LINES if number == 2 else block.tile.pad_nodes + number * block.tile.slot)
 
 
 @ti.func
 def near(place):
     """A place in the pad, of which the compiler then knows that constants added to it do not overflow."""
-    return place & ti.static(2 ** PAD.bit_length() - 1)
+    return place & (ROOM - 1)
 
 
 @ti.func
@@ -226,52 +220,89 @@ def stage(block: ti.template(), a: ti.template(), at, number: ti.template(), nod
     """Copy a vector field at the nodes of a tile to the pad, as its field of that number."""
     m = nodes_per_axis(block.head)
     nodes = product(m)
+    slot, count, layer, row = ti.static((block.tile.slot, block.tile.count, block.tile.layer, block.tile.nodes[2]))
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        for part in ti.static(range((SLOT + TILE - 1) // TILE)):
+        for part in ti.static(range((slot + TILE - 1) // TILE)):
             one = q + part * TILE
-            if one < SLOT:
-                c, i = one // TILE_NODES, one % TILE_NODES
+            if one < slot:
+                c, i = one // count, one % count
                 # A tile with fewer cells than usual reads some nodes in vain.
-                x = ti.min(node[0] + i // ti.static(TILE_Y * TILE_Z), m[0] - 1)
-                y = ti.min(node[1] + i // TILE_Z % TILE_Y, m[1] - 1)
-                z = ti.min(node[2] + i % TILE_Z, m[2] - 1)
-                block.pad[block.base + field_start(number) + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
+                x = ti.min(node[0] + i // layer, m[0] - 1)
+                y = ti.min(node[1] + i // row % ti.static(block.tile.nodes[1]), m[1] - 1)
+                z = ti.min(node[2] + i % row, m[2] - 1)
+                start = block.base + field_start(block, number)
+                block.pad[start + one] = a[at + c * nodes + (x * m[1] + y) * m[2] + z]
 
 
 @ti.func
-def stage_axes(block: ti.template(), cell, seats):
-    """Copy weights and slopes of a tile's points along the axes to the pad; zeros for free seats."""
+def cells_before(block: ti.template(), axis: ti.template()):
+    """Where the lowest nodes of the cells along an axis begin."""
+    before = block.head[FIRSTS]
+    if ti.static(axis > 0):
+        before += block.head[NX] // 2
+    if ti.static(axis > 1):
+        before += block.head[NY] // 2
+    return before
+
+
+@ti.func
+def stage_axes(block: ti.template(), cell, counts, node):
+    """Copy what is to be known of a tile's points and nodes along the axes to the pad."""
     starts = axis_starts(block.head)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        if q < ti.static(AXIS * (WIDE + DEEP + HIGH)):
-            p, start = number_along(cell[0], seats[0], TILE_CELLS[0], q // AXIS), starts[0]
-            if q >= ti.static(AXIS * (WIDE + DEEP)):
-                along = q // AXIS - ti.static(WIDE + DEEP)
-                p, start = number_along(cell[2], seats[2], TILE_CELLS[2], along), starts[2]
-            elif q >= ti.static(AXIS * WIDE):
-                p, start = number_along(cell[1], seats[1], TILE_CELLS[1], q // AXIS - WIDE), starts[1]
-            number = block.fixed[STEP_SIZE] * 0
-            if p >= 0:
-                number = block.fixed[start + AXIS * p + q % AXIS]
-            block.pad[block.base + PAD_AXES + q] = number
+        for axis in ti.static(range(3)):
+            points, nodes = ti.static((2 * block.tile.cells[axis], block.tile.nodes[axis]))
+            axis_at, cells_at = ti.static((block.tile.axis_at(axis), block.tile.cells_at(axis)))
+            firsts = cells_before(block, axis) + cell[axis]
+            if q < points * PAD_AXIS:
+                p, one = number_along(cell[axis], counts[axis], q // PAD_AXIS), q % PAD_AXIS
+                number = block.fixed[STEP_SIZE] * 0
+                if p >= 0:
+                    if one < AXIS:
+                        number = block.fixed[starts[axis] + AXIS * p + one]
+                    else:
+                        number += block.ints[firsts + q // ti.static(2 * PAD_AXIS)] - node[axis]
+                block.pad[block.base + axis_at + q] = number
+            if q < nodes:
+                number = block.fixed[STEP_SIZE] * 0 - 1
+                for k in range(counts[axis]):
+                    if block.ints[firsts + k] - node[axis] == q:
+                        number = number * 0 + k
+                block.pad[block.base + cells_at + q] = number
 
 
 @ti.func
-def point_axes(q):
+def lowest_node(block: ti.template(), axis: ti.template(), at, along):
+    """Along an axis, the number of the lowest node of the cell that a tile's point lies in.
+
+    ``at`` is where what is known of the point begins, ``along`` its number.
+    """
+    number = along // 2
+    if ti.static(block.tile.nodes[axis] > block.tile.cells[axis] + 2):
+        number = ti.cast(block.pad[block.base + at + AXIS], ti.i32)
+    return number
+
+
+@ti.func
+def point_axes(block: ti.template(), q):
     """Where the weights of the tile's point q along the axes begin, and that of its cell's lowest node in a field."""
-    x, y, z = q // ti.static(DEEP * HIGH), (q // HIGH) % DEEP, q % HIGH
-    fx, fy, fz = AXIS * x, AXIS * (WIDE + y), AXIS * (WIDE + DEEP + z)
-    corner = ((x // 2) * TILE_Y + y // 2) * TILE_Z + z // 2
-    return near(PAD_AXES + fx), near(PAD_AXES + fy), near(PAD_AXES + fz), corner
+    deep, high = ti.static((block.tile.deep, block.tile.high))
+    x, y, z = q // ti.static(deep * high), (q // high) % deep, q % high
+    fx = near(ti.static(block.tile.axis_at(0)) + PAD_AXIS * x)
+    fy = near(ti.static(block.tile.axis_at(1)) + PAD_AXIS * y)
+    fz = near(ti.static(block.tile.axis_at(2)) + PAD_AXIS * z)
+    i, j, k = lowest_node(block, 0, fx, x), lowest_node(block, 1, fy, y), lowest_node(block, 2, fz, z)
+    return fx, fy, fz, (i * ti.static(block.tile.nodes[1]) + j) * ti.static(block.tile.nodes[2]) + k
 
 
 @ti.func
 def tile_gradient(block: ti.template(), number: ti.template(), q):
     """Gradient of a staged field by the reference place at the tile's point q."""
-    fx, fy, fz, first = point_axes(q)
-    corner = near(field_start(number) + first)
+    fx, fy, fz, first = point_axes(block, q)
+    corner = near(field_start(block, number) + first)
+    count, layer, row = ti.static((block.tile.count, block.tile.layer, block.tile.nodes[2]))
     w = ti.Vector([block.pad[block.base + fz + k] for k in ti.static(range(3))])
     s = ti.Vector([block.pad[block.base + fz + 3 + k] for k in ti.static(range(3))])
     zero = w[0] * 0
@@ -281,7 +312,7 @@ def tile_gradient(block: ti.template(), number: ti.template(), q):
         for j in ti.static(range(3)):
             wy, sy = block.pad[block.base + fy + j], block.pad[block.base + fy + 3 + j]
             for c in ti.static(range(3)):
-                place = block.base + corner + ti.static(c * TILE_NODES + (i * TILE_Y + j) * TILE_Z)
+                place = block.base + corner + ti.static(c * count + i * layer + j * row)
                 a0, a1, a2 = block.pad[place], block.pad[place + 1], block.pad[place + 2]
                 value = w[0] * a0 + w[1] * a1 + w[2] * a2
                 G[c, 0] += sx * wy * value
@@ -293,8 +324,9 @@ def tile_gradient(block: ti.template(), number: ti.template(), q):
 @ti.func
 def tile_value(block: ti.template(), number: ti.template(), q):
     """A staged field at the tile's point q."""
-    fx, fy, fz, first = point_axes(q)
-    corner = near(field_start(number) + first)
+    fx, fy, fz, first = point_axes(block, q)
+    corner = near(field_start(block, number) + first)
+    count, layer, row = ti.static((block.tile.count, block.tile.layer, block.tile.nodes[2]))
     zero = block.pad[block.base + fx] * 0
     u = ti.Vector([zero, zero, zero])
     for i in range(3):
@@ -304,7 +336,7 @@ def tile_value(block: ti.template(), number: ti.template(), q):
                     block.pad[block.base + fx + i] * block.pad[block.base + fy + j] * block.pad[block.base + fz + k]
                 )
                 for c in ti.static(range(3)):
-                    u[c] += weight * block.pad[block.base + corner + c * TILE_NODES + (i * TILE_Y + j) * TILE_Z + k]
+                    u[c] += weight * block.pad[block.base + corner + c * count + i * layer + j * row + k]
     return u
 
 
@@ -323,16 +355,17 @@ def hand_over_vector(block: ti.template(), q, v):
 
 
 @ti.func
-def neighbour_point(block: ti.template(), axis, most: ti.template(), node, k, odd):
-    """Of the k-th cell back from a node of a tile, point ``odd``: its number within the tile; weight and slope.
-
-    ``axis`` is where the tile's weights along an axis begin, ``most`` how many cells a tile has along it.
-    """
+def neighbour_point(block: ti.template(), axis: ti.template(), node, k, odd):
+    """Of the cell whose k-th node along an axis a tile's node is, point ``odd``: its number; weight and slope."""
+    cells, nodes = ti.static((block.tile.cells[axis], block.tile.nodes[axis]))
     cell = node - k
-    inside = cell >= 0 and cell < most
+    if ti.static(nodes > cells + 2):
+        found = ti.cast(block.pad[block.base + ti.static(block.tile.cells_at(axis)) + ti.max(cell, 0)], ti.i32)
+        cell = ti.select(cell >= 0, found, -1)
+    inside = cell >= 0 and cell < cells
     # Elsewhere, a point that is there is read for nothing, so that loads need not wait for branches.
     p = ti.select(inside, 2 * cell + odd, 0)
-    at = near(axis + AXIS * p)
+    at = near(ti.static(block.tile.axis_at(axis)) + PAD_AXIS * p)
     w, s = block.pad[block.base + at + k], block.pad[block.base + at + 3 + k]
     return p, ti.select(inside, w, w * 0), ti.select(inside, s, s * 0)
 
@@ -344,18 +377,20 @@ def sum_tile(block: ti.template(), with_vector, out, alone):
     Without vectors, each point hands over a number alone in their place, and these are summed, too, unless ``alone``
     is negative.
     """
-    axis_x, axis_y, axis_z = PAD_AXES, PAD_AXES + AXIS * WIDE, PAD_AXES + AXIS * (WIDE + DEEP)
+    deep, high, row, across = ti.static((block.tile.deep, block.tile.high, block.tile.nodes[2], block.tile.nodes[1]))
+    lines, sheets, count, layer = ti.static((block.tile.lines, block.tile.sheets, block.tile.count, block.tile.layer))
+    # Threads from the last on, as a tile seldom fills them, sum what is handed over alone.
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        if q < TILE_LINES:
-            node, column = q % TILE_Z, q // TILE_Z * HIGH
-            zero = block.pad[block.base + axis_x] * 0
+        if q < lines:
+            node, column = q % row, q // row * high
+            zero = block.fixed[STEP_SIZE] * 0
             along_x = ti.Vector([zero, zero, zero])
             along_y = ti.Vector([zero, zero, zero])
             along_z = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(block, axis_z, TILE_CELLS[2], node, k, odd)
+                    p, w, s = neighbour_point(block, 2, node, k, odd)
                     at = block.base + near(column + p)
                     for c in ti.static(range(3)):
                         along_x[c] += w * block.pad[at + (3 * c) * TILE]
@@ -366,11 +401,11 @@ def sum_tile(block: ti.template(), with_vector, out, alone):
                             for c in ti.static(range(3)):
                                 along_z[c] += w * block.pad[at + (9 + c) * TILE]
             for c in ti.static(range(3)):
-                block.pad[block.base + near(q) + ti.static(PAD_LINES + c * TILE_LINES)] = along_x[c]
-                block.pad[block.base + near(q) + ti.static(PAD_LINES + (3 + c) * TILE_LINES)] = along_y[c]
-                block.pad[block.base + near(q) + ti.static(PAD_LINES + (6 + c) * TILE_LINES)] = along_z[c]
-        elif with_vector == 0 and alone >= 0:
-            one = q - TILE_LINES
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + c * lines)] = along_x[c]
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + (3 + c) * lines)] = along_y[c]
+                block.pad[block.base + near(q) + ti.static(PAD_LINES + (6 + c) * lines)] = along_z[c]
+        if with_vector == 0 and alone >= 0 and q >= TILE - TILE // 4:
+            one = TILE - 1 - q
             total = block.pad[block.base + ALONE + 4 * one]
             for m in ti.static(range(1, 4)):
                 total += block.pad[block.base + ALONE + 4 * one + m]
@@ -378,23 +413,23 @@ def sum_tile(block: ti.template(), with_vector, out, alone):
     sync(block.gpu)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        if q < TILE_SHEETS:
-            iz, iy, px = q % TILE_Z, q // TILE_Z % TILE_Y, q // ti.static(TILE_Y * TILE_Z)
-            zero = block.pad[block.base + axis_x] * 0
+        if q < sheets:
+            iz, iy, px = q % row, q // row % across, q // layer
+            zero = block.fixed[STEP_SIZE] * 0
             slope = ti.Vector([zero, zero, zero])
             flat = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(block, axis_y, TILE_CELLS[1], iy, k, odd)
-                    at = block.base + near(PAD_LINES + (px * DEEP + p) * TILE_Z + iz)
+                    p, w, s = neighbour_point(block, 1, iy, k, odd)
+                    at = block.base + near(PAD_LINES + (px * deep + p) * row + iz)
                     for c in ti.static(range(3)):
-                        slope[c] += w * block.pad[at + c * TILE_LINES]
-                        flat[c] += s * block.pad[at + (3 + c) * TILE_LINES] + w * block.pad[at + (6 + c) * TILE_LINES]
+                        slope[c] += w * block.pad[at + c * lines]
+                        flat[c] += s * block.pad[at + (3 + c) * lines] + w * block.pad[at + (6 + c) * lines]
             for c in ti.static(range(3)):
-                block.pad[block.base + near(q) + c * TILE_SHEETS] = slope[c]
-                block.pad[block.base + near(q) + (3 + c) * TILE_SHEETS] = flat[c]
-        elif q < TILE_SHEETS + 8 and with_vector == 0 and alone >= 0:
-            one = q - TILE_SHEETS
+                block.pad[block.base + near(q) + c * sheets] = slope[c]
+                block.pad[block.base + near(q) + (3 + c) * sheets] = flat[c]
+        if with_vector == 0 and alone >= 0 and q >= TILE - 8:
+            one = TILE - 1 - q
             total = block.pad[block.base + ALONE + TILE + 8 * one]
             for m in ti.static(range(1, 8)):
                 total += block.pad[block.base + ALONE + TILE + 8 * one + m]
@@ -402,19 +437,19 @@ def sum_tile(block: ti.template(), with_vector, out, alone):
     sync(block.gpu)
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        if q < TILE_NODES:
-            rest, ix = q % ti.static(TILE_Y * TILE_Z), q // ti.static(TILE_Y * TILE_Z)
-            zero = block.pad[block.base + axis_x] * 0
+        if q < count:
+            rest, ix = q % layer, q // layer
+            zero = block.fixed[STEP_SIZE] * 0
             total = ti.Vector([zero, zero, zero])
             for k in ti.static(range(3)):
                 for odd in ti.static(range(2)):
-                    p, w, s = neighbour_point(block, axis_x, TILE_CELLS[0], ix, k, odd)
-                    at = block.base + near(p * ti.static(TILE_Y * TILE_Z) + rest)
+                    p, w, s = neighbour_point(block, 0, ix, k, odd)
+                    at = block.base + near(p * layer + rest)
                     for c in ti.static(range(3)):
-                        total[c] += s * block.pad[at + c * TILE_SHEETS] + w * block.pad[at + (3 + c) * TILE_SHEETS]
+                        total[c] += s * block.pad[at + c * sheets] + w * block.pad[at + (3 + c) * sheets]
             for c in ti.static(range(3)):
-                block.scratch[out + c * TILE_NODES + q] = total[c]
-        elif q == TILE_NODES and with_vector == 0 and alone >= 0:
+                block.scratch[out + c * count + q] = total[c]
+        if with_vector == 0 and alone >= 0 and q == TILE - 1:
             total = block.pad[block.base + ALONE + 2 * TILE]
             for m in ti.static(range(1, 8)):
                 total += block.pad[block.base + ALONE + 2 * TILE + m]
@@ -431,7 +466,7 @@ def sum_tiles(block: ti.template(), at, sources, i, nodes):
         source = block.ints[sources + n * nodes + i]
         place = at + ti.max(source, 0)
         for c in ti.static(range(3)):
-            share = block.scratch[place + c * TILE_NODES]
+            share = block.scratch[place + c * ti.static(block.tile.count)]
             total[c] += ti.select(source >= 0, share, zero)
     return total
 

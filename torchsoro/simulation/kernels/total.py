@@ -21,6 +21,7 @@ from torchsoro.simulation.kernels.layout import (
     COLLAPSED,
     ELEMENT,
     ELEMENTS,
+    FLUID,
     FORCE,
     GRAVITY,
     GROUPS,
@@ -37,7 +38,6 @@ from torchsoro.simulation.kernels.layout import (
     NODAL_MASS,
     NODE_SHARE,
     NODES,
-    PAD,
     PADS,
     PARTIALS,
     PLANES,
@@ -50,10 +50,10 @@ from torchsoro.simulation.kernels.layout import (
     PUSHES,
     QUADRATIC,
     RING,
+    SHAPES,
     SHARE,
     SHARED,
     SHEAR,
-    SLOT,
     SLOT_CHAMBER,
     SLOTS,
     SOFTENING,
@@ -217,9 +217,10 @@ def stress_point(block: ti.template(), q, t, b, p):
                     linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
                     factor = stiffening(F, least, linear, square)
                 if ti.static(block.features & SOFTENS):
-                    left, largest = softened(block, excess(F, least), at + 6 * elements * points, b)
-                    state[out + 6 * elements * points] = largest
-                    solid = shear * left
+                    if head[HISTORIES] > 6 * elements:
+                        left, largest = softened(block, excess(F, least), at + 6 * elements * points, b)
+                        state[out + 6 * elements * points] = largest
+                        solid = shear * left
                 if elements > 0:
                     S = factor * pull_back(F, least)
                     Z = load_symmetric(state, at, points)
@@ -258,30 +259,30 @@ def stress_point(block: ti.template(), q, t, b, p):
 def point_pass(block: ti.template(), item, fresh, t):
     """Of all simulations' tiles, do number ``item`` in substep t: what its points hand to its nodes."""
     gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
-    cell, seats, node, first, last, b, tile = tile_box(block, fresh, item)
+    cell, counts, node, first, last, b, tile = tile_box(block, fresh, item)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     if fresh == 1:
-        stage_axes(block, cell, seats)
+        stage_axes(block, cell, counts, node)
     stage(block, block.state, at, 0, node)
     if ti.static(block.features & LOADED):
         if head[VISCOUS] == 1:
             stage(block, block.state, at + 3 * product(nodes_per_axis(head)), 1, node)
     sync(gpu)
-    partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+    partials = head[PARTIALS] + b * head[SLOTS] * ti.static(block.tile.slot)
     for slot in range(first - 1, last):
         # The tile's own slot, then those of the chambers that it has points of.
-        out = partials + tile * SLOT
+        out = partials + tile * ti.static(block.tile.slot)
         alone = ti.cast(-1, ti.i32)
         if slot < first:
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                stress_point(block, q, t, b, point_of(head, cell, seats, q))
+                stress_point(block, q, t, b, point_of(block, cell, counts, q))
         else:
-            out = partials + (tile_count(head) + slot) * SLOT
+            out = partials + (tile_count(head) + slot) * ti.static(block.tile.slot)
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                p = point_of(head, cell, seats, q)
+                p = point_of(block, cell, counts, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
@@ -296,9 +297,10 @@ def slow(block: ti.template(), b, i, nodes, mass, v):
     """Velocity of node i after quadratic drag."""
     r = v
     if ti.static(block.features & IMMERSED):
-        for c in ti.static(range(3)):
-            area = block.fixed[block.head[QUADRATIC] + (3 * b + c) * nodes + i]
-            r[c] = laws.quadratic_drag(v[c], block.fixed[STEP_SIZE] / mass * area)
+        if block.head[FLUID] == 1:
+            for c in ti.static(range(3)):
+                area = block.fixed[block.head[QUADRATIC] + (3 * b + c) * nodes + i]
+                r[c] = laws.quadratic_drag(v[c], block.fixed[STEP_SIZE] / mass * area)
     return r
 
 
@@ -327,7 +329,7 @@ def node_pass(block: ti.template(), item, t):
             v = load_vector(state, at + 3 * nodes, nodes)
             # Divide wherever there is mass, with no floor: a void node weighs 1e-12 kg.
             if mass > 0:
-                partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+                partials = head[PARTIALS] + b * head[SLOTS] * ti.static(block.tile.slot)
                 f = sum_tiles(block, partials, head[SOURCES], i, nodes)
                 for k in range(chambers):
                     if ints[head[NEAR_NODES] + k * nodes + i] == 1:
@@ -358,6 +360,7 @@ def node_pass(block: ti.template(), item, t):
 @ti.kernel
 def total_substep(
     features: ti.template(),
+    shape: ti.template(),
     t: ti.i32,
     ints: Integers,
     fixed: Reals,
@@ -369,25 +372,25 @@ def total_substep(
     """Substep t on a CPU; the buffers are those of ``layout.BUFFERS``."""
     for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            base = ints[PADS] + w // CPU_UNIT * PAD
-            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+            base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+            block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch))
             point_pass(block, w // CPU_UNIT, 1, t)
     if ti.static(features & HOLLOW):
         for w in range(ints[BATCH] * ints[WALL_CHUNKS] * CPU_UNIT):
             if w % CPU_UNIT == 0:
-                base = ints[PADS] + w // CPU_UNIT * PAD
-                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+                base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+                block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch))
                 wall_pass(block, w // CPU_UNIT, t)
     if ti.static(features & TIED):
         for w in range(ints[BATCH] * ints[TIES] * CPU_UNIT):
             if w % CPU_UNIT == 0:
-                base = ints[PADS] + w // CPU_UNIT * PAD
-                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+                base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+                block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch))
                 tie_pass(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            base = ints[PADS] + w // CPU_UNIT * PAD
-            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch))
+            base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+            block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch))
             node_pass(block, w // CPU_UNIT, t)
 
 
@@ -396,6 +399,7 @@ def total_march(
     real: ti.template(),
     most: ti.template(),
     features: ti.template(),
+    shape: ti.template(),
     first: ti.i32,
     last: ti.i32,
     before: ti.i32,
@@ -415,14 +419,14 @@ def total_march(
     for w in range(most * TILE):
         q, number = w % TILE, w // TILE
         head = ti.simt.block.SharedArray((KEPT,), ti.i32)
-        pad = ti.simt.block.SharedArray((PAD,), real)
+        pad = ti.simt.block.SharedArray((SHAPES[shape].pad,), real)
         if q < HEAD:
             head[q] = ints[q]
         head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
         arrivals = before
-        block = ti.static(on_gpu(features, head, pad, q, ints, fixed, supply, state, kept, scratch))
+        block = ti.static(on_gpu(features, shape, head, pad, q, ints, fixed, supply, state, kept, scratch))
         if number < blocks:
             for t in range(first, last):
                 item = number

@@ -36,7 +36,6 @@ from torchsoro.simulation.kernels.layout import (
     NODE_SHARE,
     NODES,
     NODES_BAR,
-    PAD,
     PADS,
     PARTIALS,
     PLANES,
@@ -46,9 +45,9 @@ from torchsoro.simulation.kernels.layout import (
     PUSHES,
     QUADRATIC,
     QUADRATIC_BAR,
+    SHAPES,
     SHARE,
     SHARED,
-    SLOT,
     SLOT_CHAMBER,
     SLOTS,
     SOURCES,
@@ -111,7 +110,7 @@ def node_adjoint(block: ti.template(), t, b, i):
     d_bar = load_vector(bar, here, nodes)
     v_bar = load_vector(bar, here + 3 * nodes, nodes)
     if t + 1 < head[STEPS]:
-        partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+        partials = head[PARTIALS] + b * head[SLOTS] * ti.static(block.tile.slot)
         d_bar += sum_tiles(block, partials, head[SOURCES], i, nodes)
         for k in range(chambers):
             if ints[head[NEAR_NODES] + k * nodes + i] == 1:
@@ -127,7 +126,7 @@ def node_adjoint(block: ti.template(), t, b, i):
             d_bar += surface_spread(ints, fixed, state, after, block.back, (t + 1) % 2, b, i)
         if ti.static(block.features & LOADED):
             if head[VISCOUS] == 1:
-                rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * SLOT
+                rates_at = partials + (tile_count(head) + chamber_slots(head, ints)) * ti.static(block.tile.slot)
                 v_bar += sum_tiles(block, rates_at, head[SOURCES], i, nodes)
         store_vector(bar, here, nodes, d_bar)
     # Nodes that are held have no mass here, but the forces on others depend on where they are.
@@ -215,12 +214,12 @@ def tally(block: ti.template(), t, b, row):
 def point_pass_adjoint(block: ti.template(), item, fresh, t):
     """Adjoint of ``total.point_pass``."""
     gpu, head, ints = ti.static((block.gpu, block.head, block.ints))
-    cell, seats, node, first, last, b, tile = tile_box(block, fresh, item)
+    cell, counts, node, first, last, b, tile = tile_box(block, fresh, item)
     nodes = product(nodes_per_axis(head))
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
     if fresh == 1:
-        stage_axes(block, cell, seats)
+        stage_axes(block, cell, counts, node)
     stage(block, block.state, at, 0, node)
     stage(block, block.back, head[FORCES] + b * 3 * nodes, 1, node)
     if ti.static(block.features & LOADED):
@@ -228,21 +227,21 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
         if viscous == 1:
             stage(block, block.state, at + 3 * nodes, 2, node)
     sync(gpu)
-    partials = head[PARTIALS] + b * head[SLOTS] * SLOT
+    partials = head[PARTIALS] + b * head[SLOTS] * ti.static(block.tile.slot)
     for slot in range(first - 1, last + viscous):
         # The tile's own slot, then those of the chambers that it has points of, then that of the rates of F.
-        out = partials + tile * SLOT
+        out = partials + tile * ti.static(block.tile.slot)
         alone = ti.cast(-1, ti.i32)
         if slot < first:
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                stress_point_adjoint(block, q, t, b, point_of(head, cell, seats, q))
+                stress_point_adjoint(block, q, t, b, point_of(block, cell, counts, q))
         elif slot < last:
-            out = partials + (tile_count(head) + slot) * SLOT
+            out = partials + (tile_count(head) + slot) * ti.static(block.tile.slot)
             alone = head[SWEPT] + b * chamber_slots(head, ints) + ints[head[SLOT_CHAMBER] + 2 * slot + 1]
             for each in range(block.q0, block.q1):
                 q = thread(block, each)
-                p = point_of(head, cell, seats, q)
+                p = point_of(block, cell, counts, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
                     mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
@@ -250,13 +249,13 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
                 P_bar = tile_gradient(block, 1, ti.select(mine == 1, q, 0))
                 block.pad[block.base + ALONE + q] = volume * contract(P_bar, cof)
         else:
-            out = partials + (tile_count(head) + chamber_slots(head, ints) + tile) * SLOT
+            out = partials + (tile_count(head) + chamber_slots(head, ints) + tile) * ti.static(block.tile.slot)
             if ti.static(block.features & LOADED):
                 stage(block, block.state, at + 3 * nodes, 2, node)  # lines have been there
                 sync(gpu)
                 for each in range(block.q0, block.q1):
                     q = thread(block, each)
-                    rate_point_adjoint(block, q, b, point_of(head, cell, seats, q))
+                    rate_point_adjoint(block, q, b, point_of(block, cell, counts, q))
         sync(gpu)
         sum_tile(block, ti.cast(slot < first, ti.i32), out, alone)
 
@@ -281,6 +280,7 @@ def node_pass_adjoint(block: ti.template(), item, t):
 @ti.kernel
 def total_substep_adjoint(
     features: ti.template(),
+    shape: ti.template(),
     t: ti.i32,
     ints: Integers,
     fixed: Reals,
@@ -295,30 +295,34 @@ def total_substep_adjoint(
     """Back by substep t on a CPU; substep -1 only finishes the sums of the first."""
     for w in range(ints[BATCH] * node_chunks(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            base = ints[PADS] + w // CPU_UNIT * PAD
-            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+            block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
             node_pass_adjoint(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * tile_count(ints) * CPU_UNIT):
         if w % CPU_UNIT == 0:
-            base = ints[PADS] + w // CPU_UNIT * PAD
-            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+            block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
             point_pass_adjoint(block, w // CPU_UNIT, 1, t)
     if ti.static(features & HOLLOW):
         for w in range(ints[BATCH] * ints[WALL_CHUNKS] * CPU_UNIT):
             if w % CPU_UNIT == 0 and t >= 0:
-                base = ints[PADS] + w // CPU_UNIT * PAD
-                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+                base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+                block = ti.static(
+                    on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch, bar, back, sums)
+                )
                 wall_pass_adjoint(block, w // CPU_UNIT, t)
     if ti.static(features & TIED):
         for w in range(ints[BATCH] * ints[TIES] * CPU_UNIT):
             if w % CPU_UNIT == 0 and t >= 0:
-                base = ints[PADS] + w // CPU_UNIT * PAD
-                block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+                base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+                block = ti.static(
+                    on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch, bar, back, sums)
+                )
                 tie_pass_adjoint(block, w // CPU_UNIT, t)
     for w in range(ints[BATCH] * ints[TALLIES]):
         if t >= 0:
-            base = ints[PADS] + w // CPU_UNIT * PAD
-            block = ti.static(on_cpu(features, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+            base = ints[PADS] + w // CPU_UNIT * ti.static(SHAPES[shape].pad)
+            block = ti.static(on_cpu(features, shape, base, ints, fixed, supply, state, kept, scratch, bar, back, sums))
             tally(block, t, w // ints[TALLIES], w % ints[TALLIES])
 
 
@@ -327,6 +331,7 @@ def total_march_adjoint(
     real: ti.template(),
     most: ti.template(),
     features: ti.template(),
+    shape: ti.template(),
     first: ti.i32,
     last: ti.i32,
     before: ti.i32,
@@ -345,14 +350,16 @@ def total_march_adjoint(
     for w in range(most * TILE):
         q, number = w % TILE, w // TILE
         head = ti.simt.block.SharedArray((KEPT,), ti.i32)
-        pad = ti.simt.block.SharedArray((PAD,), real)
+        pad = ti.simt.block.SharedArray((SHAPES[shape].pad,), real)
         if q < HEAD:
             head[q] = ints[q]
         head[HEAD] = 0
         sync(True)
         blocks = head[BLOCKS]
         arrivals = before
-        block = ti.static(on_gpu(features, head, pad, q, ints, fixed, supply, state, kept, scratch, bar, back, sums))
+        block = ti.static(
+            on_gpu(features, shape, head, pad, q, ints, fixed, supply, state, kept, scratch, bar, back, sums)
+        )
         if number < blocks:
             for passed in range(last - first):
                 t = last - 1 - passed

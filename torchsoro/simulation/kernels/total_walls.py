@@ -17,7 +17,6 @@ from torchsoro.simulation.kernels.layout import (
     CHAMBERS,
     FORCES,
     NORMALS,
-    PAD,
     PRESSURE,
     RING,
     SWEPT,
@@ -209,7 +208,7 @@ def wall_pressed(block: ti.template(), t, b, w):
 @ti.func
 def walls_at_hand(block: ti.template()):
     """Whether what wall points hand over has room in the pad, behind the volumes of the chambers."""
-    room = ti.static(PAD - AT_HAND)
+    room = ti.static(block.tile.pad - AT_HAND)
     return block.head[WALL_CHUNKS] * TILE * 3 <= room and block.head[CHAMBERS] <= ti.static(AT_HAND - TOTALS)
 
 

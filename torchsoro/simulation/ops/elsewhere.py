@@ -7,6 +7,7 @@ from dataclasses import fields, replace
 import torch
 from torch import Tensor
 
+from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, ObserveMany, Scene
@@ -28,6 +29,8 @@ class ElsewhereIntegrator(TotalSegmentIntegrator):
         there = Inputs(**{f.name: getattr(inputs, f.name).to(scene.device) for f in fields(inputs)})
         super().__init__(moved(scene, scene.device), there, first=first, samples=samples)
         self.device = scene.device
+        # Variations have other loads and laws each time, and a kernel that is compiled for others takes seconds.
+        self.features |= layout.ANY_LOAD
 
     def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
         """Advance the state [B, L] over the segment; what is observed and returned is where ``start`` is."""

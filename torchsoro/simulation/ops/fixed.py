@@ -14,7 +14,7 @@ from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Scene
-from torchsoro.simulation.ops.tiles import tables, wall_numbers
+from torchsoro.simulation.ops.tiles import tables, tiles_of, wall_numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,7 +58,7 @@ def fixed(scene: Scene, inputs: Inputs) -> Fixed:
             quadratic = lattice.faces.front.T.to(c) * fluid.view(-1, 1, 1) / 2
         none = c.new_zeros(0)
         return Fixed(
-            tables=once(scene, "tables", [], lambda: Arena("integers", *_integers(scene, chambers))),
+            tables=once(scene, "tables", [], lambda: Arena("integers", *_integers(scene, chambers, c))),
             nodal=nodal,
             chamber=chamber,
             arena=Arena(
@@ -85,8 +85,8 @@ def _areas(scene: Scene, planes: Tensor) -> Tensor:
     return found
 
 
-def _integers(scene: Scene, chambers: int) -> list[Tensor]:
+def _integers(scene: Scene, chambers: int, like: Tensor) -> list[Tensor]:
     """In the order of ``layout.BUFFERS``."""
     assert scene.lattice is not None
-    found = tables(scene.lattice, scene.kind, chambers)
+    found = tables(scene.lattice, tiles_of(scene.lattice, like), scene.kind, chambers)
     return [scene.kind, scene.plane_kind, *(torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in found)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -11,38 +12,71 @@ from torch import Tensor
 
 from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.kernels.tile import KEPT
 from torchsoro.simulation.ops.lattice import Lattice
 
+LIMIT = 48 * 1024  # bytes that a block of threads may share on any GPU
 
-@lru_cache(maxsize=256)
-def tiles_along(axis: Axis, most: int) -> np.ndarray:
-    """The tiles along an axis, of ``most`` seats at most: first cell, which seats have a cell, first node [T, 3].
 
-    The seats follow each other as the lowest nodes of cells do without creases: a cell beyond a crease has its lowest
-    node two further on, and leaves a seat free. Bit k of the second number is seat k. So no node belongs to more than
-    two tiles.
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Tiles:
+    """How the cells of a lattice are dealt out.
+
+    Attributes:
+        shape: Number of a tile's shape, among ``layout.SHAPES``.
+        along: The tiles along x, y and z, see :func:`tiles_along`.
+    """
+
+    shape: int
+    along: tuple[np.ndarray, ...]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Tiles along x, y, z."""
+        return tuple(map(len, self.along))
+
+    @property
+    def count(self) -> int:
+        """Number of tiles."""
+        return math.prod(self.counts)
+
+    @property
+    def of(self) -> layout.Shape:
+        """A tile's shape."""
+        return layout.SHAPES[self.shape]
+
+
+def tiles_along(axis: Axis, cells: int, nodes: int) -> np.ndarray:
+    """Along an axis, tiles of at most so many cells and nodes: first cell, number of cells, first node [T, 3].
+
+    A cell beyond a crease has its lowest node two further on than the cell before it. A tile with just two nodes beyond
+    its cells ends there, as its kernels count on it. No node belongs to more than two tiles.
     """
     rows, cell = [], 0
     while cell < axis.cells:
-        seats = axis.first[cell:] - axis.first[cell]
-        seats = seats[seats < most]
-        rows.append((cell, (1 << seats).sum(), axis.first[cell]))
-        cell += len(seats)
+        first = axis.first[cell : cell + cells] - axis.first[cell]
+        room = np.arange(len(first)) if nodes == cells + 2 else nodes - 3
+        rows.append((cell, (first <= room).sum(), axis.first[cell]))
+        cell += rows[-1][1]
     return np.array(rows)
 
 
-def tile_counts(lattice: Lattice) -> tuple[int, int, int]:
-    """Tiles along x, y, z."""
-    x, y, z = (len(tiles_along(a, n)) for a, n in zip(lattice.axes, layout.TILE_CELLS, strict=True))
-    return x, y, z
+def tiles_of(lattice: Lattice, like: Tensor) -> Tiles:
+    """The tiles of a lattice, as few as can be; a block of a GPU has room for numbers like these."""
+    return _tiles_of(tuple(lattice.axes), like.element_size() if like.is_cuda else 0)
 
 
-def tile_count(lattice: Lattice) -> int:
-    """Number of tiles."""
-    return math.prod(tile_counts(lattice))
+@lru_cache(maxsize=256)
+def _tiles_of(axes: tuple[Axis, ...], itemsize: int) -> Tiles:
+    found = [
+        Tiles(shape=k, along=tuple(map(tiles_along, axes, s.cells, s.nodes)))
+        for k, s in enumerate(layout.SHAPES)
+        if 4 * KEPT + itemsize * s.pad <= LIMIT
+    ]
+    return min(found, key=lambda tiles: tiles.count)
 
 
-def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
+def tables(lattice: Lattice, tiles: Tiles, kind: Tensor, chambers: int) -> list[np.ndarray]:
     """Index tables of a lattice whose points are of these kinds [points].
 
     Returns:
@@ -52,38 +86,37 @@ def tables(lattice: Lattice, kind: Tensor, chambers: int) -> list[np.ndarray]:
         -1 for none; whether a node has any of a chamber's; then those of :func:`wall_tables`. A chamber's pairs are
         followed by the chunks of its wall points.
     """
-    along = [tiles_along(a, n) for a, n in zip(lattice.axes, layout.TILE_CELLS, strict=True)]
-    counts = tile_counts(lattice)
+    counts, shape = tiles.counts, tiles.of
     kinds = kind.cpu().numpy().reshape(lattice.points)
-    points = np.meshgrid(*map(_tile_of_points, along), indexing="ij")
+    points = np.meshgrid(*map(_tile_of_points, tiles.along), indexing="ij")
     tile_of = np.ravel_multi_index(points, counts)
-    has = np.zeros((tile_count(lattice), chambers), bool)
+    has = np.zeros((tiles.count, chambers), bool)
     has[tile_of[kinds >= 0], kinds[kinds >= 0]] = True
     pairs = np.argwhere(has)  # tile and chamber, tile by tile
     order = np.argsort(pairs[:, 1], kind="stable")
     place = np.empty(len(pairs), int)
     place[order] = np.arange(len(pairs))
     slot = np.full(has.shape, -1)
-    slot[has] = tile_count(lattice) + np.arange(len(pairs))
+    slot[has] = tiles.count + np.arange(len(pairs))
     # The two tiles of a node along each axis, and its number there.
-    tiles, local = zip(*map(_tiles_of_nodes, lattice.axes, along), strict=True)
+    both, local = zip(*map(_tiles_of_nodes, lattice.axes, tiles.along), strict=True)
     rows = []
     for parts in itertools.product(range(2), repeat=3):
-        x, y, z = np.meshgrid(*(t[:, i] for t, i in zip(tiles, parts, strict=True)), indexing="ij")
+        x, y, z = np.meshgrid(*(t[:, i] for t, i in zip(both, parts, strict=True)), indexing="ij")
         there = (x >= 0) & (y >= 0) & (z >= 0)
         tile = np.where(there, (x * counts[1] + y) * counts[2] + z, 0)
         i, j, k = np.meshgrid(*(n[:, i] for n, i in zip(local, parts, strict=True)), indexing="ij")
-        node = (i * layout.TILE_Y + j) * layout.TILE_Z + k
+        node = (i * shape.nodes[1] + j) * shape.nodes[2] + k
         slots = np.concatenate([tile[..., None], slot[tile]], -1)
-        rows.append(np.where(there[..., None] & (slots >= 0), slots * layout.SLOT + node[..., None], -1))
+        rows.append(np.where(there[..., None] & (slots >= 0), slots * shape.slot + node[..., None], -1))
     sources = np.stack(rows).reshape(layout.SHARED, lattice.nodes, 1 + chambers).transpose(2, 0, 1)
     gas = int(kinds.max()) + 1 if (kinds >= 0).any() else 0
     walls, chunk_chamber = wall_tables(lattice, gas, len(pairs))
     return [
         np.concatenate([a.first for a in lattice.axes]),
-        np.concatenate(along),
+        np.concatenate(tiles.along),
         _starts(np.concatenate([pairs[:, 1], chunk_chamber]), chambers),
-        _starts(pairs[:, 0], tile_count(lattice)),
+        _starts(pairs[:, 0], tiles.count),
         np.stack([pairs[:, 1], place], 1),
         sources,
         np.asarray((sources[1:] >= 0).any(1)),
@@ -157,14 +190,14 @@ def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:
 
 def _tile_of_points(along: np.ndarray) -> np.ndarray:
     """Tile of each point along an axis [2 cells]."""
-    return np.repeat(np.arange(len(along)), 2 * np.bitwise_count(along[:, 1]))
+    return np.repeat(np.arange(len(along)), 2 * along[:, 1])
 
 
 def _tiles_of_nodes(axis: Axis, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tiles that a node along an axis belongs to, and its number among their nodes; each [nodes, 2], -1 for none."""
     tiles, local = np.full((2, axis.nodes, 2), -1)
-    for number, (_, seats, first) in enumerate(along):
-        nodes = np.arange(first, first + int(seats).bit_length() + 2)
+    for number, (cell, count, first) in enumerate(along):
+        nodes = np.arange(first, axis.first[cell + count - 1] + 3)
         free = (tiles[nodes, 0] >= 0).astype(int)
         tiles[nodes, free], local[nodes, free] = number, np.arange(len(nodes))
     return tiles, local

@@ -17,7 +17,7 @@ from torchsoro.simulation.ops.fixed import fixed
 from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
-from torchsoro.simulation.ops.tiles import tile_count, tile_counts
+from torchsoro.simulation.ops.tiles import tiles_of
 from torchsoro.simulation.runtime import init
 
 CHUNK = 1024  # substeps between two checks for divergence
@@ -31,10 +31,10 @@ _SUMS = ("coefficients", "prony", "pressure", "gravity", "force", "planes")  # t
 
 
 @lru_cache
-def most_blocks(device: torch.device, dtype: torch.dtype) -> int:
+def most_blocks(device: torch.device, shape: int, dtype: torch.dtype) -> int:
     """Blocks that a GPU runs at the same time. With more, those that run would wait for others for ever."""
     gpu = torch.cuda.get_device_properties(device)
-    shared = 1024 + layout.PAD * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
+    shared = 1024 + layout.SHAPES[shape].pad * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
     return min(BLOCKS, gpu.shared_memory_per_multiprocessor // shared) * gpu.multi_processor_count
 
 
@@ -86,16 +86,17 @@ class TotalSegmentIntegrator:
         self.checked = False
         self.near = None if scene.markers is None or not scene.only_markers else scene.markers.near.to(like.device)
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, self._forces())
-        tiles, chunks = tile_count(self.lattice), -(-self.nodes // layout.TILE)
+        self.tiles = tiles_of(self.lattice, like)
+        tiles, chunks = self.tiles.count, -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
         self.wall_chunks = len(self.tables.views[layout.WALL_CHUNK - layout.KIND])
         in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND]) + self.wall_chunks
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
         items = self.batch * max(tiles + self.wall_chunks + self.ties, chunks)
-        self.blocks = min(most_blocks(like.device, like.dtype), items) if self.gpu else 0
+        self.blocks = min(most_blocks(like.device, self.tiles.shape, like.dtype), items) if self.gpu else 0
         pads = 0 if self.gpu else items
-        shapes = (self.batch, self.slots, layout.SLOT), (self.batch, in_chambers), (pads, layout.PAD)
+        shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, self.wall_chunks * layout.TILE, layout.WALL_VECTORS
         self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors)
         self.kept = Arena.zeros("kept", like, (0,), (0,))
@@ -236,9 +237,8 @@ class TotalSegmentIntegrator:
         """A function that takes the substeps from its first number to before its second, or these back."""
         if self.gpu:
             real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
-            launch = capture(
-                on_gpu, real, most_blocks(buffers[0].device, buffers[1].dtype), self.features, 0, 0, 0, *buffers
-            )
+            most = most_blocks(buffers[0].device, self.tiles.shape, buffers[1].dtype)
+            launch = capture(on_gpu, real, most, self.features, self.tiles.shape, 0, 0, 0, *buffers)
             arrivals = 0
 
             def go(first: int, last: int) -> None:
@@ -250,7 +250,7 @@ class TotalSegmentIntegrator:
                     arrivals += 2 * self.blocks * (stop - start)
 
             return go
-        step = capture(on_cpu, self.features, 0, *buffers)
+        step = capture(on_cpu, self.features, self.tiles.shape, 0, *buffers)
 
         def march(first: int, last: int) -> None:
             for t in reversed(range(first, last)) if backward else range(first, last):
@@ -261,14 +261,14 @@ class TotalSegmentIntegrator:
     def _ints(self, arenas: list[Arena], **more: int) -> Tensor:
         """The buffer of integers: clock, sizes, offset of each quantity in its buffer, then the index tables."""
         names = ("nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz")
-        values = (*self.lattice.points, *self.lattice.shape, *tile_counts(self.lattice))
+        values = (*self.lattice.points, *self.lattice.shape, *self.tiles.counts)
         sizes = {
             **dict(zip(names, values, strict=True)),
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
             **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "histories": self.history},
             **{"faced": int(self.lattice.faces is not None), "ties": self.ties, "wall_chunks": self.wall_chunks},
-            "pushes": self.scene.forces - self.groups,
+            **{"pushes": self.scene.forces - self.groups, "fluid": int(self.scene.immersed)},
             **{name: int(value) for name, value in more.items()},
         }
         head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
