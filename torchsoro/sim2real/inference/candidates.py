@@ -222,8 +222,10 @@ def weigh(problem: FitProblem, fits: Sequence[Fit]) -> list[tuple[Fit, Posterior
     """
     data = data_of(problem)
     models = [(fit, model) for fit, model in zip(fits, near(problem, fits), strict=True) if model is not None]
-    with ThreadPoolExecutor(problem.threads) as pool:
-        return list(zip((f for f, _ in models), pool.map(lambda m: infer(data, m[1]), models), strict=True))
+    # Two pools, as a thread that waits for others of its own pool may wait for ever.
+    with ThreadPoolExecutor(problem.threads) as pool, ThreadPoolExecutor(problem.threads) as inner:
+        found = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), models)
+        return list(zip((f for f, _ in models), found, strict=True))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -35,6 +35,8 @@ APART = 0.15  # of ln s, ln tau and ln c, for second differences
 LEAST_PRICE = 0.1  # of the price of the twin's error, that it has; the noise is above what is less
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
 SETTLED = 5  # rounds in which the size of what is left and its weight agree to a percent
+
+Map = Callable[..., Iterable]  # of a function and its arguments, as the builtin
 
 
 @dataclass(frozen=True)
@@ -253,34 +255,36 @@ def products(data: Data, numerics: TwinError, discrepancy: Discrepancy, columns:
     return found
 
 
-def infer(data: Data, near: Linearised) -> Posterior:
+def infer(data: Data, near: Linearised, *, side_by_side: Map = map) -> Posterior:
     """Posterior of a model near a point.
 
     Args:
         data: Recordings.
         near: The model linearised at a point, which should be close to its mode.
+        side_by_side: ``map``, or one that calls in several threads.
     """
-
-    def settled(start: np.ndarray, low: np.ndarray, high: np.ndarray) -> Branch:
-        """The mode, and the ln s, ln tau and ln c that its residual tells, within bounds."""
-        x = start
-        for k in range(ALTERNATIONS):
-            left = near.left(mode_of(data, near, _discrepancy(x)).at)
-            before, x = x, _restricted(data, near, left, x, low, high, AGAIN if k else FIRST)
-            if np.abs(x - before).max() < NARROW:
-                break
-        mode = mode_of(data, near, _discrepancy(x))
-        ln_occam = _ln_occam(data, near, near.left(mode.at), x, low, high)
-        return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
-
     low, high = ranges(data, near.numerics)
     line = least_that_matters(data, near.numerics)
     above, below = np.array([line, *low[1:]]), np.array([line, *high[1:]])
     middle = 0.5 * (above + high)
     # From little and from much: with much, the first mode is not bent by a wrong model.
-    some = [settled(np.array([ln_s, middle[1], high[2]]), above, high) for ln_s in (middle[0], high[0])]
-    none = settled(np.array([low[0], middle[1], high[2]]), low, below)
-    return Posterior(near=near, some=max(some, key=lambda branch: branch.ln_evidence), none=none)
+    some = [(np.array([ln_s, middle[1], high[2]]), above, high) for ln_s in (middle[0], high[0])]
+    none = np.array([low[0], middle[1], high[2]]), low, below
+    *with_some, without = side_by_side(lambda case: _settled(data, near, *case), [*some, none])
+    return Posterior(near=near, some=max(with_some, key=lambda branch: branch.ln_evidence), none=without)
+
+
+def _settled(data: Data, near: Linearised, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> Branch:
+    """The mode, and the ln s, ln tau and ln c that its residual tells, within bounds."""
+    x = start
+    for k in range(ALTERNATIONS):
+        left = near.left(mode_of(data, near, _discrepancy(x)).at)
+        before, x = x, _restricted(data, near, left, x, low, high, AGAIN if k else FIRST)
+        if np.abs(x - before).max() < NARROW:
+            break
+    mode = mode_of(data, near, _discrepancy(x))
+    ln_occam = _ln_occam(data, near, near.left(mode.at), x, low, high)
+    return Branch(discrepancy=_discrepancy(x), mode=mode, ln_occam=ln_occam)
 
 
 def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:

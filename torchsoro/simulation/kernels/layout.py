@@ -78,31 +78,32 @@ COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
-    *("faced", "ties", "pushes", "wall_chunks", "fluid"),
+    *("faced", "ties", "pushes", "wall_chunks", "fluid", "watched", "sample_at"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
 VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
-FACED, TIES, PUSHES, WALL_CHUNKS, FLUID = range(26, 31)
+FACED, TIES, PUSHES, WALL_CHUNKS, FLUID, WATCHED, SAMPLE_AT = range(26, 33)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
-# soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers.
-LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW = (2**n for n in range(7))
+# soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
+# recorded at samples.
+LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED = (2**n for n in range(8))
 ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
-# kept of every substep beside the states; what points and nodes hand each other, forward and (from FORCES) backward;
-# sums of gradients.
+# kept of every substep beside the states, and the motion of nodes at samples; what points and nodes hand each other,
+# forward and (from FORCES) backward; sums of gradients.
 BUFFERS = {
     "integers": (
         *("kind", "plane_kind", "firsts", "tiles", "chamber_start", "slot_start", "slot_chamber", "sources"),
-        *("near_nodes", "wall_chunk", "wall_kind", "wall_start", "wall_entry"),
+        *("near_nodes", "wall_chunk", "wall_kind", "wall_start", "wall_entry", "near_number"),
     ),
     "fixed": (
         *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
         *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights"),
     ),
     "supply": ("pressure", "gravity", "force"),
-    "kept": ("volumes", "pushed"),
+    "kept": ("volumes", "pushed", "seen"),
     "scratch": ("partials", "swept", "pads", "tension", "normals"),
     "backward": ("forces", "surfaces", "volume_bar", "jacobians"),
     "sums": tuple(
@@ -113,17 +114,17 @@ BUFFERS = {
         )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(31, 40)
-WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY = range(40, 44)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(44, 53)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(53, 59)
-PRESSURE, GRAVITY, FORCE = range(59, 62)
-VOLUMES, PUSHED = range(62, 64)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(64, 69)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(69, 73)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(73, 81)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(81, 84)
-HEAD = 84
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(33, 42)
+WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY, NEAR_NUMBER = range(42, 47)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(47, 56)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(56, 62)
+PRESSURE, GRAVITY, FORCE = range(62, 65)
+VOLUMES, PUSHED, SEEN = range(65, 68)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(68, 73)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(73, 77)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(77, 85)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(85, 88)
+HEAD = 88
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors.

@@ -33,6 +33,7 @@ from torchsoro.simulation.kernels.layout import (
     KIND,
     LOADED,
     NEAR_NODES,
+    NEAR_NUMBER,
     NODAL,
     NODAL_DRAG_FACTOR,
     NODAL_MASS,
@@ -49,7 +50,10 @@ from torchsoro.simulation.kernels.layout import (
     PUSHED_NODES,
     PUSHES,
     QUADRATIC,
+    RECORDED,
     RING,
+    SAMPLE_AT,
+    SEEN,
     SHAPES,
     SHARE,
     SHARED,
@@ -75,6 +79,7 @@ from torchsoro.simulation.kernels.layout import (
     VOLUME_VISCOSITY,
     VOLUMES,
     WALL_CHUNKS,
+    WATCHED,
 )
 from torchsoro.simulation.kernels.stress import (
     excess,
@@ -305,6 +310,18 @@ def slow(block: ti.template(), b, i, nodes, mass, v):
 
 
 @ti.func
+def record(block: ti.template(), t, b, i, d, v):
+    """Write down the motion of node i after substep t, if it is near a marker and that is a sample."""
+    (head,) = ti.static((block.head,))
+    watched = head[WATCHED]
+    sample, number = block.ints[head[SAMPLE_AT] + t], block.ints[head[NEAR_NUMBER] + i]
+    if sample >= 0 and number >= 0:
+        at = head[SEEN] + (sample * head[BATCH] + b) * 6 * watched + number
+        store_vector(block.kept, at, watched, d)
+        store_vector(block.kept, at + 3 * watched, watched, v)
+
+
+@ti.func
 def node_pass(block: ti.template(), item, t):
     """Move the 256 nodes of number ``item`` by substep t."""
     head, ints, fixed, state, kept = ti.static((block.head, block.ints, block.fixed, block.state, block.kept))
@@ -354,6 +371,8 @@ def node_pass(block: ti.template(), item, t):
                 d += dt * (onto + v)
             store_vector(state, out, nodes, d)
             store_vector(state, out + 3 * nodes, nodes, v)
+            if ti.static(block.features & RECORDED):
+                record(block, t, b, i, d, v)
     sync(block.gpu)
 
 

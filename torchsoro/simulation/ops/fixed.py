@@ -89,4 +89,8 @@ def _integers(scene: Scene, chambers: int, like: Tensor) -> list[Tensor]:
     """In the order of ``layout.BUFFERS``."""
     assert scene.lattice is not None
     found = tables(scene.lattice, tiles_of(scene.lattice, like), scene.kind, chambers)
-    return [scene.kind, scene.plane_kind, *(torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in found)]
+    near = np.full(0 if scene.markers is None else scene.lattice.nodes, -1)
+    if scene.markers is not None:
+        near[scene.markers.near.cpu()] = np.arange(len(scene.markers.near))
+    more = (torch.from_numpy(t.astype(np.int32)).to(scene.kind.device) for t in (*found, near))
+    return [scene.kind, scene.plane_kind, *more]

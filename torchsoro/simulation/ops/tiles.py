@@ -196,8 +196,8 @@ def _tile_of_points(along: np.ndarray) -> np.ndarray:
 def _tiles_of_nodes(axis: Axis, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Tiles that a node along an axis belongs to, and its number among their nodes; each [nodes, 2], -1 for none."""
     tiles, local = np.full((2, axis.nodes, 2), -1)
-    for number, (cell, count, first) in enumerate(along):
-        nodes = np.arange(first, axis.first[cell + count - 1] + 3)
+    for number, (cell, count, first) in enumerate(along.tolist()):
+        nodes = np.arange(first, int(axis.first[cell + count - 1]) + 3)
         free = (tiles[nodes, 0] >= 0).astype(int)
         tiles[nodes, free], local[nodes, free] = number, np.arange(len(nodes))
     return tiles, local

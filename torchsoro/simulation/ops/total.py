@@ -49,6 +49,7 @@ def _features(scene: Scene) -> int:
         layout.TIED: scene.tie_share is not None,
         layout.PUSHED_NODES: scene.node_share is not None,
         layout.HOLLOW: scene.lattice.walls is not None,
+        layout.RECORDED: scene.only_markers and scene.markers is not None,
     }
     return sum(feature for feature, on in there.items() if on)
 
@@ -85,6 +86,7 @@ class TotalSegmentIntegrator:
         self.nodal, self.chamber, self.tables, self.fixed = common.nodal, common.chamber, common.tables, common.arena
         self.checked = False
         self.near = None if scene.markers is None or not scene.only_markers else scene.markers.near.to(like.device)
+        self.watched = 0 if self.near is None else len(self.near)
         self.supply = Arena("supply", inputs.pressure, inputs.gravity, self._forces())
         self.tiles = tiles_of(self.lattice, like)
         tiles, chunks = self.tiles.count, -(-self.nodes // layout.TILE)
@@ -99,7 +101,7 @@ class TotalSegmentIntegrator:
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, self.wall_chunks * layout.TILE, layout.WALL_VECTORS
         self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors)
-        self.kept = Arena.zeros("kept", like, (0,), (0,))
+        self.kept = Arena.zeros("kept", like, (0,), (0,), (0,))
 
     def _started(self) -> Tensor:
         """Which forces act in each substep [steps, 1, forces, 1]; all of those with a row for each."""
@@ -120,22 +122,20 @@ class TotalSegmentIntegrator:
         # The kernels write no history at places without a particle.
         states = (start.new_empty if self.scene.absent is None else start.new_zeros)(ring, *start.shape)
         states[0] = start
-        self.kept = Arena.zeros("kept", start, *self._kept(slots))
+        self.kept = Arena.zeros("kept", start, *self._kept(slots, len(self._recorded())))
         ints = self._ints([self.fixed, self.supply, self.kept, self.scratch], ring=ring, kept_ring=slots)
         march = self._march(
             *(total.total_march, total.total_substep, ints, self.fixed.buffer, self.supply.buffer, states.view(-1)),
             *(self.kept.buffer, self.scratch.buffer),
         )
-        sampled: dict[int, Tensor] = {}
-
-        def look(k: int, state: Tensor) -> None:
-            if self.near is None:
-                observe(k, state)
-            else:  # all together in the end, so that the host does not wait
-                sampled[k] = state[:, : 6 * self.nodes].unflatten(1, (6, self.nodes)).index_select(2, self.near)
-
+        if self.near is not None:  # simulations go on apart: kernels record their markers, and the host need not wait
+            first = states[:1, :, : 6 * self.nodes].unflatten(2, (6, self.nodes)).index_select(3, self.near)
+            march(0, self.steps)
+            seen = self.kept.views[2]
+            observe(list(self.samples), (torch.cat([first, seen]) if 0 in self.samples else seen).flatten(2))
+            return states
         if 0 in self.samples:
-            look(0, states[0])
+            observe(0, states[0])
         now = 0
         while now < self.steps:
             before = None if keep or self.scene.apart else states[now % 2].clone()
@@ -151,10 +151,8 @@ class TotalSegmentIntegrator:
                     march(now, collapsed)
                 report(self.scene, self.inputs, self.first + collapsed, states[collapsed % ring])
             if stop in self.samples:
-                look(stop, after)
+                observe(stop, after)
             now = stop
-        if sampled:
-            observe(list(sampled), torch.stack(list(sampled.values())).flatten(2))
         return states
 
     def _wrong(self, ints: Tensor, state: Tensor) -> bool:
@@ -170,7 +168,7 @@ class TotalSegmentIntegrator:
 
     def restore(self, record: Sequence[Tensor]) -> Tensor:
         """Take over the record of another integrator of the same segment, for ``backward``; returns all states."""
-        self.kept = Arena.over("kept", record[1], *self._kept(self.steps))
+        self.kept = Arena.over("kept", record[1], *self._kept(self.steps, 0))
         return record[0]
 
     def backward(self, states: Tensor, bar: Tensor, add: Observe, *, wanted: frozenset[str]) -> dict[str, Tensor]:
@@ -269,6 +267,7 @@ class TotalSegmentIntegrator:
             **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "histories": self.history},
             **{"faced": int(self.lattice.faces is not None), "ties": self.ties, "wall_chunks": self.wall_chunks},
             **{"pushes": self.scene.forces - self.groups, "fluid": int(self.scene.immersed)},
+            **{"watched": self.watched, "sample_at": layout.HEAD + len(self.tables.buffer)},
             **{name: int(value) for name, value in more.items()},
         }
         head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
@@ -277,11 +276,19 @@ class TotalSegmentIntegrator:
             shift = layout.HEAD if name == "integers" else 0
             head += [shift + offset for offset in given.get(name, [0] * len(quantities))]
         assert len(head) == layout.HEAD
-        values = torch.tensor(head, dtype=torch.int32)
+        values, samples = torch.tensor(head, dtype=torch.int32), self._recorded()
+        of_step = torch.full((self.steps if self.watched else 0,), -1, dtype=torch.int32)
+        of_step[[k - 1 for k in samples]] = torch.arange(len(samples), dtype=torch.int32)
         if self.gpu:  # from pinned memory, as the host would wait otherwise
-            values = values.pin_memory().to(self.tables.buffer.device, non_blocking=True)
-        return torch.cat([values, self.tables.buffer])
+            device = self.tables.buffer.device
+            values, of_step = (t.pin_memory().to(device, non_blocking=True) for t in (values, of_step))
+        return torch.cat([values, self.tables.buffer, of_step])
 
-    def _kept(self, slots: int) -> tuple[tuple[int, ...], ...]:
-        """Shapes of the quantities that are kept of every substep beside the states."""
-        return (slots, self.batch, self.chambers), (slots, self.batch, 3, self.nodes)
+    def _recorded(self) -> list[int]:
+        """Substeps after which kernels record the motion of what is near markers."""
+        return [k for k in self.samples if k > 0 and self.watched]
+
+    def _kept(self, slots: int, samples: int) -> tuple[tuple[int, ...], ...]:
+        """Shapes of the quantities that are kept of every substep beside the states, and of what is recorded."""
+        seen = samples, self.batch, 6, self.watched
+        return (slots, self.batch, self.chambers), (slots, self.batch, 3, self.nodes), seen
