@@ -100,7 +100,7 @@ BUFFERS = {
     ),
     "fixed": (
         *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
-        *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights"),
+        *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights", "tile_axes"),
     ),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed", "seen"),
@@ -117,14 +117,14 @@ BUFFERS = {
 KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(33, 42)
 WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY, NEAR_NUMBER = range(42, 47)
 NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(47, 56)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS = range(56, 62)
-PRESSURE, GRAVITY, FORCE = range(62, 65)
-VOLUMES, PUSHED, SEEN = range(65, 68)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(68, 73)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(73, 77)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(77, 85)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(85, 88)
-HEAD = 88
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(56, 63)
+PRESSURE, GRAVITY, FORCE = range(63, 66)
+VOLUMES, PUSHED, SEEN = range(66, 69)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(69, 74)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(74, 78)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(78, 86)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(86, 89)
+HEAD = 89
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors.
@@ -205,18 +205,22 @@ class Shape(NamedTuple):
         """Where vectors at the nodes begin."""
         return PAD_LINES + LINE * self.lines
 
+    def along(self, axis: int) -> int:
+        """What is to be known of points and nodes along an axis."""
+        return PAD_AXIS * 2 * self.cells[axis] + self.nodes[axis]
+
     def axis_at(self, axis: int) -> int:
         """Where weights and slopes of the points along an axis begin."""
-        return self.pad_nodes + 2 * self.slot + PAD_AXIS * 2 * sum(self.cells[:axis])
+        return self.pad_nodes + 2 * self.slot + sum(map(self.along, range(axis)))
 
     def cells_at(self, axis: int) -> int:
         """Where, for nodes along an axis, the number of the cell begins of which each is the lowest; -1 for none."""
-        return self.axis_at(3) + sum(self.nodes[:axis])
+        return self.axis_at(axis) + PAD_AXIS * 2 * self.cells[axis]
 
     @property
     def pad(self) -> int:
         """All numbers that a tile shares."""
-        return self.cells_at(3)
+        return self.axis_at(3)
 
 
 PAD_LINES = BUNDLE * TILE

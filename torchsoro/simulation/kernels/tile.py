@@ -15,17 +15,15 @@ from typing import Any, NamedTuple
 
 import taichi as ti
 
-from torchsoro.simulation.kernels.lattice import axis_starts, nodes_per_axis, product
+from torchsoro.simulation.kernels.lattice import nodes_per_axis, product
 from torchsoro.simulation.kernels.layout import (
     ARRIVED,
     AXES,
     AXIS,
     CHAMBER_START,
     CHAMBERS,
-    FIRSTS,
     HEAD,
     LOADED,
-    NX,
     NY,
     NZ,
     PAD_AXIS,
@@ -36,6 +34,7 @@ from torchsoro.simulation.kernels.layout import (
     STEP_SIZE,
     SWEPT,
     TILE,
+    TILE_AXES,
     TILES,
     TX,
     TY,
@@ -236,41 +235,20 @@ def stage(block: ti.template(), a: ti.template(), at, number: ti.template(), nod
 
 
 @ti.func
-def cells_before(block: ti.template(), axis: ti.template()):
-    """Where the lowest nodes of the cells along an axis begin."""
-    before = block.head[FIRSTS]
-    if ti.static(axis > 0):
-        before += block.head[NX] // 2
-    if ti.static(axis > 1):
-        before += block.head[NY] // 2
-    return before
-
-
-@ti.func
-def stage_axes(block: ti.template(), cell, counts, node):
+def stage_axes(block: ti.template(), tile):
     """Copy what is to be known of a tile's points and nodes along the axes to the pad."""
-    starts = axis_starts(block.head)
+    (head,) = ti.static((block.head,))
+    x, y, z = tile // (head[TY] * head[TZ]), (tile // head[TZ]) % head[TY], tile % head[TZ]
+    of_x, of_y, of_z = ti.static((block.tile.along(0), block.tile.along(1), block.tile.along(2)))
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        for axis in ti.static(range(3)):
-            points, nodes = ti.static((2 * block.tile.cells[axis], block.tile.nodes[axis]))
-            axis_at, cells_at = ti.static((block.tile.axis_at(axis), block.tile.cells_at(axis)))
-            firsts = cells_before(block, axis) + cell[axis]
-            if q < points * PAD_AXIS:
-                p, one = number_along(cell[axis], counts[axis], q // PAD_AXIS), q % PAD_AXIS
-                number = block.fixed[STEP_SIZE] * 0
-                if p >= 0:
-                    if one < AXIS:
-                        number = block.fixed[starts[axis] + AXIS * p + one]
-                    else:
-                        number += block.ints[firsts + q // ti.static(2 * PAD_AXIS)] - node[axis]
-                block.pad[block.base + axis_at + q] = number
-            if q < nodes:
-                number = block.fixed[STEP_SIZE] * 0 - 1
-                for k in range(counts[axis]):
-                    if block.ints[firsts + k] - node[axis] == q:
-                        number = number * 0 + k
-                block.pad[block.base + cells_at + q] = number
+        at = x * of_x
+        if q >= of_x:
+            at = head[TX] * of_x + y * of_y - of_x
+        if q >= ti.static(of_x + of_y):
+            at = head[TX] * of_x + head[TY] * of_y + z * of_z - ti.static(of_x + of_y)
+        if q < ti.static(of_x + of_y + of_z):
+            block.pad[block.base + ti.static(block.tile.axis_at(0)) + q] = block.fixed[head[TILE_AXES] + at + q]
 
 
 @ti.func

@@ -267,7 +267,7 @@ def point_pass(block: ti.template(), item, fresh, t):
     cell, counts, node, first, last, b, tile = tile_box(block, fresh, item)
     at = ((t % head[RING]) * head[BATCH] + b) * state_length(head)
     if fresh == 1:
-        stage_axes(block, cell, counts, node)
+        stage_axes(block, tile)
     stage(block, block.state, at, 0, node)
     if ti.static(block.features & LOADED):
         if head[VISCOUS] == 1:

@@ -219,7 +219,7 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
     at = (ti.max(t, 0) * head[BATCH] + b) * state_length(head)
     viscous = ti.cast(0, ti.i32)
     if fresh == 1:
-        stage_axes(block, cell, counts, node)
+        stage_axes(block, tile)
     stage(block, block.state, at, 0, node)
     stage(block, block.back, head[FORCES] + b * 3 * nodes, 1, node)
     if ti.static(block.features & LOADED):

@@ -14,7 +14,7 @@ from torchsoro.simulation.ops.chambers import chamber_means
 from torchsoro.simulation.ops.lattice import numbers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Scene
-from torchsoro.simulation.ops.tiles import tables, tiles_of, wall_numbers
+from torchsoro.simulation.ops.tiles import tables, tile_axes, tiles_of, wall_numbers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,6 +68,7 @@ def fixed(scene: Scene, inputs: Inputs) -> Fixed:
                 *(none if scene.tie_share is None else scene.tie_share.to(c), ties),
                 none if scene.node_share is None else scene.node_share.to(c),
                 *(torch.from_numpy(walls).to(c) for walls in wall_numbers(lattice)),
+                torch.from_numpy(tile_axes(lattice, tiles_of(lattice, c))).to(c),
             ),
         )
 

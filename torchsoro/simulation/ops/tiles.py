@@ -124,6 +124,25 @@ def tables(lattice: Lattice, tiles: Tiles, kind: Tensor, chambers: int) -> list[
     ]
 
 
+def tile_axes(lattice: Lattice, tiles: Tiles) -> np.ndarray:
+    """What kernels are to know of each tile along each axis, one after the other.
+
+    Of its points three weights, three slopes [1/m] and the lowest node of their cell, zeros for those that it lacks; of
+    its nodes the cell of which each is the lowest, -1 for none.
+    """
+    rows = []
+    for axis, along, cells, nodes in zip(lattice.axes, tiles.along, tiles.of.cells, tiles.of.nodes, strict=True):
+        table = np.concatenate([t.reshape(-1, 3) for t in axis.table], 1)
+        for cell, count, first in along.tolist():
+            lowest = axis.first[cell : cell + count] - first
+            points, starts = np.zeros((2 * cells, layout.PAD_AXIS)), np.full(nodes, -1)
+            points[: 2 * count, : layout.AXIS] = table[2 * cell : 2 * (cell + count)]
+            points[: 2 * count, layout.AXIS] = np.repeat(lowest, 2)
+            starts[lowest] = np.arange(count)
+            rows += [points.reshape(-1), starts]
+    return np.concatenate(rows)
+
+
 def wall_slots(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """How wall points of hollow chambers go into chunks of 256 of one chamber each.
 
