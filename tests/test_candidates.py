@@ -9,10 +9,22 @@ import numpy as np
 import pytest
 from ringing import bar, effect
 
-from torchsoro.sim2real.inference.candidates import at_mode, data_of, model_of, near, responses, weigh, weighing_of
+from torchsoro.sim2real.data.schema import PlaneTable
+from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
+from torchsoro.sim2real.inference.candidates import (
+    GAPS,
+    at_mode,
+    data_of,
+    model_of,
+    near,
+    responses,
+    weigh,
+    weighing_of,
+)
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.resolution import between
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.visible import limit
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -83,6 +95,29 @@ def test_a_model_without_a_finer_twin_has_the_error_that_its_problem_states(weig
     stated = np.mean([alone.discretization.of(t) ** 2 for t in alone.trials], 0).T
     assert model.numerics.amplitude == pytest.approx(np.sqrt(stated))
     assert not model.numerics.draws
+
+
+def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(made):
+    twin, record = made
+    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
+    experiment = record(None)
+    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
+    experiment = dataclasses.replace(experiment, trials=tuple(trials))
+    fine = Twin(twin.setup, edge=0.6 * twin.edge, across=5)
+    problem = FitProblem(experiment, twin, fine=fine)
+    fit = problem.fit([((), None)], rounds=0)[0]
+    assert fit is not None
+    (model,) = near(problem, [fit], closely=True)
+    assert model is not None
+    wall = WallOffset()
+    points = np.concatenate([np.tile(fit.point, (len(GAPS), 1)), GAPS[:, None] / wall.quantities[0].scale], 1)
+    by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
+    (motions,) = by_fine.simulate([((wall,), points)])
+    for i, (trial, motion) in enumerate(zip(problem.trials, motions, strict=True)):
+        seen = [problem.observation.observe(motion.alone(k), i, fit.errors) for k in range(len(GAPS))]
+        left = trial.recording.position - np.mean(seen, 0)
+        np.testing.assert_allclose(model.residuals[i], left, rtol=0, atol=1e-9)
+    assert len(model.numerics.draws) == len(GAPS) + 1  # and that of the cells
 
 
 def test_a_fit_at_a_mode_has_its_numbers_and_deviations_in_si_units(weighed):

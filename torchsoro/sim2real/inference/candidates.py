@@ -99,7 +99,7 @@ def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
+def near(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> list[Linearised | None]:
     """Fits as linearised models, with the error that finer twins leave; all simulated together.
 
     Without a finer twin, or with trials that come with a simulation of their own, models are those of the problem
@@ -108,6 +108,7 @@ def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
     Args:
         problem: That was fitted.
         fits: Ends of searches.
+        closely: Whether, of rough motions, planes are moved in the finer twin, which takes some times as long.
 
     Returns:
         A model of each; None where a simulation breaks down.
@@ -135,27 +136,31 @@ def near(problem: FitProblem, fits: Sequence[Fit]) -> list[Linearised | None]:
                 numerics=TwinError(amplitude=np.sqrt(stated)),
             )
         )
-    return models if finer is None else _corrected(problem, coarse, fits, models, finer)
+    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely)
 
 
 def _corrected(
-    problem: FitProblem, coarse: FitProblem, fits: Sequence[Fit], models: Sequence[Linearised | None], fine: Twin
+    problem: FitProblem,
+    coarse: FitProblem,
+    fits: Sequence[Fit],
+    models: Sequence[Linearised | None],
+    fine: Twin,
+    closely: bool,
 ) -> list[Linearised | None]:
     """Models with the residuals by finer twins, and the error of these."""
     data = data_of(problem)
     by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
+    if problem.rough and closely:
+        touching = _touching(problem, by_fine, fits)
+        return [_spread(problem, model, variants, fine) for model, variants in zip(models, touching, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     sharp = [_residuals(problem, f, motions) for f, motions in zip(fits, by_fine.simulate(ask), strict=True)]
     if problem.rough:
-        touching = _touching(problem, coarse, fits)
+        # What a plane's place changes, by the twin in use: it is of that order in the finer one.
         found: list[Linearised | None] = []
-        for model, finer, variants in zip(models, sharp, touching, strict=True):
-            if model is None or not finer or not variants:
-                found.append(None)
-                continue
-            # What a plane's place changes, by the twin in use: the finer one would take some twenty times as long.
-            moved = [_sum(finer[0], v, model.residuals) for v in variants]
-            found.append(by_spread(data, model, moved, model.residuals, problem.twin.edge / fine.edge))
+        for model, finer, variants in zip(models, sharp, _touching(problem, coarse, fits), strict=True):
+            moved = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
+            found.append(_spread(problem, model, moved, fine))
         return found
     middle = between(problem.twin, fine)
     by_middle = problem.only(problem.trials, twin=middle, discretization=DiscretizationError())
@@ -169,12 +174,21 @@ def _corrected(
     ]
 
 
-def _touching(problem: Likelihood, coarse: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
+def _spread(
+    problem: Likelihood, model: Linearised | None, variants: Sequence[Motions], fine: Twin
+) -> Linearised | None:
+    """A model by equally good twins; none where a simulation broke down."""
+    if model is None or not variants:
+        return None
+    return by_spread(data_of(problem), model, variants, model.residuals, problem.twin.edge / fine.edge)
+
+
+def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
     """Residuals with planes a little nearer and farther, of each fit; none where one breaks down."""
     wall = WallOffset()
     gaps = GAPS[:, None] / wall.quantities[0].scale
     ask = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
-    return [_residuals(problem, f, motions) for f, motions in zip(fits, coarse.simulate(ask), strict=True)]
+    return [_residuals(problem, f, motions) for f, motions in zip(fits, twin.simulate(ask), strict=True)]
 
 
 def _residuals(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTrajectory]) -> list[Motions]:
@@ -213,19 +227,22 @@ def _slopes(
     return tuple(found)
 
 
-def weigh(problem: FitProblem, fits: Sequence[Fit]) -> list[tuple[Fit, Posterior]]:
+def weigh(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> list[tuple[Fit, Posterior]]:
     """Posteriors near fits, each with the fit; without those that break down.
 
     Args:
         problem: That was fitted.
         fits: Ends of searches.
+        closely: See :func:`near`.
     """
     data = data_of(problem)
-    models = [(fit, model) for fit, model in zip(fits, near(problem, fits), strict=True) if model is not None]
+    models = [
+        (fit, model) for fit, model in zip(fits, near(problem, fits, closely=closely), strict=True) if model is not None
+    ]
     # Two pools, as a thread that waits for others of its own pool may wait for ever.
     with ThreadPoolExecutor(problem.threads) as pool, ThreadPoolExecutor(problem.threads) as inner:
-        found = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), models)
-        return list(zip((f for f, _ in models), found, strict=True))
+        after = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), models)
+        return list(zip((f for f, _ in models), after, strict=True))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

@@ -126,9 +126,14 @@ class Weighing:
     names: int
 
     @cached_property
+    def nulls(self) -> tuple[Posterior, ...]:
+        """Distinct modes of the model without an effect, most probable first."""
+        return tuple(sorted(map(_middle, _alike(self.nothing)), key=lambda p: -p.ln_evidence))
+
+    @property
     def null(self) -> Posterior:
-        """The most probable mode of the model without an effect."""
-        return max(map(_middle, _alike(self.nothing)), key=lambda p: p.ln_evidence)
+        """The most probable of them."""
+        return self.nulls[0]
 
     @cached_property
     def scatter(self) -> float:
@@ -160,14 +165,21 @@ class Weighing:
         return near.left(mode_of(self.data, near, self.bounded.discrepancy).at)
 
     @cached_property
-    def kappa(self) -> float:
-        """Mean adjustment over the changes by all names, by the errors of the most probable model.
-
-        Differences of ln evidence are no more certain than it scatters.
-        """
+    def by_error(self) -> float:
+        """Mean adjustment over the changes by all names, by the errors of the most probable model."""
         changes = [self.change(modes[0]) for modes in self.groups.values()]
         columns = tuple(np.stack(same, -1) for same in zip(*changes, strict=True))
-        return max(adjustment(self.data, self.best, columns), self.scatter) if changes else 1.0
+        return adjustment(self.data, self.best, columns) if changes else 1.0
+
+    @property
+    def scattered(self) -> bool:
+        """Whether ln evidence scatters by more than the twin's error leaves uncertain of it."""
+        return bool(self.groups) and self.scatter > self.by_error
+
+    @property
+    def kappa(self) -> float:
+        """Likelihoods are taken to the power of its inverse; differences are no more certain than evidence scatters."""
+        return self.scatter if self.scattered else self.by_error
 
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:

@@ -13,7 +13,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses, weigh, weighing_of
-from torchsoro.sim2real.inference.conclusion import Conclusion, adjustment, conclude
+from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict
@@ -22,7 +22,8 @@ from torchsoro.sim2real.inference.search import search, within_tolerances
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
-POLISHED = 4  # names that are linearised again where their posterior has its mode
+POLISHED = 4  # names that are linearised again where their posterior has its mode; of rough motions so many modes
+NOTHING = 2  # modes without an effect beside them
 ROUNDS = 3  # of that, at most
 AHEAD = 3  # ends of searches that are always weighed
 FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of the running
@@ -134,17 +135,17 @@ def weighed(
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     known = weigh(problem, [null_model, *strained, *_other_valleys(problem), *_running(problem, ends)])
     weighing = weighing_of(problem, [p for _, p in known], names)
-    for _ in range(ROUNDS):
-        leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
-        # Of rough motions each is looked at again, to see how far its evidence hangs on which node touches when.
-        far = [p for p in (weighing.null, *leading[:POLISHED]) if problem.rough or _moved(p)]
+    for k in range(ROUNDS):
+        far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
         if not far:
             break
-        again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far])
+        again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far], closely=True)
         sound = {p.near.model.name for _, p in again}
-        # What breaks down there stays as it was, and so does what is one of several looks.
-        kept = [k for k in known if problem.rough or k[1] not in far or k[1].near.model.name not in sound]
-        known = [*kept, *again]
+        if not problem.rough:  # what breaks down there stays as it was
+            known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]
+        elif k == 0:  # evidence with errors that were told otherwise is no measure
+            known = [one for one in known if one[1].near.model.name not in sound]
+        known += again
         weighing = weighing_of(problem, [p for _, p in known], names)
     changes = responses(problem, effects, _fit_of(known, weighing.null))
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
@@ -173,6 +174,24 @@ def weighed(
         conclusion=found,
     )
     return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
+
+
+def _far(weighing: Weighing) -> list[Posterior]:
+    """Of what leads, modes that are far from where they were linearised."""
+    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
+    return [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]
+
+
+def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
+    """Modes of rough motions that are linearised again after so many rounds.
+
+    Closely, as what leads is to be told apart; once more, to see how far evidence hangs on which node touches when; and
+    again where that is what decides.
+    """
+    if before > 1 and not weighing.scattered:
+        return []
+    modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
+    return [*weighing.nulls[:NOTHING], *modes[:POLISHED]]
 
 
 def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
