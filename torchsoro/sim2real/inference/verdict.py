@@ -22,9 +22,10 @@ from torchsoro.sim2real.inference.search import search, within_tolerances
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
-POLISHED = 4  # names that are linearised again where their posterior has its mode; of rough motions so many modes
-NOTHING = 2  # modes without an effect beside them
+POLISHED = 4  # names that are linearised again where their posterior has its mode
 ROUNDS = 3  # of that, at most
+CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
+NOTHING = 2  # modes without an effect beside them
 AHEAD = 3  # ends of searches that are always weighed
 FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of the running
 
@@ -191,7 +192,7 @@ def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
     if before > 1 and not weighing.scattered:
         return []
     modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
-    return [*weighing.nulls[:NOTHING], *modes[:POLISHED]]
+    return [*weighing.nulls[:NOTHING], *modes[: CLOSELY[before]]]
 
 
 def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
