@@ -135,6 +135,16 @@ class Weighing:
         """The most probable of them."""
         return self.nulls[0]
 
+    @property
+    def valleys(self) -> tuple[Posterior, ...]:
+        """The same modes, each by the look at which it is most probable."""
+        return tuple(same[0] for same in _alike(self.nothing))
+
+    def latest(self, found: Posterior) -> Posterior:
+        """The last look at a mode."""
+        name = found.near.model.name
+        return [p for p in (*self.nothing, *self.effects) if p.near.model.name == name and _same(p, found)][-1]
+
     @cached_property
     def scatter(self) -> float:
         """Standard deviation of ln evidence where a mode was linearised more than once, a little beside itself.

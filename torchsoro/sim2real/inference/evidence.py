@@ -179,7 +179,7 @@ class Posterior:
     @property
     def matters(self) -> bool:
         """Whether a discrepancy that matters is more probable."""
-        return self.some.ln_evidence > self.none.ln_evidence
+        return bool(self.some.ln_evidence > self.none.ln_evidence)
 
     @property
     def best(self) -> Branch:

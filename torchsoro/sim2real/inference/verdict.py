@@ -134,7 +134,7 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *_other_valleys(problem), *_running(problem, ends)])
+    known = weigh(problem, [null_model, *strained, *_other_valleys(problem, null_model), *_running(problem, ends)])
     weighing = weighing_of(problem, [p for _, p in known], names)
     for k in range(ROUNDS):
         far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
@@ -192,7 +192,11 @@ def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
     if before > 1 and not weighing.scattered:
         return []
     modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
-    return [*weighing.nulls[:NOTHING], *modes[: CLOSELY[before]]]
+    # At first, few effects have been looked at more than once, so that the best look at nothing counts, too.
+    nothing = weighing.nulls if before else weighing.valleys
+    asked = [*nothing[:NOTHING], *modes[: CLOSELY[before]]]
+    # From where the last look leads, as the one in the middle has been followed before.
+    return [weighing.latest(p) for p in asked] if before else asked
 
 
 def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
@@ -204,7 +208,7 @@ def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
     return [f for k, f in enumerate(order) if k < AHEAD or f.chi2 < FARTHER * least]
 
 
-def _other_valleys(problem: FitProblem) -> list[Fit]:
+def _other_valleys(problem: FitProblem, null_model: Fit) -> list[Fit]:
     """Where bodies touch planes, the null model all over its tolerances.
 
     The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
@@ -213,7 +217,7 @@ def _other_valleys(problem: FitProblem) -> list[Fit]:
     if problem.finer_twin is None or not problem.rough:
         return []
     tasks = [((), point) for point in within_tolerances(problem)]
-    return [f for f in problem.fit(tasks, rounds=0, settle=False) if f is not None]
+    return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
 
 
 def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
