@@ -117,6 +117,18 @@ def test_evidence_that_scatters_where_a_mode_is_looked_at_again_decides_by_no_mo
     assert [p.ln_evidence for p in again.groups["drag"]] == [sure.groups["drag"][0].ln_evidence]
     odds = [w.candidates()[0] for w in (sure, again)]
     assert odds[0]["drag"] > 0.99 > odds[1]["drag"]
+    # It is followed from its last look.
+    assert again.latest(again.groups["drag"][0]) is again.effects[-1]
+
+
+def test_the_best_look_at_nothing_is_known_beside_the_one_in_the_middle():
+    data, nothing, drag = recorded(0.0, 1, effect=0.02)
+    sure = weighed(data, nothing, drag)
+    looks = tuple(shifted(sure.null, d) for d in (-40.0, 40.0, 0.0))
+    again = dataclasses.replace(sure, nothing=looks)
+    assert again.null is looks[2]
+    assert again.valleys == (looks[1],)
+    assert again.latest(again.null) is looks[2]
 
 
 def test_an_effect_that_is_there_is_explained():
