@@ -32,7 +32,6 @@ from torchsoro.simulation.kernels.layout import (
     SHARED,
     SLOT_START,
     STEP_SIZE,
-    SWEPT,
     TILE,
     TILE_AXES,
     TILES,
@@ -42,10 +41,7 @@ from torchsoro.simulation.kernels.layout import (
     Shape,
 )
 
-# Where parts of a chamber's sum lie in the pad: after the bundles that go with slopes; likewise of one over tiles.
-ALONE = 9 * TILE
-PARTS = 16
-TOTALS = TILE + PARTS
+ALONE = 9 * TILE  # where parts of a chamber's sum lie in the pad: after the bundles that go with slopes
 # Integers that a block keeps at hand: the head, a zero, and those of a tile.
 KEPT = HEAD + 14
 # A power of two above all places in a pad.
@@ -447,63 +443,3 @@ def sum_tiles(block: ti.template(), at, sources, i, nodes):
             share = block.scratch[place + c * ti.static(block.tile.count)]
             total[c] += ti.select(source >= 0, share, zero)
     return total
-
-
-@ti.func
-def fold(block: ti.template(), k):
-    """Sum the 256 numbers at the beginning of the pad, to number k of TOTALS."""
-    sync(block.gpu)
-    for each in range(block.q0, block.q1):
-        q = thread(block, each)
-        if q < PARTS:
-            total = block.pad[block.base + q]
-            for m in ti.static(range(1, TILE // PARTS)):
-                total += block.pad[block.base + m * PARTS + q]
-            block.pad[block.base + TILE + q] = total
-    sync(block.gpu)
-    for each in range(block.q0, block.q1):
-        if thread(block, each) == 0:
-            fold_last(block, k)
-    sync(block.gpu)
-
-
-@ti.func
-def fold_last(block: ti.template(), k):
-    """Sum PARTS numbers at TILE of the pad, to number k of TOTALS."""
-    total = block.pad[block.base + TILE]
-    for m in ti.static(range(1, PARTS)):
-        total += block.pad[block.base + TILE + m]
-    block.pad[block.base + TOTALS + k] = total
-
-
-@ti.func
-def fold_parts(block: ti.template(), k, count):
-    """The same of so many numbers, which are at TILE of the pad, too, where there are PARTS of them at most."""
-    if count > PARTS:
-        fold(block, k)
-    else:
-        sync(block.gpu)
-        for each in range(block.q0, block.q1):
-            if thread(block, each) == 0:
-                fold_last(block, k)
-        sync(block.gpu)
-
-
-@ti.func
-def sum_chambers(block: ti.template(), b):
-    """Sum what the tiles of each chamber of simulation b hand over alone: at TOTALS of the pad, number by number."""
-    chambers, start = block.head[CHAMBERS], block.head[CHAMBER_START]
-    for k in range(chambers):
-        first, last = block.ints[start + k], block.ints[start + k + 1]
-        swept = block.head[SWEPT] + b * block.ints[start + chambers]
-        for each in range(block.q0, block.q1):
-            q = thread(block, each)
-            total = block.fixed[AXES] * 0
-            one = first + q
-            while one < last:
-                total += block.scratch[swept + one]
-                one += TILE
-            block.pad[block.base + q] = total
-            if q < PARTS:
-                block.pad[block.base + TILE + q] = total
-        fold_parts(block, k, last - first)

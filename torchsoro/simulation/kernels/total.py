@@ -6,6 +6,7 @@ nodes add up these sums, move, and meet the planes. What a body has besides (``f
 
 import taichi as ti
 
+from torchsoro.simulation.kernels.fold import TOTALS, sum_chambers
 from torchsoro.simulation.kernels.forward import CPU_UNIT, Integers, Reals
 from torchsoro.simulation.kernels.lattice import nodes_per_axis, particle_place, points_per_axis, product, state_length
 from torchsoro.simulation.kernels.laws_taichi import laws
@@ -103,7 +104,6 @@ from torchsoro.simulation.kernels.tensor import (
 from torchsoro.simulation.kernels.tile import (
     ALONE,
     KEPT,
-    TOTALS,
     chamber_slots,
     hand_over,
     hand_over_vector,
@@ -114,7 +114,6 @@ from torchsoro.simulation.kernels.tile import (
     point_of,
     stage,
     stage_axes,
-    sum_chambers,
     sum_tile,
     sum_tiles,
     sync,

@@ -7,6 +7,7 @@ substeps between two passes.
 
 import taichi as ti
 
+from torchsoro.simulation.kernels.fold import TOTALS, sum_chambers
 from torchsoro.simulation.kernels.forward import CPU_UNIT, Integers, Reals
 from torchsoro.simulation.kernels.lattice import gather_value, nodes_per_axis, points_per_axis, product, state_length
 from torchsoro.simulation.kernels.laws_taichi import laws
@@ -69,7 +70,6 @@ from torchsoro.simulation.kernels.tensor import add, contract, load_vector, stor
 from torchsoro.simulation.kernels.tile import (
     ALONE,
     KEPT,
-    TOTALS,
     chamber_slots,
     meet,
     node_chunks,
@@ -78,7 +78,6 @@ from torchsoro.simulation.kernels.tile import (
     point_of,
     stage,
     stage_axes,
-    sum_chambers,
     sum_tile,
     sum_tiles,
     sync,

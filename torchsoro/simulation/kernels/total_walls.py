@@ -7,6 +7,7 @@ their points hand them.
 
 import taichi as ti
 
+from torchsoro.simulation.kernels.fold import TOTALS, fold
 from torchsoro.simulation.kernels.lattice import nodes_per_axis, product, state_length
 from torchsoro.simulation.kernels.layout import (
     BATCH,
@@ -39,7 +40,7 @@ from torchsoro.simulation.kernels.layout import (
     WALL_WEIGHTS,
 )
 from torchsoro.simulation.kernels.tensor import add, load_vector, store_vector
-from torchsoro.simulation.kernels.tile import TOTALS, chamber_slots, fold, sync, thread
+from torchsoro.simulation.kernels.tile import chamber_slots, sync, thread
 
 AT_HAND = 2 * TILE  # of the pad: where what wall points hand over begins
 
