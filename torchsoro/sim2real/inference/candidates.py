@@ -150,9 +150,10 @@ def _corrected(
     """Models with the residuals by finer twins, and the error of these."""
     data = data_of(problem)
     by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
+    edges = problem.twin.edge / fine.edge
     if problem.rough and closely:
         touching = _touching(problem, by_fine, fits)
-        return [_spread(problem, model, variants, fine) for model, variants in zip(models, touching, strict=True)]
+        return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     sharp = [_residuals(problem, f, motions) for f, motions in zip(fits, by_fine.simulate(ask), strict=True)]
     if problem.rough:
@@ -160,7 +161,7 @@ def _corrected(
         found: list[Linearised | None] = []
         for model, finer, variants in zip(models, sharp, _touching(problem, coarse, fits), strict=True):
             moved = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
-            found.append(_spread(problem, model, moved, fine))
+            found.append(_spread(data, model, moved, edges))
         return found
     middle = between(problem.twin, fine)
     by_middle = problem.only(problem.trials, twin=middle, discretization=DiscretizationError())
@@ -174,13 +175,9 @@ def _corrected(
     ]
 
 
-def _spread(
-    problem: Likelihood, model: Linearised | None, variants: Sequence[Motions], fine: Twin
-) -> Linearised | None:
-    """A model by equally good twins; none where a simulation broke down."""
-    if model is None or not variants:
-        return None
-    return by_spread(data_of(problem), model, variants, model.residuals, problem.twin.edge / fine.edge)
+def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], edges: float) -> Linearised | None:
+    """A model by equally good twins, with the ratio of edges of cells; none where a simulation broke down."""
+    return None if model is None or not variants else by_spread(data, model, variants, model.residuals, edges)
 
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:

@@ -126,9 +126,17 @@ class Weighing:
     names: int
 
     @cached_property
+    def _looks_at_nothing(self) -> list[list[Posterior]]:
+        return _alike(self.nothing)
+
+    @cached_property
+    def _looks_at_effects(self) -> list[list[Posterior]]:
+        return _alike(self.effects)
+
+    @cached_property
     def nulls(self) -> tuple[Posterior, ...]:
         """Distinct modes of the model without an effect, most probable first."""
-        return tuple(sorted(map(_middle, _alike(self.nothing)), key=lambda p: -p.ln_evidence))
+        return tuple(sorted(map(_middle, self._looks_at_nothing), key=lambda p: -p.ln_evidence))
 
     @property
     def null(self) -> Posterior:
@@ -138,7 +146,7 @@ class Weighing:
     @property
     def valleys(self) -> tuple[Posterior, ...]:
         """The same modes, each by the look at which it is most probable."""
-        return tuple(same[0] for same in _alike(self.nothing))
+        return tuple(same[0] for same in self._looks_at_nothing)
 
     def latest(self, found: Posterior) -> Posterior:
         """The last look at a mode."""
@@ -151,7 +159,7 @@ class Weighing:
 
         Of rough motions that says how much of it hangs on which node touches when.
         """
-        again = [[p.ln_evidence for p in same] for same in (*_alike(self.nothing), *_alike(self.effects))]
+        again = [[p.ln_evidence for p in same] for same in (*self._looks_at_nothing, *self._looks_at_effects)]
         free = sum(len(same) - 1 for same in again)
         return math.sqrt(sum(len(same) * float(np.var(same)) for same in again) / free) if free else 0.0
 
@@ -195,7 +203,7 @@ class Weighing:
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
         """Distinct modes of each name, most probable first."""
         found: dict[str, list[Posterior]] = {}
-        for p in sorted(map(_middle, _alike(self.effects)), key=lambda p: -p.ln_evidence):
+        for p in sorted(map(_middle, self._looks_at_effects), key=lambda p: -p.ln_evidence):
             found.setdefault(p.near.model.name, []).append(p)
         return {name: tuple(modes) for name, modes in found.items()}
 

@@ -11,43 +11,25 @@ TOTALS = TILE + PARTS
 
 
 @ti.func
-def fold(block: ti.template(), k):
-    """Sum the 256 numbers at the beginning of the pad, to number k of TOTALS."""
+def fold(block: ti.template(), k, count):
+    """Sum so many numbers at the beginning of the pad to number k of TOTALS; PARTS of them at most lie at TILE, too."""
     sync(block.gpu)
-    for each in range(block.q0, block.q1):
-        q = thread(block, each)
-        if q < PARTS:
-            total = block.pad[block.base + q]
-            for m in ti.static(range(1, TILE // PARTS)):
-                total += block.pad[block.base + m * PARTS + q]
-            block.pad[block.base + TILE + q] = total
-    sync(block.gpu)
+    if count > PARTS:
+        for each in range(block.q0, block.q1):
+            q = thread(block, each)
+            if q < PARTS:
+                total = block.pad[block.base + q]
+                for m in ti.static(range(1, TILE // PARTS)):
+                    total += block.pad[block.base + m * PARTS + q]
+                block.pad[block.base + TILE + q] = total
+        sync(block.gpu)
     for each in range(block.q0, block.q1):
         if thread(block, each) == 0:
-            fold_last(block, k)
+            total = block.pad[block.base + TILE]
+            for m in ti.static(range(1, PARTS)):
+                total += block.pad[block.base + TILE + m]
+            block.pad[block.base + TOTALS + k] = total
     sync(block.gpu)
-
-
-@ti.func
-def fold_last(block: ti.template(), k):
-    """Sum PARTS numbers at TILE of the pad, to number k of TOTALS."""
-    total = block.pad[block.base + TILE]
-    for m in ti.static(range(1, PARTS)):
-        total += block.pad[block.base + TILE + m]
-    block.pad[block.base + TOTALS + k] = total
-
-
-@ti.func
-def fold_parts(block: ti.template(), k, count):
-    """The same of so many numbers, which are at TILE of the pad, too, where there are PARTS of them at most."""
-    if count > PARTS:
-        fold(block, k)
-    else:
-        sync(block.gpu)
-        for each in range(block.q0, block.q1):
-            if thread(block, each) == 0:
-                fold_last(block, k)
-        sync(block.gpu)
 
 
 @ti.func
@@ -67,4 +49,4 @@ def sum_chambers(block: ti.template(), b):
             block.pad[block.base + q] = total
             if q < PARTS:
                 block.pad[block.base + TILE + q] = total
-        fold_parts(block, k, last - first)
+        fold(block, k, last - first)

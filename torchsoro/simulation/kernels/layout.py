@@ -88,6 +88,7 @@ FACED, TIES, PUSHES, WALL_CHUNKS, FLUID, WATCHED, SAMPLE_AT = range(26, 33)
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
 # recorded at samples.
 LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED = (2**n for n in range(8))
+# All loads and laws, for variations that have now one and now another.
 ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 
 # Buffer by buffer, in order, what lies in it: integers; what stays the same in a segment; what acts over time; what is
@@ -138,14 +139,12 @@ STEP_SIZE, EDGE, AXES = 0, 1, 2
 AXIS = 6
 
 # What a point hands to the nodes: a tensor that goes with the slopes and a vector that goes with the weights; the same
-# after the sum along z: three vectors, for slopes along x, y and z; after the sum along y: for slopes along x and not.
+# after the sum along z: three vectors, for slopes along x, y and z.
 BUNDLE = 12
 LINE = 9
-SHEET = 6
 TILE = 256  # points of a tile at most, and threads that work on them, one each
-PAD_AXIS = (
-    AXIS + 1
-)  # numbers of a point along an axis that a tile shares: also the lowest node of its cell, in the tile
+# Numbers of a point along an axis that a tile shares; the last is the lowest node of its cell, in the tile.
+PAD_AXIS = AXIS + 1
 SHARED = 8  # tiles that a node belongs to
 
 

@@ -77,7 +77,7 @@ def mean_of(block: ti.template(), a: ti.template(), at, tie, first):
                 total += block.fixed[shares + i] * a[at + c * nodes + i]
                 i += TILE
             block.pad[block.base + q] = total
-        fold(block, first + c)
+        fold(block, first + c, TILE)
 
 
 @ti.func
@@ -172,7 +172,7 @@ def wall_vectors(block: ti.template(), b, w):
 @ti.func
 def wall_total(block: ti.template(), b, chunk):
     """Sum what the points of a chunk have in the pad, for the chamber."""
-    fold(block, 0)
+    fold(block, 0, TILE)
     for each in range(block.q0, block.q1):
         if thread(block, each) == 0:
             place = block.ints[block.head[WALL_CHUNK] + chunk]

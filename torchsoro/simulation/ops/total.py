@@ -132,7 +132,8 @@ class TotalSegmentIntegrator:
             first = states[:1, :, : 6 * self.nodes].unflatten(2, (6, self.nodes)).index_select(3, self.near)
             march(0, self.steps)
             seen = self.kept.views[2]
-            observe(list(self.samples), (torch.cat([first, seen]) if 0 in self.samples else seen).flatten(2))
+            if self.samples:
+                observe(list(self.samples), (torch.cat([first, seen]) if 0 in self.samples else seen).flatten(2))
             return states
         if 0 in self.samples:
             observe(0, states[0])
