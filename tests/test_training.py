@@ -252,6 +252,21 @@ def test_amendments_that_no_iteration_used_are_dropped(tmp_path, at_once):
     assert notes(tmp_path) == []
 
 
+def test_an_amendment_that_does_not_fit_the_checkpoint_leaves_the_run_as_it_was(tmp_path, at_once):
+    with RunFolder(tmp_path, SETTINGS) as run:
+        run.save(4)
+    go_on(tmp_path, 7, seed=2)
+    files = [tmp_path / name for name in ("settings.json", "amendments.json", "checkpoint.pt")]
+    before = [path.read_bytes() for path in files]
+    with (
+        pytest.raises(ValueError, match="does not fit"),
+        RunFolder(tmp_path, {**SETTINGS, "seed": 3}, resume=True, amend=True) as run,
+    ):
+        run.load()
+        raise ValueError("the design does not fit")
+    assert [path.read_bytes() for path in files] == before
+
+
 def test_a_half_written_last_row_is_dropped(tmp_path):
     with RunFolder(tmp_path, SETTINGS) as run:
         for iteration in range(12):

@@ -128,6 +128,9 @@ class RunFolder:
         self.path.mkdir(parents=True, exist_ok=True)
         for file in ("checkpoint.pt", "metrics.csv", "settings.json", "amendments.json"):
             (self.path / f"{file}.tmp").unlink(missing_ok=True)  # a killed process may have left one
+        # If the checkpoint turns out not to fit the settings, the run stays as it was.
+        held = [self.path / file for file in ("settings.json", "amendments.json")] if resume else []
+        self._held = {path: path.read_bytes() if path.exists() else None for path in held}
         self._note(changed)
         with atomic_write(self.path / "settings.json") as file:
             file.write((json.dumps(self.settings, indent=2, allow_nan=False) + "\n").encode())
@@ -321,6 +324,8 @@ class RunFolder:
             signal.signal(signal.SIGTERM, self._old_handler)
             self._old_handler = None
         self.close()
+        if kind is not None and issubclass(kind, ValueError) and self._saved < self.start:
+            self._take_back()
         if kind is not None and self._saved < 0:
             self._delete(*_WRITTEN)
             if self._new:
@@ -333,6 +338,15 @@ class RunFolder:
     def _delete(self, *patterns: str) -> None:
         for path in [path for pattern in patterns for path in self.path.glob(pattern)]:
             path.unlink()
+
+    def _take_back(self) -> None:
+        """Undo what resuming has written."""
+        for path, content in self._held.items():
+            if content is None:
+                path.unlink(missing_ok=True)
+            else:
+                with atomic_write(path) as file:
+                    file.write(content)
 
     def _wait_for_next_second(self) -> None:
         # TensorBoard reads event files by name, which holds the second of their making and then the process: one that
