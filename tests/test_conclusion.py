@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from swings import EXACT, recorded
 
-from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude
+from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude, remainder
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, Model, TwinError, infer, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
@@ -17,6 +17,8 @@ from torchsoro.sim2real.inference.remaining_error import by_richardson, by_sprea
 from torchsoro.sim2real.inference.visible import limit, remedies
 
 # The twin's own error ------------------------------------------------------------------------------------------------
+
+SHIFTS = np.linspace(-1.0, 1.0, 7)
 
 
 def test_richardson_finds_an_error_that_falls_with_the_square_of_the_edge():
@@ -51,7 +53,7 @@ def test_spread_of_equally_good_twins_is_priced_within_a_third_of_the_error_of_t
     data, nothing, _ = recorded(0.0, 2)
     off = draws(data, 7, 0.05, 3)
     variants = [tuple(r + d for r, d in zip(nothing.residuals, one, strict=True)) for one in off]
-    priced = by_spread(data, nothing, variants)
+    priced = by_spread(data, nothing, variants, SHIFTS)
     mean = tuple(np.mean(same, 0) for same in zip(*off, strict=True))
     for r, m, n in zip(priced.residuals, mean, nothing.residuals, strict=True):
         assert r - m == pytest.approx(n, abs=1e-12, nan_ok=True)
@@ -61,10 +63,22 @@ def test_spread_of_equally_good_twins_is_priced_within_a_third_of_the_error_of_t
     assert 0.03 < priced.numerics.time < 0.3
 
 
-def test_one_twin_has_no_spread():
+def test_what_grows_with_the_shift_of_planes_is_no_error():
     data, nothing, _ = recorded(0.0, 2)
-    with pytest.raises(ValueError, match="variants: 1, wanted two or more"):
-        by_spread(data, nothing, [nothing.residuals])
+    (way,) = draws(data, 1, 0.05, 3)
+    variants = [tuple(r + s * d for r, d in zip(nothing.residuals, way, strict=True)) for s in SHIFTS]
+    priced = by_spread(data, nothing, variants, SHIFTS)
+    assert priced.numerics.amplitude.max() < 1e-12
+    for r, n in zip(priced.residuals, nothing.residuals, strict=True):
+        assert r == pytest.approx(n, abs=1e-12, nan_ok=True)
+
+
+def test_two_twins_have_no_spread_and_shifts_are_theirs():
+    data, nothing, _ = recorded(0.0, 2)
+    with pytest.raises(ValueError, match="variants: 2, wanted three or more"):
+        by_spread(data, nothing, [nothing.residuals] * 2, SHIFTS[:2])
+    with pytest.raises(ValueError, match="wanted 3 that sum to zero"):
+        by_spread(data, nothing, [nothing.residuals] * 3, SHIFTS[:3])
 
 
 def test_a_difference_that_a_measurement_error_makes_is_no_error_of_the_twin():
@@ -151,6 +165,24 @@ def test_a_discrepancy_that_no_effect_explains_is_unknown():
     data, nothing, drag = recorded(0.3, 6)
     found = conclude(weighed(data, nothing, drag), limit=0.0)
     assert (found.kind, found.chosen) == ("unknown_physics", ())
+
+
+def test_a_discrepancy_that_is_no_larger_than_the_noise_is_nothing():
+    data, nothing, drag = recorded(0.03, 6)
+    weighing = weighed(data, nothing, drag)
+    assert MATTERS * data.size < remainder(data, weighing.null) < 1.1 * data.noise
+    found = conclude(weighing, limit=0.0)
+    assert (found.kind, found.chosen) == ("nothing_missing", ())
+
+
+def test_an_effect_that_leaves_less_than_the_noise_is_told_if_it_moves_more():
+    for effect, seed, chosen in ((0.03, 14, ("drag",)), (0.04, 15, ())):
+        data, nothing, drag = recorded(0.03, seed, effect=effect)
+        found = conclude(weighed(data, nothing, drag), limit=0.0)
+        (candidate,) = found.candidates
+        assert max(UNEXPLAINED * found.left, MATTERS * data.size) < candidate.left < data.noise
+        assert (candidate.left < candidate.size) == bool(chosen)
+        assert found.chosen == chosen
 
 
 def test_an_effect_beside_something_else_is_told_as_most_of_the_difference():
@@ -291,7 +323,8 @@ def test_an_effect_that_moves_the_body_as_the_twin_errs_is_not_told():
     variants = [[tuple(r + a * o for r, o in zip(m.residuals, off, strict=True)) for a in scales] for m in off_models]
     exact = conclude(weighed(data, *off_models), limit=0.0)
     assert exact.chosen == ("drag",)
-    priced = [by_spread(data, m, v) for m, v in zip(off_models, variants, strict=True)]
+    shifts = np.array([-5.0, 3.0, 1.0, -1.0, -3.0, 5.0])  # in no order with the scales
+    priced = [by_spread(data, m, v, shifts) for m, v in zip(off_models, variants, strict=True)]
     assert conclude(weighed(data, *priced), limit=0.0).kind == "nothing_missing"
 
 

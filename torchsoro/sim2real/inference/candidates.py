@@ -177,7 +177,7 @@ def _corrected(
 
 def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], edges: float) -> Linearised | None:
     """A model by equally good twins, with the ratio of edges of cells; none where a simulation broke down."""
-    return None if model is None or not variants else by_spread(data, model, variants, model.residuals, edges)
+    return None if model is None or not variants else by_spread(data, model, variants, GAPS, model.residuals, edges)
 
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:

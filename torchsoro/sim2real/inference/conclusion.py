@@ -239,10 +239,11 @@ class Weighing:
             missing = 1 - probabilities[NOTHING]
             least = min(groups, key=lambda name: left[name]) if groups else None
             count = independent(self.null.left if least is None else self.groups[least][0].left)
-            rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(self.unexplained)}
+            seen = math.hypot(self.unexplained, self.data.noise)
+            rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(seen)}
             for name, modes in groups.items():
                 own = len(modes[0].near.model.own)
-                size = max(left[name], self.data.noise)
+                size = math.hypot(left[name], self.data.noise)
                 rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         found = [
@@ -359,6 +360,9 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
             told[NOTHING] += c.probability
         elif c.best.matters and c.left > max(UNEXPLAINED * left, c.best.near.numerics.size, null.near.numerics.size):
             told[UNKNOWN] += c.probability
+        elif c.left > max(c.size, c.best.near.numerics.size):
+            # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.
+            told[UNKNOWN if left > data.noise else NOTHING] += c.probability
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name
             told[name] = told.get(name, 0.0) + c.probability

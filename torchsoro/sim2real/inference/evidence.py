@@ -64,12 +64,14 @@ class TwinError:
         draws: Errors as they may be, as far as beliefs and measurement errors do not take them up.
         modes: Of each trial, in proportion to the draws, errors that move all markers together, each times an unknown
             of unit variance [T, M, A, R] m; none if empty.
+        chance: Root mean square of what hangs on which node touches when [m].
     """
 
     amplitude: np.ndarray
     time: float = NOISE_TIME
     draws: tuple[Motions, ...] = ()
     modes: Motions = ()
+    chance: float = 0.0
 
     @property
     def size(self) -> float:
@@ -346,9 +348,13 @@ def ranges(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray]:
 
 
 def least_that_matters(data: Data, numerics: TwinError) -> float:
-    """Ln s of the least discrepancy that matters: less than the twin's price may be its own error in another form."""
+    """Ln s of the least discrepancy that matters.
+
+    Less than the twin's price may be its own error in another form. Less than the noise is seen in long recordings, but
+    no twin of another's body is as good: where nothing was missing, up to two thirds of the noise were left.
+    """
     least, most = data.shares
-    return math.log(min(max(least, numerics.size / data.size), 0.9 * most))
+    return math.log(min(max(least, numerics.size / data.size, data.noise / data.size), 0.9 * most))
 
 
 def _discrepancy(x: np.ndarray) -> Discrepancy:

@@ -7,9 +7,10 @@ the finer one (Richardson 1911),
 
 Contact: which node touches when is decided by distances far below a cell, and motion after that differs by more than
 what finer cells change. Twins whose planes are shifted below a cell are equally good: R of them are draws of one
-distribution, and so is nature. Their mean predicts best, and its error has the covariance
+distribution, and so is nature. What grows in proportion to the shift g is no chance, but what a plane elsewhere does;
+where planes are is stated. Beside that line, their mean at no shift predicts best, and its error has the covariance
 
-    S = (1 + 1/R) 1/(R - 1) sum_r (y_r - mean) (y_r - mean)',
+    S = (1 + 1/R) 1/(R - 2) sum_r d_r d_r',    d_r = y_r - mean - g_r sum_q g_q y_q / sum_q g_q^2,    sum_q g_q = 0,
 
 to which the error of the cells is added, of order one where bodies touch.
 
@@ -35,7 +36,7 @@ from torchsoro.sim2real.inference.evidence import (
     time_range,
 )
 from torchsoro.sim2real.inference.laplace import posterior
-from torchsoro.sim2real.inference.observed import Data, Motions
+from torchsoro.sim2real.inference.observed import Data, Motions, size_of
 from torchsoro.sim2real.inference.state_space import total
 
 ORDER = 2  # of convergence with the edge of the cells, of smooth motion
@@ -63,7 +64,12 @@ def by_richardson(data: Data, near: Linearised, coarser: Motions, ratio: float) 
 
 
 def by_spread(
-    data: Data, near: Linearised, variants: Sequence[Motions], coarser: Motions | None = None, ratio: float = math.inf
+    data: Data,
+    near: Linearised,
+    variants: Sequence[Motions],
+    shifts: np.ndarray,
+    coarser: Motions | None = None,
+    ratio: float = math.inf,
 ) -> Linearised:
     """The mean of equally good twins, with the error that this has, in each trial by itself.
 
@@ -75,20 +81,30 @@ def by_spread(
         data: Recordings.
         near: Of which residuals do not count.
         variants: Residuals by each of R twins.
+        shifts: Of their planes [R], which sum to zero.
         coarser: Residuals by a twin with larger cells.
         ratio: Edge of its cells over that of the variants'.
 
     Raises:
-        ValueError: for fewer than two variants, or a ratio that is not above one.
+        ValueError: for fewer than three variants, shifts that are not theirs or do not sum to zero, or a ratio that is
+            not above one.
     """
     count = len(variants)
-    if count < 2:
-        raise ValueError(f"variants: {count}, wanted two or more twins")
+    if count < 3:
+        raise ValueError(f"variants: {count}, wanted three or more twins, as two are always on a line")
+    if len(shifts) != count or abs(shifts.sum()) > 1e-9 * np.abs(shifts).max():
+        raise ValueError(f"shifts = {shifts}, wanted {count} that sum to zero")
     if not ratio > 1:
         raise ValueError(f"ratio = {ratio:g}, wanted one above 1: the other twin has larger cells")
     mean = tuple(np.mean(same, 0) for same in zip(*variants, strict=True))
-    factor = math.sqrt((1 + 1 / count) * count / (count - 1))
-    draws = [cleared(data, near, tuple(factor * (r - m) for r, m in zip(one, mean, strict=True))) for one in variants]
+    line = tuple(np.tensordot(shifts / (shifts @ shifts), np.stack(same), 1) for same in zip(*variants, strict=True))
+    factor = math.sqrt((1 + 1 / count) * count / (count - 2))
+    chance = [
+        tuple(factor * (r - m - g * b) for r, m, b in zip(one, mean, line, strict=True))
+        for one, g in zip(variants, shifts, strict=True)
+    ]
+    draws = [cleared(data, near, one) for one in chance]
+    size = math.sqrt(float(np.mean([size_of(draw) ** 2 for draw in draws])))
     modes = [tuple(d / math.sqrt(count) for d in draw) for draw in draws]
     if coarser is not None:
         share = 1 / (ratio**TOUCHING - 1)
@@ -96,7 +112,7 @@ def by_spread(
         draws.append(modes[-1])
     process = _process(data, draws)
     together = tuple(np.stack(same, -1) for same in zip(*modes, strict=True))
-    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together))
+    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together, chance=size))
 
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:

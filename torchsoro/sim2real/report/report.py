@@ -258,8 +258,8 @@ def _considered(page: Document, e: Explanation) -> None:
             rows,
             "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the "
             "least that it leaves of the difference beyond noise and the simulation's own error; an effect that leaves "
-            "more than a fifth of it counts as none of the known ones, and one that changes the motion by less than "
-            "matters as nothing.",
+            "more than a fifth of it, and more than the noise, counts as none of the known ones, and one that changes "
+            "the motion by less than matters as nothing.",
         )
 
 
