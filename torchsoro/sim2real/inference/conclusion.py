@@ -352,13 +352,14 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
     names, left = {c.name: c for c in candidates}, weighing.unexplained
+    faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
         # An extension that moves as what it extends adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
         plain = [d for d in plain if apart(c.best, d.best) < least]
         if c.size < least:
             told[NOTHING] += c.probability
-        elif c.best.matters and c.left > max(UNEXPLAINED * left, c.best.near.numerics.size, null.near.numerics.size):
+        elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
             told[UNKNOWN] += c.probability
         elif c.left > max(c.size, c.best.near.numerics.size):
             # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.

@@ -64,14 +64,12 @@ class TwinError:
         draws: Errors as they may be, as far as beliefs and measurement errors do not take them up.
         modes: Of each trial, in proportion to the draws, errors that move all markers together, each times an unknown
             of unit variance [T, M, A, R] m; none if empty.
-        chance: Root mean square of what hangs on which node touches when [m].
     """
 
     amplitude: np.ndarray
     time: float = NOISE_TIME
     draws: tuple[Motions, ...] = ()
     modes: Motions = ()
-    chance: float = 0.0
 
     @property
     def size(self) -> float:

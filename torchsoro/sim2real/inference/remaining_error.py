@@ -36,7 +36,7 @@ from torchsoro.sim2real.inference.evidence import (
     time_range,
 )
 from torchsoro.sim2real.inference.laplace import posterior
-from torchsoro.sim2real.inference.observed import Data, Motions, size_of
+from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.state_space import total
 
 ORDER = 2  # of convergence with the edge of the cells, of smooth motion
@@ -104,7 +104,6 @@ def by_spread(
         for one, g in zip(variants, shifts, strict=True)
     ]
     draws = [cleared(data, near, one) for one in chance]
-    size = math.sqrt(float(np.mean([size_of(draw) ** 2 for draw in draws])))
     modes = [tuple(d / math.sqrt(count) for d in draw) for draw in draws]
     if coarser is not None:
         share = 1 / (ratio**TOUCHING - 1)
@@ -112,7 +111,7 @@ def by_spread(
         draws.append(modes[-1])
     process = _process(data, draws)
     together = tuple(np.stack(same, -1) for same in zip(*modes, strict=True))
-    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together, chance=size))
+    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together))
 
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:

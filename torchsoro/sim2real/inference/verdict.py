@@ -14,7 +14,6 @@ from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses, weigh, weighing_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
-from torchsoro.sim2real.inference.decision import VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import predict
@@ -25,7 +24,7 @@ FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
 ROUNDS = 3  # of that, at most
-CLOSELY = (6, 3, 3)  # of motions that hang on chance, modes with an effect that are looked at closely, round by round
+CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
 AHEAD = 3  # ends of searches that are always weighed
 FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of the running
@@ -137,14 +136,13 @@ def weighed(
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     known = weigh(problem, [null_model, *strained, *_other_valleys(problem, null_model), *_running(problem, ends)])
     weighing = weighing_of(problem, [p for _, p in known], names)
-    closely = _hangs_on_chance(weighing)
     for k in range(ROUNDS):
-        far = _looked_at_again(weighing, k) if closely else _far(weighing)
+        far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
         if not far:
             break
-        again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far], closely=closely)
+        again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far], closely=True)
         sound = {p.near.model.name for _, p in again}
-        if not closely:  # what breaks down there stays as it was
+        if not problem.rough:  # what breaks down there stays as it was
             known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]
         elif k == 0:  # evidence with errors that were told otherwise is no measure
             known = [one for one in known if one[1].near.model.name not in sound]
@@ -179,23 +177,10 @@ def weighed(
     return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
 
 
-def _hangs_on_chance(weighing: Weighing) -> bool:
-    """Whether motions differ visibly by which node touches when, if those by a finer twin do a few times as much.
-
-    They do, by up to 2.5 times, of bodies that walk; a pad that is pulled and a block that slides stay down instead.
-    """
-    return VISIBLE * max(p.near.numerics.chance for p in _leading(weighing)) > weighing.data.noise
-
-
-def _leading(weighing: Weighing) -> list[Posterior]:
-    """The most probable mode without an effect, and those of the names that lead."""
-    modes = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
-    return [weighing.null, *modes[:POLISHED]]
-
-
 def _far(weighing: Weighing) -> list[Posterior]:
     """Of what leads, modes that are far from where they were linearised."""
-    return [p for p in _leading(weighing) if _moved(p)]
+    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
+    return [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]
 
 
 def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
