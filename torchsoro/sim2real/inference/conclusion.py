@@ -347,7 +347,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
-    # What does not matter is nothing; what leaves much of the difference, more than the twin may err, is not missing.
+    # What does not matter is nothing; what leaves much, more than noise and than the twin may err, is not missing.
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
