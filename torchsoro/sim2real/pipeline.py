@@ -21,7 +21,7 @@ from torchsoro.sim2real.inference.believed_motion import against_belief
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
-from torchsoro.sim2real.inference.heldout import Prediction, at_clocks_of, predict
+from torchsoro.sim2real.inference.heldout import Prediction, at_clocks_of, before_and_after
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
@@ -104,7 +104,7 @@ def shown(
 ) -> tuple[list[Trial], tuple[Prediction, ...], tuple[Prediction, ...]]:
     """The trials that do not break down, as believed and as explained."""
     for asked in ([*trials, *kept], trials):
-        before, after = (tuple(predict(problem, best, asked, believed=b)) for b in (True, False))
+        before, after = map(tuple, before_and_after(problem, best, asked))
         if before and after:
             break
         note("A held-out trial cannot be simulated with what was found, and is not shown.")

@@ -10,9 +10,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
+from torchsoro.sim2real.inference.discretization import GAPS, shifted
 from torchsoro.sim2real.inference.evidence import (
     Linearised,
     Model,
@@ -31,7 +31,6 @@ from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
-GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
 WEAK = 0.1  # strength of a response, over that of the weakest probe point: it is linear there
@@ -155,7 +154,8 @@ def _corrected(
         touching = _touching(problem, by_fine, fits)
         return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
-    sharp = [_residuals(problem, f, motions) for f, motions in zip(fits, by_fine.simulate(ask), strict=True)]
+    motions = by_fine.simulate(ask)
+    sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
     if problem.rough:
         # What a plane's place changes, by the twin in use: it is of that order in the finer one.
         found: list[Linearised | None] = []
@@ -163,6 +163,12 @@ def _corrected(
             moved = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
             found.append(_spread(data, model, moved, edges))
         return found
+    if problem.touches:
+        # Chance is small, and about the same at all points: as it is in the finer twin at the setup as stated.
+        touching = [
+            _with_planes_moved(problem, f, m) if finer else [] for f, m, finer in zip(fits, motions, sharp, strict=True)
+        ]
+        return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
     middle = between(problem.twin, fine)
     by_middle = problem.only(problem.trials, twin=middle, discretization=DiscretizationError())
     dull = [_residuals(problem, f, motions) for f, motions in zip(fits, by_middle.simulate(ask), strict=True)]
@@ -182,10 +188,18 @@ def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], e
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
     """Residuals with planes a little nearer and farther, of each fit; none where one breaks down."""
-    wall = WallOffset()
-    gaps = GAPS[:, None] / wall.quantities[0].scale
-    ask = [((*f.effects, wall), np.concatenate([np.tile(f.point, (len(gaps), 1)), gaps], 1)) for f in fits]
-    return [_residuals(problem, f, motions) for f, motions in zip(fits, twin.simulate(ask), strict=True)]
+    moved = shifted(twin, [(f.effects, f.point[None]) for f in fits], GAPS)
+    return [_residuals(problem, f, motions) for f, motions in zip(fits, moved, strict=True)]
+
+
+def _with_planes_moved(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTrajectory]) -> list[Motions]:
+    """Residuals with planes a little nearer and farther, by what that adds to the setup as stated."""
+    alone = [m.alone() for m in motions]
+    moved = [
+        [m.plus(by[t.name]) for m, t in zip(alone, problem.trials, strict=True)]
+        for by in problem.discretization.touching
+    ]
+    return [_left(problem, variant, fit.errors) for variant in moved]
 
 
 def _residuals(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTrajectory]) -> list[Motions]:

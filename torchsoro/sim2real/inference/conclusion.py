@@ -214,8 +214,8 @@ class Weighing:
 
     @cached_property
     def unexplained(self) -> float:
-        """What the model without an effect leaves, its beliefs within their tolerances [m]."""
-        return max(remainder(self.data, self.bounded), self.data.noise)
+        """What the model without an effect leaves, its beliefs within their tolerances, see :func:`remainder` [m]."""
+        return remainder(self.data, self.bounded)
 
     def _ln_prior(self, model: Model) -> float:
         """Of a name; a model without effects stands for what has none."""
@@ -351,7 +351,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
     told[NOTHING] = probabilities[NOTHING]
     told[UNKNOWN] = probabilities[UNKNOWN]
-    names, left = {c.name: c for c in candidates}, weighing.unexplained
+    names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
     faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
         # An extension that moves as what it extends adds nothing.

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-import torch
 from scipy.interpolate import Akima1DInterpolator
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial
+from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, added
+from torchsoro.sim2real.inference.gauss_newton import STEP
+from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, Likelihood, Request, added
 from torchsoro.sim2real.inference.observation import Priors
+from torchsoro.sim2real.inference.observed import Motions, size_of
+from torchsoro.sim2real.inference.remaining_error import beside_line
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.twin.batch import THREADS, simulate
+from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
-GAP = 2e-5  # distance by which planes are moved to see how much the moment of contact matters [m]
+GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
+NEARER = 2e-5 * np.array([-1.0, 1.0])  # the same, of the twin in use
 # Of recordings without measurement errors.
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
 OWN = 1 / 3  # share of the difference to a supplied simulation that may change with an effect
@@ -55,17 +59,19 @@ def measure(
     here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors)
-    shifted = DiscretizationError(shift=shift)
-    own = _believed(FitProblem(experiment, twin, trials=everything, discretization=shifted, **common))
+    known = DiscretizationError(shift=shift)
+    own = _believed(FitProblem(experiment, twin, trials=everything, discretization=known, **common))
     correction = added(everything, own, other)
-    here = FitProblem(experiment, twin, trials=trials, **common)
+    here = FitProblem(experiment, twin, trials=trials, discretization=known, **common)
+    touching, chance = (), math.inf
+    if there.touches and not any(t.simulated for t in trials):
+        touching, chance = _chance(there.only(trials))
     # The error falls with the square of the cell size, which gives that of the finer twin from the difference of the
     # two; impacts on planes do not converge at that order, so that there the whole difference counts.
     ratio = max((fine.count / twin.count) ** (1 / 3), 1.1)
     smooth = 1 / (ratio**2 - 1)
     shares = [OWN if t.simulated else 1.0 if s.planes else smooth for t, s in zip(trials, here.scenarios, strict=True)]
-    deviations = [_apart(here, other[: len(trials)], shares)]
-    deviations += [_apart(here, touching, [0.5] * len(trials)) for touching in _touching(here)]
+    deviations = _apart(here, [(other[: len(trials)], shares), *((m, [0.5] * len(trials)) for m in _touching(here))])
     found = {}
     for i, (trial, motion) in enumerate(zip(trials, own, strict=False)):
         left = SAFETY * np.sqrt(sum(d[i] ** 2 for d in deviations))
@@ -79,27 +85,49 @@ def measure(
         deviation=found,
         shift=shift,
         correction=correction,
+        touching=touching,
+        chance=chance,
         edges=(twin.edge, fine.edge),
         walls=thinnest,
     )
 
 
+def shifted(problem: Likelihood, points: Sequence[Request], gaps: np.ndarray) -> list[list[MarkerTrajectory]]:
+    """Motions of all trials with planes a little nearer and farther, for each request at one point.
+
+    Args:
+        problem: By whose twin.
+        points: Effects, and where [1, K].
+        gaps: By which planes are moved, towards the body if positive [R] m.
+    """
+    wall = WallOffset()
+    by = gaps[:, None] / wall.quantities[0].scale
+    asked = [((*effects, wall), np.concatenate([np.tile(at, (len(by), 1)), by], 1)) for effects, at in points]
+    return problem.simulate(asked)
+
+
 def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
-    if not here.rough:
+    if not here.touches:
         return []
-    moved = [
-        s.replace(
-            planes=tuple(
-                dataclasses.replace(g, offset=g.offset + GAP * torch.tensor([-1.0, 1.0], dtype=torch.float64))
-                for g in s.planes
-            )
-        )
-        for s in here.scenarios
+    (motions,) = shifted(here, [((), np.zeros((1, len(here.common))))], NEARER)
+    return [[m.alone(k) for m in motions] for k in range(len(NEARER))]
+
+
+def _chance(fine: FitProblem) -> tuple[tuple[Mapping[str, MarkerTrajectory], ...], float]:
+    """What moved planes add to the motion as stated, by shift, and how much of that is chance [m]."""
+    (motions,) = shifted(fine, [((), np.zeros((1, len(fine.common))))], GAPS)
+    if not all(m.sound.all() for m in motions):
+        return (), math.inf
+    middle = [m.alone(len(GAPS) // 2) for m in motions]
+    moved = [[m.alone(k) for m in motions] for k in range(len(GAPS))]
+    none = np.zeros(len(fine.observation.deviations))
+    seen: list[Motions] = [
+        tuple(fine.observation.observe(m, i, none) for i, m in enumerate(variant)) for variant in moved
     ]
-    motions = simulate(here.twin, moved, threads=here.threads)
-    # A trial without planes moves in one way only.
-    return [[m.alone(min(k, len(m.position) - 1)) for m in motions] for k in range(2)]
+    _, draws = beside_line(seen, GAPS)
+    chance = math.sqrt(sum(size_of(d) ** 2 for d in draws) / len(draws))
+    return tuple(added(fine.trials, middle, variant) for variant in moved), chance
 
 
 def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:
@@ -118,21 +146,37 @@ def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:
     )
 
 
-def _apart(here: FitProblem, other: Sequence[MarkerTrajectory], shares: Sequence[float]) -> list[np.ndarray]:
-    """Shares of how far other motions are off, once modulus, pressure and measurement errors are fitted.
+def _apart(
+    here: FitProblem, others: Sequence[tuple[Sequence[MarkerTrajectory], Sequence[float]]]
+) -> list[list[np.ndarray]]:
+    """Shares of how far other motions are off, once modulus, pressure and measurement errors are fitted to them.
+
+    They are near, so that the response to these is linear.
+
+    Args:
+        here: By whose twin.
+        others: Motions of all trials, and the share of each.
 
     Returns:
-        For each trial [M, A] m.
+        For each of the others and each trial [M, A] m.
     """
-    recorded = _recordings_of(here, other)
-    fit = here.only(recorded).fit([((), None)], rounds=2)[0]
-    if fit is None:
-        return [np.zeros_like(here.discretization.of(t)) for t in here.trials]
-    return [
-        share * np.sqrt(((t.recording.position - seen) ** 2).mean(0))
-        for t, seen, share in zip(recorded, fit.seen, shares, strict=True)
-        if t.recording is not None
-    ]
+    none, count = np.zeros(len(here.observation.deviations)), len(here.common)
+    motions = here.simulate([((), np.concatenate([np.zeros((1, count)), STEP * np.eye(count)]))])[0]
+    seen, columns = [], []
+    for i, motion in enumerate(motions):
+        own, by = here.observation.linearise(motion.alone(0), i, none)
+        beside = [here.observation.observe(motion.alone(1 + k), i, none) for k in range(count)]
+        seen.append(own)
+        columns.append(np.concatenate([*((x - own)[..., None] / STEP for x in beside), by], -1))
+    X = np.concatenate([c.reshape(-1, c.shape[-1]) for c in columns]) / here.noise
+    H = X.T @ X + np.diag(np.concatenate([np.full(count, WITHIN), 1 / here.observation.deviations]) ** 2)
+    found = []
+    for other, shares in others:
+        off = [here.observation.observe(m, i, none) - x for i, (m, x) in enumerate(zip(other, seen, strict=True))]
+        at = np.linalg.solve(H, X.T @ np.concatenate([x.ravel() for x in off]) / here.noise)
+        left = (x - c @ at for x, c in zip(off, columns, strict=True))
+        found.append([share * np.sqrt((x**2).mean(0)) for x, share in zip(left, shares, strict=True)])
+    return found
 
 
 def _recordings_of(here: FitProblem, motions: Sequence[MarkerTrajectory]) -> list[Trial]:

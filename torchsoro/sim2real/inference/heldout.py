@@ -10,6 +10,7 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
@@ -53,22 +54,30 @@ def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed:
     Returns:
         A prediction of each trial; empty where the simulation of one breaks down.
     """
-    return predict_all(problem, [fit], trials, believed=believed)[0]
+    there = _there(problem, trials)
+    (motions,) = there.simulate([_asked(there, fit, believed)])
+    return _predicted(problem, there, fit, motions)
 
 
-def predict_all(
-    problem: FitProblem, fits: Sequence[Fit], trials: Sequence[Trial], *, believed: bool = False
-) -> list[list[Prediction]]:
-    """:func:`predict` for several fits, simulated together."""
+def before_and_after(
+    problem: FitProblem, fit: Fit, trials: Sequence[Trial]
+) -> tuple[list[Prediction], list[Prediction]]:
+    """:func:`predict` of what is believed and of a fit, simulated together."""
+    there = _there(problem, trials)
+    before, after = there.simulate([_asked(there, fit, believed) for believed in (True, False)])
+    return _predicted(problem, there, fit, before), _predicted(problem, there, fit, after)
+
+
+def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
+    """The trials, by the finer twin where there is one."""
     there = problem.only(trials, slips=())
     if there.fine is not None and not there.stated:
         there = there.only(trials, twin=there.fine, discretization=DiscretizationError())
-    still = np.zeros((1, len(there.common)))
-    simulated = there.simulate([((), still) if believed else (fit.effects, fit.point[None]) for fit in fits])
-    return [
-        _predicted(problem, there, fit, motions) if all(m.sound.all() for m in motions) else []
-        for fit, motions in zip(fits, simulated, strict=True)
-    ]
+    return there
+
+
+def _asked(there: FitProblem, fit: Fit, believed: bool) -> Request:
+    return ((), np.zeros((1, len(there.common)))) if believed else (fit.effects, fit.point[None])
 
 
 def at_clocks_of(
@@ -98,7 +107,9 @@ def _errors(problem: FitProblem, there: FitProblem, fit: Fit) -> np.ndarray:
 def _predicted(
     problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerTrajectory]
 ) -> list[Prediction]:
-    found = []
+    found: list[Prediction] = []
+    if not all(m.sound.all() for m in motions):
+        return found
     for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
         assert trial.recording is not None
         one = motion.alone()

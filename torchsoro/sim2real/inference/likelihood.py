@@ -26,6 +26,7 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
+CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
@@ -132,9 +133,14 @@ class Likelihood:
         return tuple(self.twin.scenario(t).replace(until=self.observation.until(i)) for i, t in enumerate(self.trials))
 
     @property
-    def rough(self) -> bool:
-        """Whether a trial has planes: what touches when makes chi-squared rough."""
+    def touches(self) -> bool:
+        """Whether a trial has planes."""
         return any(s.planes for s in self.scenarios)
+
+    @property
+    def rough(self) -> bool:
+        """Whether what touches when makes chi-squared rough: bodies on planes, unless their motion is known not to."""
+        return self.touches and self.discretization.chance > CALM * self.noise
 
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
 
 import numpy as np
-from scipy.stats import norm, t
+from scipy.special import ndtr, ndtri, stdtr, stdtrit
 
 
 @dataclass(frozen=True)
@@ -46,30 +47,41 @@ class Prior:
         if math.isinf(self.scale) and not math.isfinite(self.high - self.low):
             raise ValueError(f"low = {self.low:g}, high = {self.high:g}: wanted finite bounds of a uniform prior")
 
-    @property
+    @cached_property
     def ln_mass(self) -> float:
         """Ln of the integral of the distribution within the bounds."""
         if math.isinf(self.scale):
             return math.log(self.high - self.low)
+        low, high = self._shares
+        return math.log(high - low)
+
+    @cached_property
+    def _shares(self) -> tuple[float, float]:
+        """Of the whole distribution, below the bounds."""
         ends = np.array([self.low, self.high]) / self.scale
-        low, high = norm.cdf(ends) if math.isinf(self.freedom) else t.cdf(ends, self.freedom)
-        return math.log(float(high) - float(low))
+        low, high = ndtr(ends) if math.isinf(self.freedom) else stdtr(self.freedom, ends)
+        return float(low), float(high)
 
     def quantile(self, u: np.ndarray) -> np.ndarray:
         """Values below which the distribution has shares u of its mass, 0 to 1."""
         if math.isinf(self.scale):
             return self.low + u * (self.high - self.low)
-        law = norm if math.isinf(self.freedom) else t(self.freedom)
-        low, high = law.cdf(np.array([self.low, self.high]) / self.scale)
-        return np.clip(self.scale * law.ppf(low + u * (high - low)), self.low, self.high)
+        low, high = self._shares
+        share = low + u * (high - low)
+        z = ndtri(share) if math.isinf(self.freedom) else stdtrit(self.freedom, share)
+        return np.clip(self.scale * z, self.low, self.high)
 
     def ln_density(self, x: float) -> float:
         """Ln of the density at a value within the bounds."""
         if math.isinf(self.scale):
             return -self.ln_mass
-        z = x / self.scale
-        ln_p = norm.logpdf(z) if math.isinf(self.freedom) else t.logpdf(z, self.freedom)
-        return float(ln_p) - math.log(self.scale) - self.ln_mass
+        z, n = x / self.scale, self.freedom
+        if math.isinf(n):
+            ln_p = -0.5 * (z**2 + math.log(2 * math.pi))
+        else:
+            ln_p = math.lgamma((n + 1) / 2) - math.lgamma(n / 2) - 0.5 * math.log(n * math.pi)
+            ln_p -= 0.5 * (n + 1) * math.log1p(z**2 / n)
+        return ln_p - math.log(self.scale) - self.ln_mass
 
     def weight(self, x: float) -> float:
         """The w of -ln density = w x^2 / 2 + const near a value: the weight of iterated least squares."""

@@ -96,14 +96,9 @@ def by_spread(
         raise ValueError(f"shifts = {shifts}, wanted {count} that sum to zero")
     if not ratio > 1:
         raise ValueError(f"ratio = {ratio:g}, wanted one above 1: the other twin has larger cells")
-    mean = tuple(np.mean(same, 0) for same in zip(*variants, strict=True))
-    line = tuple(np.tensordot(shifts / (shifts @ shifts), np.stack(same), 1) for same in zip(*variants, strict=True))
-    factor = math.sqrt((1 + 1 / count) * count / (count - 2))
-    chance = [
-        tuple(factor * (r - m - g * b) for r, m, b in zip(one, mean, line, strict=True))
-        for one, g in zip(variants, shifts, strict=True)
-    ]
-    draws = [cleared(data, near, one) for one in chance]
+    mean, chance = beside_line(variants, shifts)
+    factor = math.sqrt(1 + 1 / count)
+    draws = [cleared(data, near, tuple(factor * d for d in one)) for one in chance]
     modes = [tuple(d / math.sqrt(count) for d in draw) for draw in draws]
     if coarser is not None:
         share = 1 / (ratio**TOUCHING - 1)
@@ -112,6 +107,24 @@ def by_spread(
     process = _process(data, draws)
     together = tuple(np.stack(same, -1) for same in zip(*modes, strict=True))
     return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together))
+
+
+def beside_line(variants: Sequence[Motions], shifts: np.ndarray) -> tuple[Motions, list[Motions]]:
+    """The mean of motions with planes that are shifted, and draws of what is not in proportion to the shift.
+
+    Args:
+        variants: Motions or residuals with each of R shifts.
+        shifts: Of the planes [R], which sum to zero.
+    """
+    count = len(variants)
+    mean = tuple(np.mean(same, 0) for same in zip(*variants, strict=True))
+    line = tuple(np.tensordot(shifts / (shifts @ shifts), np.stack(same), 1) for same in zip(*variants, strict=True))
+    factor = math.sqrt(count / (count - 2))
+    draws = [
+        tuple(factor * (r - m - g * b) for r, m, b in zip(one, mean, line, strict=True))
+        for one, g in zip(variants, shifts, strict=True)
+    ]
+    return mean, draws
 
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
@@ -139,15 +152,12 @@ def _process(data: Data, draws: Sequence[Motions]) -> TwinError:
     if not amplitude.any():
         return TwinError(amplitude=amplitude, draws=tuple(draws))
     quiet = dataclasses.replace(data, noise=FAINT * float(amplitude.mean()))
+    columns = [np.stack(same, -1) for same in zip(*draws, strict=True)]
 
     def lost(x: np.ndarray) -> float:
         models = errors(quiet, TwinError(amplitude=math.exp(x[0]) * amplitude, time=math.exp(x[1])), Discrepancy())
-        value = 0.0
-        for draw in draws:
-            for trial, model, d in zip(data.trials, models, draw, strict=True):
-                gram = model.gram([(trial.time, d[..., None])])
-                value += 0.5 * (float(gram.product[0, 0]) + gram.ln_det)
-        return value
+        grams = (model.gram([(t.time, d)]) for t, model, d in zip(data.trials, models, columns, strict=True))
+        return 0.5 * sum(float(np.trace(g.product)) + len(draws) * g.ln_det for g in grams)
 
     low, high = time_range(data)
     found = minimize(

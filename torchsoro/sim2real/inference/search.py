@@ -41,6 +41,8 @@ ENDS = 10  # that are weighed, at most
 ENDS_ROUGH = 16  # the same where bodies touch planes
 PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
 FIRST = 2  # of them
+AHEAD = 3  # ends of searches that are always in the running
+FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of it
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
@@ -162,15 +164,22 @@ def _refined(
     problem: FitProblem, null_model: Fit, best: list[Fit], report: Callable[[str], None]
 ) -> tuple[FitProblem, Fit, list[Fit]]:
     """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin."""
-    leading = [null_model, *best[:COMPLETED]]
+    leading, ends = [null_model, *best[:COMPLETED]], {}
     for _ in range(REFINED):
         problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
         leading = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
         report("by the finer twin: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in leading))
+        ends |= {f.effects: f for f in leading}
+        leading = [f for f in leading if not f.effects or f in running(leading)]
     # Where all of them break down once they are corrected, they are told as they were.
-    refined = _best(f for f in leading if f.effects) or best
-    return problem, next((f for f in leading if not f.effects), null_model), refined
+    return problem, ends.get((), null_model), _best(f for f in ends.values() if f.effects) or best
+
+
+def running(ends: Iterable[Fit]) -> list[Fit]:
+    """Ends of searches with an effect that may be the most probable, best first."""
+    order = sorted((f for f in ends if f.effects), key=lambda fit: fit.chi2)
+    return [f for k, f in enumerate(order) if k < AHEAD or f.chi2 < FARTHER * max(order[0].chi2, order[0].samples)]
 
 
 def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:

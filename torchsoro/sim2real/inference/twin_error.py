@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,10 @@ class DiscretizationError:
         shift: Of ln of the modulus, and of the pressure, with which the twin moves as a finer one does; zero if empty.
         correction: By trial, what the finer twin then adds to the motion that is believed [S, M, ...].
         own: By effects, the same with them, where it is known.
+        touching: What the finer twin adds where planes are a little elsewhere, by trial, for each of some shifts; none
+            without planes, or if they were not moved.
+        chance: Root mean square of what of that is not in proportion to the shift, so that which node touches when
+            decides it [m]; not finite if it was not measured.
         edges: Of the cells of the twins that were compared [m], the one in use first.
         walls: Cells through the thinnest wall, or edge, of each.
     """
@@ -32,6 +37,8 @@ class DiscretizationError:
     shift: tuple[float, ...] = ()
     correction: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
     own: Mapping[tuple[Hypothesis, ...], Mapping[str, MarkerTrajectory]] = field(default_factory=dict)
+    touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
+    chance: float = math.inf
     edges: tuple[float, ...] = ()
     walls: tuple[int, ...] = ()
 

@@ -16,18 +16,17 @@ from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses,
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.heldout import predict
+from torchsoro.sim2real.inference.heldout import before_and_after
 from torchsoro.sim2real.inference.observed import Data
-from torchsoro.sim2real.inference.search import search, within_tolerances
+from torchsoro.sim2real.inference.search import running, search, within_tolerances
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
+HOPELESS = 40.0  # in ln of a probability: what is so far behind the best is not; it moved by up to 30 in that
 ROUNDS = 3  # of that, at most
 CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
-AHEAD = 3  # ends of searches that are always weighed
-FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of the running
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -134,7 +133,10 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *_other_valleys(problem, null_model), *_running(problem, ends)])
+    known = weigh(
+        problem,
+        [null_model, *strained, *_other_valleys(problem, null_model), *(ends if problem.rough else running(ends))],
+    )
     weighing = weighing_of(problem, [p for _, p in known], names)
     for k in range(ROUNDS):
         far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
@@ -178,9 +180,11 @@ def weighed(
 
 
 def _far(weighing: Weighing) -> list[Posterior]:
-    """Of what leads, modes that are far from where they were linearised."""
-    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)
-    return [p for p in (weighing.null, *leading[:POLISHED]) if _moved(p)]
+    """Of what may still be told, modes that are far from where they were linearised."""
+    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)[:POLISHED]
+    least = weighing.best.ln_evidence - HOPELESS * weighing.kappa
+    asked = (weighing.null, *(p for p in leading if p.ln_evidence > least))
+    return [p for p in asked if _moved(p, weighing.kappa)]
 
 
 def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
@@ -197,15 +201,6 @@ def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
     asked = [*nothing[:NOTHING], *modes[: CLOSELY[before]]]
     # From where the last look leads, as the one in the middle has been followed before.
     return [weighing.latest(p) for p in asked] if before else asked
-
-
-def _running(problem: FitProblem, ends: Sequence[Fit]) -> list[Fit]:
-    """Ends of searches that may be the most probable; all of them where the twin is too rough to say."""
-    if problem.rough or not ends:
-        return list(ends)
-    least = min(max(f.chi2, f.samples) for f in ends)
-    order = sorted(ends, key=lambda fit: fit.chi2)
-    return [f for k, f in enumerate(order) if k < AHEAD or f.chi2 < FARTHER * least]
 
 
 def _other_valleys(problem: FitProblem, null_model: Fit) -> list[Fit]:
@@ -225,10 +220,10 @@ def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
     return next(fit for fit, p in known if p.near is found.near)
 
 
-def _moved(found: Posterior) -> bool:
-    """Whether a mode is more than a standard deviation from where its model was linearised."""
+def _moved(found: Posterior, kappa: float) -> bool:
+    """Whether a mode is more than a standard deviation, which is worth kappa, from where its model was linearised."""
     off = np.abs(found.mode.at - found.near.at)
-    return bool((off > np.sqrt(np.diag(found.mode.covariance))).any())
+    return bool((off > np.sqrt(kappa * np.diag(found.mode.covariance))).any())
 
 
 def number(value: float, unit: str) -> str:
@@ -260,7 +255,7 @@ def _predicted(verdict: Verdict, data: Data, kappa: float, trials: Sequence[Tria
             folds.append((others, dataclasses.replace(fit, errors=np.delete(fit.errors, i)), [trial]))
     found: dict[str, tuple[float, float]] = {}
     for where, fit, left in folds:
-        before, after = (predict(where, fit, left, believed=b) for b in (True, False))
+        before, after = before_and_after(where, fit, left)
         if not before or not after:
             return {}
         found |= {b.trial: (b.total, a.total) for b, a in zip(before, after, strict=True)}
