@@ -22,6 +22,7 @@ from torchsoro.sim2real.inference.candidates import (
     weighing_of,
 )
 from torchsoro.sim2real.inference.conclusion import conclude
+from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
@@ -97,14 +98,19 @@ def test_a_model_without_a_finer_twin_has_the_error_that_its_problem_states(weig
     assert not model.numerics.draws
 
 
-def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(made):
+@pytest.fixture
+def on_a_plane(made):
     twin, record = made
     ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
     experiment = record(None)
     trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
     experiment = dataclasses.replace(experiment, trials=tuple(trials))
-    fine = Twin(twin.setup, edge=0.6 * twin.edge, across=5)
-    problem = FitProblem(experiment, twin, fine=fine)
+    return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
+
+
+def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(on_a_plane):
+    problem, fine = on_a_plane, on_a_plane.fine
+    assert problem.rough  # as long as nobody has moved its planes
     fit = problem.fit([((), None)], rounds=0)[0]
     assert fit is not None
     (model,) = near(problem, [fit], closely=True)
@@ -118,6 +124,26 @@ def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are
         left = trial.recording.position - np.mean(seen, 0)
         np.testing.assert_allclose(model.residuals[i], left, rtol=0, atol=1e-9)
     assert len(model.numerics.draws) == len(GAPS) + 1  # and that of the cells
+
+
+def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_a_plane):
+    problem = on_a_plane
+    known = measure(problem.experiment, problem.twin, problem.fine)
+    assert len(known.touching) == len(GAPS)
+    assert math.isfinite(known.chance)
+    quiet = DiscretizationError(touching=known.touching, chance=0.49 * problem.noise)
+    loud = quiet.replace(chance=0.51 * problem.noise)
+    calm, rough = (problem.only(problem.trials, discretization=d) for d in (quiet, loud))
+    assert rough.rough
+    assert not calm.rough
+    (fit,) = problem.fit([((), None)], rounds=0)
+    assert fit is not None
+    ((one,), (other,)) = near(calm, [fit]), near(rough, [fit], closely=True)
+    assert one is not None
+    assert other is not None
+    for mine, theirs in zip(one.residuals, other.residuals, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-7)  # steps in time differ by what goes together
+    assert one.numerics.amplitude == pytest.approx(other.numerics.amplitude, rel=1e-3)
 
 
 def test_a_fit_at_a_mode_has_its_numbers_and_deviations_in_si_units(weighed):
