@@ -171,7 +171,9 @@ def _refined(
         leading = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
         report("by the finer twin: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in leading))
         ends |= {f.effects: f for f in leading}
-        leading = [f for f in leading if not f.effects or f in running(leading)]
+        if not leading:
+            break
+        leading = [*(f for f in leading if not f.effects), *running(leading)]
     # Where all of them break down once they are corrected, they are told as they were.
     return problem, ends.get((), null_model), _best(f for f in ends.values() if f.effects) or best
 

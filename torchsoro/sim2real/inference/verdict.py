@@ -23,7 +23,7 @@ from torchsoro.sim2real.inference.search import running, search, within_toleranc
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
-HOPELESS = 40.0  # in ln of a probability: what is so far behind the best is not; it moved by up to 30 in that
+HOPELESS = 40.0  # in ln of a probability, behind the best: more than that (up to 30) changed in no mode seen
 ROUNDS = 3  # of that, at most
 CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
