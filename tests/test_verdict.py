@@ -12,7 +12,7 @@ from ringing import effect
 
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.search import ENDS, _unconstrained, distinct
+from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, _unconstrained, distinct, running
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
 from torchsoro.sim2real.report import sentences
@@ -71,6 +71,21 @@ def test_ends_of_one_name_count_once_where_they_are_the_same_place(still):
     assert distinct([drag, near, null_model, far, other], ENDS) == [drag, far, other]
     many = [dataclasses.replace(drag, point=np.array([0.1, 2.0**k])) for k in range(2 * ENDS)]
     assert distinct(many, ENDS) == many[:ENDS]
+
+
+@pytest.mark.parametrize(("chance", "share"), [(0.0, 1.0), (1.0, 2.0), (3.0, 10.0)])
+def test_what_leaves_no_more_than_noise_and_chance_in_touching_is_in_the_running(still, chance, share):
+    _, null_model = still
+    where = SimpleNamespace(
+        touches=True, noise=1e-4, samples=null_model.samples, discretization=SimpleNamespace(chance=1e-4 * chance)
+    )
+    drag = dataclasses.replace(null_model, effects=(effect("drag"),), chi2=0.1 * null_model.samples)
+    ahead = [drag] * AHEAD
+    least = FARTHER * share * null_model.samples
+    near, far = (dataclasses.replace(drag, chi2=by * least) for by in (0.99, 1.01))
+    assert running(where, [far, near, null_model, *ahead]) == [*ahead, near]
+    smooth = SimpleNamespace(**{**vars(where), "touches": False})
+    assert (near in running(smooth, [near, *ahead])) == (chance == 0.0)
 
 
 def test_drag_is_named_with_its_number_and_its_probability(dragged):

@@ -38,7 +38,7 @@ def center_of_gravity(x: Tensor, mass: Tensor) -> Tensor:
     if mass.ndim < 1 or mass.shape[-1] != x.shape[-2]:
         raise ValueError(f"mass: got shape {tuple(mass.shape)}, want [..., {x.shape[-2]}] as in x")
     try:
-        torch.broadcast_shapes(x.shape[:-1], mass.shape)
+        torch.broadcast_tensors(x[..., 0], mass)
     except RuntimeError:
         raise ValueError(
             f"mass: got shape {tuple(mass.shape)}, want leading axes that broadcast against {tuple(x.shape[:-2])} of x"

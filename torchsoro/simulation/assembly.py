@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -62,8 +63,8 @@ def assemble(
     ranks += [*body_tensors(attached), *load_tensors(attached), *others]
     leads = [tuple(t.shape[: t.ndim - rank]) for t, rank in ranks]
     try:
-        lead = torch.broadcast_shapes(*leads)
-    except RuntimeError:
+        lead = torch.Size(np.broadcast_shapes(*leads))  # that of torch imports sympy first
+    except ValueError:
         seen = ", ".join(map(str, sorted({axes for axes in leads if axes})))
         raise ValueError(f"leading axes {seen}: wanted batches that broadcast against each other") from None
     batch, steps = math.prod(lead), gravity.shape[-2]

@@ -120,4 +120,4 @@ def _largest(squares: Tensor) -> tuple[float, int]:
 
 def _at(values: Tensor, like: Tensor, place: int) -> float:
     """The number at a place of the flattened tensor, of values that broadcast to its shape."""
-    return float(torch.broadcast_to(values, torch.broadcast_shapes(values.shape, like.shape)).reshape(-1)[place])
+    return float(torch.broadcast_tensors(values, like)[0].reshape(-1)[place])

@@ -21,7 +21,7 @@ FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
 COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
 STARTS = 3  # searches of each effect, from probe points that differ
 EARLY_ABOVE = (
-    3.0  # chi-squared per sample of the null model, above which searches begin with the first part of the trials
+    3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
 )
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
@@ -29,7 +29,7 @@ CORRECTED = 1.5  # chi-squared per sample of the null model, above which the fin
 REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
-MOST_ROUGH = 24  # the same where bodies touch planes and most searches end in valleys nearby
+MOST_ROUGH = 24  # the same of rough motions, where most searches end in valleys nearby
 SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
@@ -38,11 +38,11 @@ TWICE = 0.25  # excess of chi-squared of a pair over that of the best single eff
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
-ENDS_ROUGH = 16  # the same where bodies touch planes
+ENDS_ROUGH = 16  # the same where a finer twin is searched, too
 PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
 FIRST = 2  # of them
 AHEAD = 3  # ends of searches that are always in the running
-FARTHER = 4.0  # times the least chi-squared: of smooth motions, an end that leaves more is far out of it
+FARTHER = 4.0  # times the least chi-squared: an end that leaves more is far out of it
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
@@ -61,7 +61,8 @@ def search(
 
     Returns:
         The problem with slips and corrections that were found, the fit without an effect, and distinct ends of
-        searches with effects: the best of each name first.
+        searches that are in the running: of rough motions others without an effect, then those with effects, the best
+        of each name first.
     """
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
@@ -107,17 +108,20 @@ def search(
     best = _best([*completed, *tried])
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
-    if best and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
+    # A second effect would take up what chance in touching leaves.
+    if best and not problem.rough and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
-        pairs = [f for f in _pairs(problem, effects, best, report) if f.chi2 - f.samples < TWICE * left]
-        best = _best([*best, *pairs])
-    ends = [*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)]
+        pairs = _pairs(problem, effects, running(problem, best), report)
+        best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
+    ends = distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)], ENDS)
+    ends = running(problem, ends)
+    valleys = _other_valleys(problem, null_model, ends)
     if not by_finer:
-        return problem, null_model, distinct(ends, ENDS)
+        return problem, null_model, [*valleys, *ends]
     # What two searches find in turn, so that neither crowds out the other.
     nothing, finer = _by_finer(problem, effects, null_model, report)
     mixed = [f for pair in itertools.zip_longest(finer, ends) for f in pair if f is not None]
-    return problem, null_model, [*nothing, *distinct(mixed, ENDS_ROUGH)]
+    return problem, null_model, [*valleys, *nothing, *distinct(mixed, ENDS_ROUGH)]
 
 
 def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
@@ -164,7 +168,7 @@ def _refined(
     problem: FitProblem, null_model: Fit, best: list[Fit], report: Callable[[str], None]
 ) -> tuple[FitProblem, Fit, list[Fit]]:
     """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin."""
-    leading, ends = [null_model, *best[:COMPLETED]], {}
+    leading, ends = [null_model, *running(problem, best)[:COMPLETED]], {}
     for _ in range(REFINED):
         problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
@@ -173,15 +177,34 @@ def _refined(
         ends |= {f.effects: f for f in leading}
         if not leading:
             break
-        leading = [*(f for f in leading if not f.effects), *running(leading)]
+        leading = [*(f for f in leading if not f.effects), *running(problem, leading)]
     # Where all of them break down once they are corrected, they are told as they were.
     return problem, ends.get((), null_model), _best(f for f in ends.values() if f.effects) or best
 
 
-def running(ends: Iterable[Fit]) -> list[Fit]:
+def running(problem: FitProblem, ends: Iterable[Fit]) -> list[Fit]:
     """Ends of searches with an effect that may be the most probable, best first."""
     order = sorted((f for f in ends if f.effects), key=lambda fit: fit.chi2)
-    return [f for k, f in enumerate(order) if k < AHEAD or f.chi2 < FARTHER * max(order[0].chi2, order[0].samples)]
+    return [f for k, f in enumerate(order) if k < AHEAD or near_best(problem, f, order[0])]
+
+
+def near_best(problem: FitProblem, fit: Fit, best: Fit) -> bool:
+    """Whether a fit leaves no more than some times what the best does, or what noise and chance in touching leave."""
+    chance = problem.discretization.chance / problem.noise if problem.touches else 0.0
+    return fit.chi2 < FARTHER * max(best.chi2, (1 + chance**2) * fit.samples)
+
+
+def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:
+    """Of rough motions, the null model all over its tolerances, if it is in the running.
+
+    The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
+    it into a deep one must not be told where what is stated, a little different, does so, too.
+    """
+    best = min(ends, key=lambda fit: fit.chi2, default=null_model)
+    if problem.finer_twin is None or not problem.rough or not near_best(problem, null_model, best):
+        return []
+    tasks: list[Task] = [((), point) for point in within_tolerances(problem)]
+    return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
 
 
 def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
@@ -299,9 +322,9 @@ def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most
 def _pairs(
     problem: FitProblem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
-    """Two effects together: each that was fitted with every other, on more and more of the trials.
+    """Two effects together: each in the running with every other, on more and more of the trials.
 
-    Not the leading ones alone: which of several that do badly by themselves does best hangs on rounding. Nor from one
+    Not the best ones alone: which of several that do badly by themselves does best hangs on rounding. Nor from one
     place alone: a response far off says little of where to begin.
     """
     tasks: list[Task] = []
@@ -336,7 +359,7 @@ def _fit_null_model(
 ) -> tuple[FitProblem, Fit]:
     """The fit without effects, and the problem with slips of markers where they explain most of what is left.
 
-    Where bodies touch planes, chi-squared has many valleys in what is stated: an effect that is searched from more
+    Of rough motions, chi-squared has many valleys in what is stated: an effect that is searched from more
     places than the null model would be told for having found the better one.
     """
     if problem.rough:

@@ -18,7 +18,7 @@ from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import before_and_after
 from torchsoro.sim2real.inference.observed import Data
-from torchsoro.sim2real.inference.search import running, search, within_tolerances
+from torchsoro.sim2real.inference.search import search
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
@@ -124,7 +124,7 @@ def weighed(
         problem: That was fitted.
         effects: That were thought of.
         null_model: The fit without an effect.
-        ends: Fits of effects.
+        ends: Fits of effects, and others without one.
         heldout: See :func:`judge`.
         report: See :func:`judge`.
     """
@@ -133,10 +133,7 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(
-        problem,
-        [null_model, *strained, *_other_valleys(problem, null_model), *(ends if problem.rough else running(ends))],
-    )
+    known = weigh(problem, [null_model, *strained, *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     for k in range(ROUNDS):
         far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
@@ -182,9 +179,13 @@ def weighed(
 def _far(weighing: Weighing) -> list[Posterior]:
     """Of what may still be told, modes that are far from where they were linearised."""
     leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)[:POLISHED]
-    least = weighing.best.ln_evidence - HOPELESS * weighing.kappa
-    asked = (weighing.null, *(p for p in leading if p.ln_evidence > least))
+    asked = (weighing.null, *(p for p in leading if _hopeful(weighing, p)))
     return [p for p in asked if _moved(p, weighing.kappa)]
+
+
+def _hopeful(weighing: Weighing, found: Posterior) -> bool:
+    """Whether another look at a mode may make it what is told."""
+    return found.ln_evidence > weighing.best.ln_evidence - HOPELESS * weighing.kappa
 
 
 def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
@@ -198,21 +199,11 @@ def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
     modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
     # At first, few effects have been looked at more than once, so that the best look at nothing counts, too.
     nothing = weighing.nulls if before else weighing.valleys
-    asked = [*nothing[:NOTHING], *modes[: CLOSELY[before]]]
+    if not _hopeful(weighing, nothing[0]):
+        nothing = () if before else nothing[:1]  # what is left without an effect is shown in any case
+    asked = [*nothing[:NOTHING], *(p for p in modes[: CLOSELY[before]] if _hopeful(weighing, p))]
     # From where the last look leads, as the one in the middle has been followed before.
     return [weighing.latest(p) for p in asked] if before else asked
-
-
-def _other_valleys(problem: FitProblem, null_model: Fit) -> list[Fit]:
-    """Where bodies touch planes, the null model all over its tolerances.
-
-    The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
-    it into a deep one must not be told where what is stated, a little different, does so, too.
-    """
-    if problem.finer_twin is None or not problem.rough:
-        return []
-    tasks = [((), point) for point in within_tolerances(problem)]
-    return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
 
 
 def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
