@@ -17,13 +17,14 @@ from torchsoro.sim2real.inference.candidates import (
     data_of,
     model_of,
     near,
-    responses,
     weigh,
     weighing_of,
 )
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.isolability import isolability
+from torchsoro.sim2real.inference.likelihood import ROUGH
 from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.visible import limit
@@ -58,8 +59,9 @@ def test_a_heavier_bar_is_explained_by_its_density(weighed):
 
 
 def test_nothing_is_named_in_a_bar_that_is_as_believed(weighed):
-    problem, fits, weighing = weighed[None]
-    seen = limit(weighing.data, weighing.null, responses(problem, [effect(n) for n in NAMES], fits[0]), 1.0, 20)
+    problem, _, weighing = weighed[None]
+    changes = isolability(problem, [effect(n) for n in NAMES]).changes
+    seen = limit(weighing.data, weighing.null, changes, 1.0, 20)
     assert 0.0 < seen < 0.1 * weighing.data.size
     found = conclude(weighing, limit=0.0)
     assert (found.kind, found.chosen) == ("nothing_missing", ())
@@ -131,8 +133,8 @@ def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_
     known = measure(problem.experiment, problem.twin, problem.fine)
     assert len(known.touching) == len(GAPS)
     assert math.isfinite(known.chance)
-    quiet = DiscretizationError(touching=known.touching, chance=0.49 * problem.noise)
-    loud = quiet.replace(chance=0.51 * problem.noise)
+    quiet = DiscretizationError(touching=known.touching, chance=0.99 * ROUGH * problem.noise)
+    loud = quiet.replace(chance=1.01 * ROUGH * problem.noise)
     calm, rough = (problem.only(problem.trials, discretization=d) for d in (quiet, loud))
     assert rough.rough
     assert not calm.rough

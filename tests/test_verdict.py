@@ -76,16 +76,13 @@ def test_ends_of_one_name_count_once_where_they_are_the_same_place(still):
 @pytest.mark.parametrize(("chance", "share"), [(0.0, 1.0), (1.0, 2.0), (3.0, 10.0)])
 def test_what_leaves_no_more_than_noise_and_chance_in_touching_is_in_the_running(still, chance, share):
     _, null_model = still
-    where = SimpleNamespace(
-        touches=True, noise=1e-4, samples=null_model.samples, discretization=SimpleNamespace(chance=1e-4 * chance)
-    )
+    where = SimpleNamespace(chance=chance)
     drag = dataclasses.replace(null_model, effects=(effect("drag"),), chi2=0.1 * null_model.samples)
     ahead = [drag] * AHEAD
     least = FARTHER * share * null_model.samples
     near, far = (dataclasses.replace(drag, chi2=by * least) for by in (0.99, 1.01))
     assert running(where, [far, near, null_model, *ahead]) == [*ahead, near]
-    smooth = SimpleNamespace(**{**vars(where), "touches": False})
-    assert (near in running(smooth, [near, *ahead])) == (chance == 0.0)
+    assert (near in running(SimpleNamespace(chance=0.0), [near, *ahead])) == (chance == 0.0)
 
 
 def test_drag_is_named_with_its_number_and_its_probability(dragged):

@@ -160,9 +160,11 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     problem = correct(inputs, progress.tick)
     discretization = problem.discretization
     progress.stage("simulating what each effect would change")
-    tells = isolability(problem)
+    tells = isolability(problem, inputs.effects)
     progress.stage("searching among the effects")
-    verdict = judge(problem, inputs.effects, heldout=kept, budget=60 * options.budget, report=lambda line: None)
+    verdict = judge(
+        problem, inputs.effects, tells=tells, heldout=kept, budget=60 * options.budget, report=lambda line: None
+    )
     progress.stage("predicting trials and writing the report")
     problem = verdict.problem
     best = verdict.best

@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
 from torchsoro.sim2real.inference.discretization import GAPS, shifted
@@ -33,7 +32,6 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
-WEAK = 0.1  # strength of a response, over that of the weakest probe point: it is linear there
 
 
 def data_of(problem: Likelihood) -> Data:
@@ -272,38 +270,6 @@ def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> 
         raise ValueError(BREAKS)
     effects = tuple(p for p in found if p.near.model.effects)
     return Weighing(data=data_of(problem), nothing=nothing, effects=effects, names=names)
-
-
-def responses(problem: FitProblem, effects: Sequence[Hypothesis], still: Fit) -> Motions:
-    """Changes of the motion by weak effects, of each trial [T, M, A, E]; without what breaks down or moves nothing.
-
-    Args:
-        problem: That was fitted.
-        effects: To think of.
-        still: The fit without an effect.
-    """
-    coarse = problem.only(problem.trials, discretization=DiscretizationError(shift=tuple(problem.shift)))
-    weak = [np.concatenate(e.weak_probe_points(problem.twin, WEAK)) for e in effects]
-    base, *changed = coarse.simulate(
-        [
-            ((), still.point[None]),
-            *(
-                ((e,), np.concatenate([np.tile(still.point, (len(d), 1)), d], 1))
-                for e, d in zip(effects, weak, strict=True)
-            ),
-        ]
-    )
-    before = _left(problem, [m.alone() for m in base], still.errors)
-    columns: list[Motions] = []
-    for motions in changed:
-        sound = np.all([m.sound for m in motions], axis=0)
-        for k in (int(k) for k in np.flatnonzero(sound)):
-            after = _left(problem, [m.alone(k) for m in motions], still.errors)
-            change = tuple(np.nan_to_num(a - b)[..., None] for a, b in zip(before, after, strict=True))
-            if any(c.any() for c in change):
-                columns.append(change)
-    none = tuple(b[..., None][..., :0] for b in before)
-    return tuple(np.concatenate(same, -1) for same in zip(none, *columns, strict=True))
 
 
 def at_mode(problem: Likelihood, fit: Fit, mode: Mode) -> Fit:

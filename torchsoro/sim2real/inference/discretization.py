@@ -55,7 +55,13 @@ def measure(
     everything = (*trials, *(t for t in experiment.heldout if t.recording is not None))
     common = {"noise": 1e-4, "report": report, "threads": threads}
     there = FitProblem(experiment, fine, trials=everything, **common)
-    other = [_as_simulated(motion, t) for motion, t in zip(_believed(there), everything, strict=True)]
+    touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
+    chance = math.inf
+    if there.touches and not any(t.simulated for t in trials):
+        believed, touching, chance = _chance(there, len(trials))
+    else:
+        believed = _believed(there)
+    other = [_as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
     here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors)
@@ -63,9 +69,6 @@ def measure(
     own = _believed(FitProblem(experiment, twin, trials=everything, discretization=known, **common))
     correction = added(everything, own, other)
     here = FitProblem(experiment, twin, trials=trials, discretization=known, **common)
-    touching, chance = (), math.inf
-    if there.touches and not any(t.simulated for t in trials):
-        touching, chance = _chance(there.only(trials))
     # The error falls with the square of the cell size, which gives that of the finer twin from the difference of the
     # two; impacts on planes do not converge at that order, so that there the whole difference counts.
     ratio = max((fine.count / twin.count) ** (1 / 3), 1.1)
@@ -114,20 +117,25 @@ def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     return [[m.alone(k) for m in motions] for k in range(len(NEARER))]
 
 
-def _chance(fine: FitProblem) -> tuple[tuple[Mapping[str, MarkerTrajectory], ...], float]:
-    """What moved planes add to the motion as stated, by shift, and how much of that is chance [m]."""
+def _chance(
+    fine: FitProblem, count: int
+) -> tuple[list[MarkerTrajectory], tuple[Mapping[str, MarkerTrajectory], ...], float]:
+    """The motion as stated; what moved planes add to it in the first trials, by shift; how much is chance [m]."""
     (motions,) = shifted(fine, [((), np.zeros((1, len(fine.common))))], GAPS)
-    if not all(m.sound.all() for m in motions):
-        return (), math.inf
     middle = [m.alone(len(GAPS) // 2) for m in motions]
-    moved = [[m.alone(k) for m in motions] for k in range(len(GAPS))]
+    if not all(m.sound.all() for m in middle):
+        raise ValueError(BREAKS)
+    kept = motions[:count]
+    if not all(m.sound.all() for m in kept):
+        return middle, (), math.inf
+    moved = [[m.alone(k) for m in kept] for k in range(len(GAPS))]
     none = np.zeros(len(fine.observation.deviations))
     seen: list[Motions] = [
         tuple(fine.observation.observe(m, i, none) for i, m in enumerate(variant)) for variant in moved
     ]
     _, draws = beside_line(seen, GAPS)
     chance = math.sqrt(sum(size_of(d) ** 2 for d in draws) / len(draws))
-    return tuple(added(fine.trials, middle, variant) for variant in moved), chance
+    return middle, tuple(added(fine.trials[:count], middle[:count], variant) for variant in moved), chance
 
 
 def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:

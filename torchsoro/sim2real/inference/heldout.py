@@ -68,6 +68,25 @@ def before_and_after(
     return _predicted(problem, there, fit, before), _predicted(problem, there, fit, after)
 
 
+def left_out(problem: FitProblem, fits: Sequence[Fit]) -> tuple[list[Prediction], list[Prediction]]:
+    """The first trials, each as :func:`before_and_after` by a fit of all others, simulated together.
+
+    Args:
+        problem: The fits', with all trials.
+        fits: One for each trial that is left out, with the measurement errors of the others.
+    """
+    trials = problem.trials[: len(fits)]
+    there = _there(problem, trials)
+    believed, *found = there.simulate([_asked(there, f, k < 0) for k, f in enumerate((fits[0], *fits), -1)])
+    before: list[Prediction] = []
+    after: list[Prediction] = []
+    for i, (trial, fit) in enumerate(zip(trials, fits, strict=True)):
+        others, one = problem.only([t for t in problem.trials if t is not trial]), there.only([trial])
+        before += _predicted(others, one, fit, [believed[i]])
+        after += _predicted(others, one, fit, [found[i][i]])
+    return before, after
+
+
 def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
     """The trials, by the finer twin where there is one."""
     there = problem.only(trials, slips=())

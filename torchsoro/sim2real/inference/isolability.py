@@ -20,6 +20,7 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
+from torchsoro.sim2real.inference.observed import Motions
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SAME = 0.97  # cosine above which one effect passes for another
@@ -36,12 +37,15 @@ class Isolability:
         quantities: First quantity of each, and its unit.
         detectable: Strength at which each is detectable, in that unit [E]; infinite if never.
         cosines: How much of the change by effect i, where it is first detectable, effect j can imitate [E, E], 0 to 1.
+        changes: Of the motion by weak effects, one for each direction in which one acts, of each trial [T, M, A, D] m;
+            without what breaks down or moves nothing.
     """
 
     effects: tuple[str, ...]
     quantities: tuple[tuple[str, str], ...]
     detectable: np.ndarray
     cosines: np.ndarray
+    changes: Motions
 
     def confused(self, threshold: float = SAME) -> list[tuple[str, str]]:
         """Pairs of effects, of which the second can imitate the first: the experiment cannot tell them apart."""
@@ -79,7 +83,8 @@ def isolability(
     # Effects that are fitted always need no simulation of their own.
     fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
     others = [e for e in effects if type(e) not in fitted]
-    probe_points = [_probe_points(effect, problem) for effect in others]
+    looks = [_probe_points(effect, problem) for effect in others]
+    probe_points = [[*weak, *strong] for weak, strong in looks]
     still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
     asked = [
         ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
@@ -89,7 +94,8 @@ def isolability(
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)
     believed = [m.alone(0) for m in base]
-    blocks = [changes(problem.observation, problem.noise_models, believed, motions) for motions in (base, *found)]
+    moved = [moved_by(problem.observation, believed, motions) for motions in (base, *found)]
+    blocks = [whitened(problem.noise_models, by) for by in moved]
     blocks[0] = blocks[0][:, 1:] / SMALL
     by = errors_of(problem.observation, problem.noise_models, believed)
     common, *rest = np.split(
@@ -108,11 +114,15 @@ def isolability(
     responses = [known[id(effect)] for effect in effects]
     detectable, cosines = compare(responses, common, prior_residual_of(problem), score)
     first = [e.quantities[0] for e in effects]
+    beliefs = [1 + fitted[type(e)] for e in effects if type(e) in fitted]
+    weak = [tuple(m[..., beliefs] for m in moved[0])]
+    weak += [tuple(m[..., : sum(map(len, own))] for m in by) for by, (own, _) in zip(moved[1:], looks, strict=True)]
     return Isolability(
         effects=tuple(e.name for e in effects),
         quantities=tuple((q.name, q.unit) for q in first),
         detectable=detectable * np.array([q.scale for q in first]),
         cosines=cosines,
+        changes=_seen(problem, weak),
     )
 
 
@@ -121,23 +131,25 @@ def prior_residual_of(problem: FitProblem) -> PriorResidual:
     return lambda x: problem.prior_residual(x, np.zeros(len(x), bool))[0]
 
 
-def changes(
-    observation: ObservationModel,
-    noise_models: Sequence[NoiseModel],
-    believed: Sequence[MarkerTrajectory],
-    motions: Sequence[MarkerTrajectory],
-) -> np.ndarray:
-    """Whitened change of what would be recorded in all trials, for a batch of motions [N, B]; 0 for broken ones."""
+def moved_by(
+    observation: ObservationModel, believed: Sequence[MarkerTrajectory], motions: Sequence[MarkerTrajectory]
+) -> Motions:
+    """Change of what would be recorded, for a batch of motions, of each trial [T, M, A, B] m; 0 for broken ones."""
     sound = np.all([m.sound for m in motions], axis=0)
     still = np.zeros(len(observation.deviations))
-    parts = []
-    for i, (noise_model, base, motion) in enumerate(zip(noise_models, believed, motions, strict=True)):
+    found = []
+    for i, (base, motion) in enumerate(zip(believed, motions, strict=True)):
         seen = observation.observe(base, i, still)
         each = [
             observation.observe(motion.alone(k), i, still) - seen if good else 0 * seen for k, good in enumerate(sound)
         ]
-        parts.append(noise_model.whiten(np.stack(each, -1)))
-    return np.concatenate(parts)
+        found.append(np.stack(each, -1))
+    return tuple(found)
+
+
+def whitened(noise_models: Sequence[NoiseModel], changes: Motions) -> np.ndarray:
+    """Changes of all trials over their errors [N, B]."""
+    return np.concatenate([model.whiten(change) for model, change in zip(noise_models, changes, strict=True)])
 
 
 def errors_of(
@@ -155,19 +167,30 @@ def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, observation: Observa
     return np.asarray(np.linalg.qr(left, mode="r"))
 
 
-def _probe_points(effect: Hypothesis, problem: FitProblem) -> list[np.ndarray]:
-    """Probe points of an effect: alternatives, each with directions [D, K] in scales, weak ones first.
+def _seen(problem: FitProblem, changes: Sequence[Motions]) -> Motions:
+    """Those together that move something that was recorded, of each trial [T, M, A, D] m."""
+    found = []
+    for i, trial in enumerate(problem.trials):
+        assert trial.recording is not None
+        seen = np.isfinite(trial.recording.position)[..., None]
+        found.append(np.where(seen, np.concatenate([of[i] for of in changes], -1), 0.0))
+    some = np.any([change.any(axis=(0, 1, 2)) for change in found], axis=0)
+    return tuple(change[..., some] for change in found)
+
+
+def _probe_points(effect: Hypothesis, problem: FitProblem) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Weak and strong probe points of an effect: alternatives, each with directions [D, K] in scales.
 
     A weak one suffices for an effect whose response begins at zero strength. One that has a threshold, as sliding on a
     plane, is also simulated at full strengths.
     """
     weak = effect.weak_probe_points(problem.twin, SMALL)
     if effect.joint:  # of many places, every other
-        return weak[:: -2 if effect.local else 1]
+        return weak[:: -2 if effect.local else 1], []
     if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].planes:
-        return weak
+        return weak, []
     known = sorted(effect.probe_points(problem.twin), key=lambda d: abs(d[0, 0]))
-    return [*weak, known[0], known[-1]]
+    return weak, [known[0], known[-1]]
 
 
 def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:

@@ -26,7 +26,7 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
-CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
+ROUGH = 2.0  # times the noise: of sliding blocks with once the noise, smooth and rough weighing tell the same
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
@@ -138,9 +138,14 @@ class Likelihood:
         return any(s.planes for s in self.scenarios)
 
     @property
+    def chance(self) -> float:
+        """Error by chance in which node touches a plane when, over the noise."""
+        return self.discretization.chance / self.noise if self.touches else 0.0
+
+    @property
     def rough(self) -> bool:
-        """Whether what touches when makes chi-squared rough: bodies on planes, unless their motion is known not to."""
-        return self.touches and self.discretization.chance > CALM * self.noise
+        """Whether chance makes chi-squared rough: bodies on planes, unless their motion is known not to."""
+        return self.chance > ROUGH
 
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:

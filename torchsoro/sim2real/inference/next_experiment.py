@@ -12,7 +12,7 @@ from torchsoro.sim2real.data.experiment import ForceTable, Marker, Setup, Trial,
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
-from torchsoro.sim2real.inference.isolability import changes, errors_of, prior_residual_of, shortened
+from torchsoro.sim2real.inference.isolability import errors_of, moved_by, prior_residual_of, shortened, whitened
 from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
@@ -214,7 +214,7 @@ def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerTrajector
     observation = ObservationModel(trial.setup, [trial], problem.priors)
     noise_models = [NoiseModel(trial.recording, problem.noise, discretization)]
     believed = [motions[0].alone(0)]
-    blocks = [changes(observation, noise_models, believed, [m]) for m in motions]
+    blocks = [whitened(noise_models, moved_by(observation, believed, [m])) for m in motions]
     widths = np.cumsum([b.shape[1] for b in blocks])[:-1]
     still, *both = np.split(shortened(blocks, errors_of(observation, noise_models, believed), observation), widths, 1)
     common = still[:, 1:] / STEP

@@ -24,6 +24,7 @@ EARLY_ABOVE = (
     3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
 )
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
+CALM = 0.5  # times the noise: where chance in touching is more, pairs of effects are not tried
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
 CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
 REFINED = 2  # rounds in which the best are corrected by the finer twin
@@ -67,7 +68,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
+    by_finer = problem.chance > CALM and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough and not by_finer else MOST))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
@@ -109,7 +110,7 @@ def search(
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
     # A second effect would take up what chance in touching leaves.
-    if best and not problem.rough and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
+    if best and problem.chance < CALM and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
         pairs = _pairs(problem, effects, running(problem, best), report)
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
@@ -190,8 +191,7 @@ def running(problem: FitProblem, ends: Iterable[Fit]) -> list[Fit]:
 
 def near_best(problem: FitProblem, fit: Fit, best: Fit) -> bool:
     """Whether a fit leaves no more than some times what the best does, or what noise and chance in touching leave."""
-    chance = problem.discretization.chance / problem.noise if problem.touches else 0.0
-    return fit.chi2 < FARTHER * max(best.chi2, (1 + chance**2) * fit.samples)
+    return fit.chi2 < FARTHER * max(best.chi2, (1 + problem.chance**2) * fit.samples)
 
 
 def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:

@@ -12,11 +12,12 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
-from torchsoro.sim2real.inference.candidates import at_mode, data_of, responses, weigh, weighing_of
+from torchsoro.sim2real.inference.candidates import at_mode, data_of, weigh, weighing_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.heldout import before_and_after
+from torchsoro.sim2real.inference.heldout import before_and_after, left_out
+from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
 
@@ -90,6 +91,7 @@ def judge(
     problem: FitProblem,
     effects: Sequence[Hypothesis] | None = None,
     *,
+    tells: Isolability | None = None,
     heldout: Sequence[Trial] = (),
     budget: float = 600.0,
     report: Callable[[str], None] = print,
@@ -99,6 +101,7 @@ def judge(
     Args:
         problem: Recordings and twin.
         effects: What is thought of; the library if None.
+        tells: Which of them the experiment can tell; found if None.
         heldout: Trials that are only predicted, once all is decided. Without any, each of three or more is predicted
             from the others.
         budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
@@ -106,7 +109,7 @@ def judge(
     """
     effects = problem.thought_of(library() if effects is None else effects)
     problem, null_model, ends = search(problem, effects, budget, report)
-    return weighed(problem, effects, null_model, ends, heldout=heldout, report=report)
+    return weighed(problem, effects, null_model, ends, tells=tells, heldout=heldout, report=report)
 
 
 def weighed(
@@ -115,6 +118,7 @@ def weighed(
     null_model: Fit,
     ends: Sequence[Fit],
     *,
+    tells: Isolability | None = None,
     heldout: Sequence[Trial] = (),
     report: Callable[[str], None] = print,
 ) -> Verdict:
@@ -125,8 +129,9 @@ def weighed(
         effects: That were thought of.
         null_model: The fit without an effect.
         ends: Fits of effects, and others without one.
-        heldout: See :func:`judge`.
-        report: See :func:`judge`.
+        tells: See :func:`judge`.
+        heldout: The same.
+        report: The same.
     """
     data, names = data_of(problem), len({e.name for e in effects})
     believed = dataclasses.replace(
@@ -147,7 +152,7 @@ def weighed(
             known = [one for one in known if one[1].near.model.name not in sound]
         known += again
         weighing = weighing_of(problem, [p for _, p in known], names)
-    changes = responses(problem, effects, _fit_of(known, weighing.null))
+    changes = (tells or isolability(problem, effects)).changes
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
     kappa = weighing.kappa if weighing.groups else adjustment(data, weighing.null, changes)
     asked = data, weighing.null, changes, kappa, names
@@ -235,19 +240,15 @@ def tell(fit: Fit) -> str:
 def _predicted(verdict: Verdict, data: Data, kappa: float, trials: Sequence[Trial]) -> dict[str, tuple[float, float]]:
     """By trial that was left out, the error as believed and with what was found [m]."""
     problem, best = verdict.problem, verdict.best
-    folds = [(problem, best, list(trials))]
-    if not trials:
-        if len(problem.trials) < 3:
-            return {}
-        folds = []
-        for i, trial in enumerate(problem.trials[:FOLDS]):
-            fit = at_mode(problem, best, told(data, verdict.posterior, kappa, but=i))
-            others = problem.only([t for t in problem.trials if t is not trial])
-            folds.append((others, dataclasses.replace(fit, errors=np.delete(fit.errors, i)), [trial]))
-    found: dict[str, tuple[float, float]] = {}
-    for where, fit, left in folds:
-        before, after = before_and_after(where, fit, left)
-        if not before or not after:
-            return {}
-        found |= {b.trial: (b.total, a.total) for b, a in zip(before, after, strict=True)}
-    return found
+    if trials:
+        before, after = before_and_after(problem, best, trials)
+    elif len(problem.trials) < 3:
+        return {}
+    else:
+        trials = problem.trials[:FOLDS]
+        fits = [at_mode(problem, best, told(data, verdict.posterior, kappa, but=i)) for i in range(len(trials))]
+        fits = [dataclasses.replace(fit, errors=np.delete(fit.errors, i)) for i, fit in enumerate(fits)]
+        before, after = left_out(problem, fits)
+    if not len(before) == len(after) == len(trials):  # one breaks down
+        return {}
+    return {b.trial: (b.total, a.total) for b, a in zip(before, after, strict=True)}
