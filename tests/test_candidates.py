@@ -19,12 +19,13 @@ from torchsoro.sim2real.inference.candidates import (
     near,
     weigh,
     weighing_of,
+    with_chance_at,
 )
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.isolability import isolability
-from torchsoro.sim2real.inference.likelihood import ROUGH
+from torchsoro.sim2real.inference.likelihood import CALM
 from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.visible import limit
@@ -133,8 +134,8 @@ def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_
     known = measure(problem.experiment, problem.twin, problem.fine)
     assert len(known.touching) == len(GAPS)
     assert math.isfinite(known.chance)
-    quiet = DiscretizationError(touching=known.touching, chance=0.99 * ROUGH * problem.noise)
-    loud = quiet.replace(chance=1.01 * ROUGH * problem.noise)
+    quiet = DiscretizationError(touching=known.touching, chance=0.99 * CALM * problem.noise)
+    loud = quiet.replace(chance=1.01 * CALM * problem.noise)
     calm, rough = (problem.only(problem.trials, discretization=d) for d in (quiet, loud))
     assert rough.rough
     assert not calm.rough
@@ -146,6 +147,31 @@ def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_
     for mine, theirs in zip(one.residuals, other.residuals, strict=True):
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-7)  # steps in time differ by what goes together
     assert one.numerics.amplitude == pytest.approx(other.numerics.amplitude, rel=1e-3)
+
+
+def test_chance_is_that_at_what_leads_where_it_is_more_than_as_stated(on_a_plane):
+    problem = on_a_plane
+    (fit,) = problem.fit([((), None)], rounds=0)
+    assert fit is not None
+    wall = WallOffset()
+    points = np.concatenate([np.tile(fit.point, (len(GAPS), 1)), GAPS[:, None] / wall.quantities[0].scale], 1)
+    by_fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
+    (motions,) = by_fine.simulate([((wall,), points)])
+    seen = [
+        np.stack([problem.observation.observe(m.alone(k), i, fit.errors) for k in range(len(GAPS))])
+        for i, m in enumerate(motions)
+    ]
+    flat = np.concatenate([s[:, np.isfinite(s).all(0)] for s in seen], 1)
+    line = np.stack([np.polyval(c, GAPS) for c in np.polyfit(GAPS, flat, 1).T], 1)
+    chance = float(np.sqrt(((flat - line) ** 2).sum(0).mean() / (len(GAPS) - 2)))
+
+    def after(known):
+        error = problem.discretization.replace(chance=known)
+        return with_chance_at(problem.only(problem.trials, discretization=error), fit)
+
+    assert after(0.0).discretization.chance == pytest.approx(chance, rel=0.02)  # recordings have lost samples
+    assert after(2 * chance).discretization.chance == 2 * chance
+    assert after(0.0).rough == (chance > CALM * problem.noise)
 
 
 def test_a_fit_at_a_mode_has_its_numbers_and_deviations_in_si_units(weighed):

@@ -25,7 +25,7 @@ from torchsoro.sim2real.inference.laplace import Mode
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread
+from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
 from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
@@ -154,7 +154,7 @@ def _corrected(
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
-    if problem.rough:
+    if problem.many_valleys:
         # What a plane's place changes, by the twin in use: it is of that order in the finer one.
         found: list[Linearised | None] = []
         for model, finer, variants in zip(models, sharp, _touching(problem, coarse, fits), strict=True):
@@ -252,6 +252,16 @@ def weigh(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) ->
     with ThreadPoolExecutor(problem.threads) as pool, ThreadPoolExecutor(problem.threads) as inner:
         after = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), models)
         return list(zip((f for f, _ in models), after, strict=True))
+
+
+def with_chance_at(problem: FitProblem, fit: Fit) -> FitProblem:
+    """The problem with chance in touching as it is at a fit, by the finer twin, where that is more than as stated."""
+    if problem.finer_twin is None:
+        return problem
+    by_fine = problem.only(problem.trials, twin=problem.finer_twin, discretization=DiscretizationError())
+    (variants,) = _touching(problem, by_fine, [fit])
+    found, known = chance_in(variants, GAPS) if variants else math.inf, problem.discretization
+    return problem.only(problem.trials, discretization=known.replace(chance=max(found, known.chance)))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

@@ -15,8 +15,8 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, Likelihood, Request, added
 from torchsoro.sim2real.inference.observation import Priors
-from torchsoro.sim2real.inference.observed import Motions, size_of
-from torchsoro.sim2real.inference.remaining_error import beside_line
+from torchsoro.sim2real.inference.observed import Motions
+from torchsoro.sim2real.inference.remaining_error import chance_in
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
@@ -133,9 +133,8 @@ def _chance(
     seen: list[Motions] = [
         tuple(fine.observation.observe(m, i, none) for i, m in enumerate(variant)) for variant in moved
     ]
-    _, draws = beside_line(seen, GAPS)
-    chance = math.sqrt(sum(size_of(d) ** 2 for d in draws) / len(draws))
-    return middle, tuple(added(fine.trials[:count], middle[:count], variant) for variant in moved), chance
+    touching = tuple(added(fine.trials[:count], middle[:count], variant) for variant in moved)
+    return middle, touching, chance_in(seen, GAPS)
 
 
 def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:

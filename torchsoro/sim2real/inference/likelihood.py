@@ -26,7 +26,8 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
-ROUGH = 2.0  # times the noise: of sliding blocks with once the noise, smooth and rough weighing tell the same
+CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
+VALLEYS = 2.0  # times the noise: chance of sliding blocks, whose searches end where they should, is up to 1.3
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
@@ -144,8 +145,13 @@ class Likelihood:
 
     @property
     def rough(self) -> bool:
-        """Whether chance makes chi-squared rough: bodies on planes, unless their motion is known not to."""
-        return self.chance > ROUGH
+        """Whether chance makes chi-squared rough: bodies on planes, unless their motion is known not to hang on it."""
+        return self.chance > CALM
+
+    @property
+    def many_valleys(self) -> bool:
+        """Whether it is so rough that searches end in valleys nearby."""
+        return self.chance > VALLEYS
 
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:

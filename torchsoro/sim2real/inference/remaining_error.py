@@ -36,7 +36,7 @@ from torchsoro.sim2real.inference.evidence import (
     time_range,
 )
 from torchsoro.sim2real.inference.laplace import posterior
-from torchsoro.sim2real.inference.observed import Data, Motions
+from torchsoro.sim2real.inference.observed import Data, Motions, size_of
 from torchsoro.sim2real.inference.state_space import total
 
 ORDER = 2  # of convergence with the edge of the cells, of smooth motion
@@ -125,6 +125,12 @@ def beside_line(variants: Sequence[Motions], shifts: np.ndarray) -> tuple[Motion
         for one, g in zip(variants, shifts, strict=True)
     ]
     return mean, draws
+
+
+def chance_in(variants: Sequence[Motions], shifts: np.ndarray) -> float:
+    """Root mean square of what is not in proportion to the shift, see :func:`beside_line` [m]."""
+    _, draws = beside_line(variants, shifts)
+    return math.sqrt(sum(size_of(d) ** 2 for d in draws) / len(draws))
 
 
 def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:

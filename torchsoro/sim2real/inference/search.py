@@ -24,13 +24,12 @@ EARLY_ABOVE = (
     3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
 )
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
-CALM = 0.5  # times the noise: where chance in touching is more, pairs of effects are not tried
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
 CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
 REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
-MOST_ROUGH = 24  # the same of rough motions, where most searches end in valleys nearby
+MOST_VALLEYS = 24  # the same where most end in valleys nearby
 SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
@@ -40,7 +39,7 @@ TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
 ENDS_ROUGH = 16  # the same where a finer twin is searched, too
-PLACES = 16  # within the tolerances of what is stated, from the best of which the null model of rough motions begins
+PLACES = 16  # within the tolerances of what is stated, from the best of which the null model begins among many valleys
 FIRST = 2  # of them
 AHEAD = 3  # ends of searches that are always in the running
 FARTHER = 4.0  # times the least chi-squared: an end that leaves more is far out of it
@@ -62,14 +61,16 @@ def search(
 
     Returns:
         The problem with slips and corrections that were found, the fit without an effect, and distinct ends of
-        searches that are in the running: of rough motions others without an effect, then those with effects, the best
-        of each name first.
+        searches that are in the running: others without an effect, where there are many valleys, then those with
+        effects.
     """
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    by_finer = problem.chance > CALM and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
-    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_ROUGH if problem.rough and not by_finer else MOST))
+    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
+    most = int(
+        np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_VALLEYS if problem.many_valleys and not by_finer else MOST)
+    )
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -92,7 +93,7 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
-    if problem.rough and not by_finer:
+    if problem.many_valleys and not by_finer:
         tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
@@ -110,7 +111,7 @@ def search(
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
     # A second effect would take up what chance in touching leaves.
-    if best and problem.chance < CALM and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
+    if best and not problem.rough and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
         left = best[0].chi2 - best[0].samples
         pairs = _pairs(problem, effects, running(problem, best), report)
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
@@ -195,13 +196,13 @@ def near_best(problem: FitProblem, fit: Fit, best: Fit) -> bool:
 
 
 def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:
-    """Of rough motions, the null model all over its tolerances, if it is in the running.
+    """Where fits have many valleys, the null model all over its tolerances, if it is in the running.
 
     The finer twin has other valleys than the twin in which effects are searched. An effect whose numbers happen to lead
     it into a deep one must not be told where what is stated, a little different, does so, too.
     """
     best = min(ends, key=lambda fit: fit.chi2, default=null_model)
-    if problem.finer_twin is None or not problem.rough or not near_best(problem, null_model, best):
+    if problem.finer_twin is None or not problem.many_valleys or not near_best(problem, null_model, best):
         return []
     tasks: list[Task] = [((), point) for point in within_tolerances(problem)]
     return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
@@ -359,10 +360,10 @@ def _fit_null_model(
 ) -> tuple[FitProblem, Fit]:
     """The fit without effects, and the problem with slips of markers where they explain most of what is left.
 
-    Of rough motions, chi-squared has many valleys in what is stated: an effect that is searched from more
-    places than the null model would be told for having found the better one.
+    Where there are many valleys, an effect that is searched from more places than the null model would be told for
+    having found the better one.
     """
-    if problem.rough:
+    if problem.many_valleys:
         tasks = [*tasks, *_null_starts(problem)]
     while True:
         # What did well on the beginning of the trials may break down later.

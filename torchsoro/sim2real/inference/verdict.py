@@ -12,7 +12,7 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
-from torchsoro.sim2real.inference.candidates import at_mode, data_of, weigh, weighing_of
+from torchsoro.sim2real.inference.candidates import at_mode, data_of, weigh, weighing_of, with_chance_at
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
@@ -24,7 +24,7 @@ from torchsoro.sim2real.inference.search import search
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
 POLISHED = 4  # names that are linearised again where their posterior has its mode
-HOPELESS = 40.0  # in ln of a probability, behind the best: more than that (up to 30) changed in no mode seen
+HOPELESS = 40.0  # in ln evidence, behind the best: by more than that (up to 30) it rose in no look seen
 ROUNDS = 3  # of that, at most
 CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
@@ -140,6 +140,9 @@ def weighed(
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     known = weigh(problem, [null_model, *strained, *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
+    best = weighing.best
+    if problem.touches and not problem.rough and best.near.model.effects:
+        problem = with_chance_at(problem, at_mode(problem, _fit_of(known, best), best.mode))
     for k in range(ROUNDS):
         far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
         if not far:
@@ -190,7 +193,8 @@ def _far(weighing: Weighing) -> list[Posterior]:
 
 def _hopeful(weighing: Weighing, found: Posterior) -> bool:
     """Whether another look at a mode may make it what is told."""
-    return found.ln_evidence > weighing.best.ln_evidence - HOPELESS * weighing.kappa
+    unit = weighing.kappa if weighing.scattered else 1.0
+    return found.ln_evidence > weighing.best.ln_evidence - HOPELESS * unit
 
 
 def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
