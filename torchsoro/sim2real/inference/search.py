@@ -38,7 +38,7 @@ TWICE = 0.25  # excess of chi-squared of a pair over that of the best single eff
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
-ENDS_ROUGH = 16  # the same where a finer twin is searched, too
+ENDS_FINER = 16  # the same where a finer twin is searched, too
 PLACES = 16  # within the tolerances of what is stated, from the best of which the null model begins among many valleys
 FIRST = 2  # of them
 AHEAD = 3  # ends of searches that are always in the running
@@ -68,9 +68,8 @@ def search(
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
     by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
-    most = int(
-        np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_VALLEYS if problem.many_valleys and not by_finer else MOST)
-    )
+    begun = MOST_VALLEYS if problem.many_valleys and not by_finer else MOST
+    most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, begun))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
         # Responses are not linear so far off, but at first a wrong frequency is not yet a wrong phase. The correction
@@ -123,7 +122,7 @@ def search(
     # What two searches find in turn, so that neither crowds out the other.
     nothing, finer = _by_finer(problem, effects, null_model, report)
     mixed = [f for pair in itertools.zip_longest(finer, ends) for f in pair if f is not None]
-    return problem, null_model, [*valleys, *nothing, *distinct(mixed, ENDS_ROUGH)]
+    return problem, null_model, [*valleys, *nothing, *distinct(mixed, ENDS_FINER)]
 
 
 def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:

@@ -144,7 +144,9 @@ def weighed(
     if problem.touches and not problem.rough and best.near.model.effects:
         problem = with_chance_at(problem, at_mode(problem, _fit_of(known, best), best.mode))
     for k in range(ROUNDS):
-        far = _looked_at_again(weighing, k) if problem.rough else _far(weighing)
+        # Among many valleys, or once it is seen to scatter, evidence changes by as much as it is divided by.
+        behind = HOPELESS * (weighing.kappa if problem.many_valleys or weighing.scattered else 1.0)
+        far = _looked_at_again(weighing, behind, k) if problem.rough else _far(weighing, behind)
         if not far:
             break
         again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far], closely=True)
@@ -184,20 +186,19 @@ def weighed(
     return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
 
 
-def _far(weighing: Weighing) -> list[Posterior]:
+def _far(weighing: Weighing, behind: float) -> list[Posterior]:
     """Of what may still be told, modes that are far from where they were linearised."""
     leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)[:POLISHED]
-    asked = (weighing.null, *(p for p in leading if _hopeful(weighing, p)))
+    asked = (weighing.null, *_within(weighing, leading, behind))
     return [p for p in asked if _moved(p, weighing.kappa)]
 
 
-def _hopeful(weighing: Weighing, found: Posterior) -> bool:
-    """Whether another look at a mode may make it what is told."""
-    unit = weighing.kappa if weighing.scattered else 1.0
-    return found.ln_evidence > weighing.best.ln_evidence - HOPELESS * unit
+def _within(weighing: Weighing, found: Sequence[Posterior], behind: float) -> list[Posterior]:
+    """Modes that are so far behind the best at most, which another look may make what is told."""
+    return [p for p in found if p.ln_evidence > weighing.best.ln_evidence - behind]
 
 
-def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
+def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Posterior]:
     """Modes of rough motions that are linearised again after so many rounds.
 
     Closely, as what leads is to be told apart; once more, to see how far evidence hangs on which node touches when; and
@@ -208,9 +209,9 @@ def _looked_at_again(weighing: Weighing, before: int) -> list[Posterior]:
     modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
     # At first, few effects have been looked at more than once, so that the best look at nothing counts, too.
     nothing = weighing.nulls if before else weighing.valleys
-    if not _hopeful(weighing, nothing[0]):
+    if not _within(weighing, nothing[:1], behind):
         nothing = () if before else nothing[:1]  # what is left without an effect is shown in any case
-    asked = [*nothing[:NOTHING], *(p for p in modes[: CLOSELY[before]] if _hopeful(weighing, p))]
+    asked = [*nothing[:NOTHING], *_within(weighing, modes[: CLOSELY[before]], behind)]
     # From where the last look leads, as the one in the middle has been followed before.
     return [weighing.latest(p) for p in asked] if before else asked
 
