@@ -12,6 +12,7 @@ from ringing import effect
 
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.heldout import before_and_after, left_out
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, _unconstrained, distinct, running
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
@@ -112,6 +113,20 @@ def test_trials_that_are_only_predicted_change_no_verdict(made, dragged):
     assert (one.kind, [c.fit.name for c in one.chosen]) == (other.kind, [c.fit.name for c in other.chosen])
     assert one.heldout["kept"][1] < 0.2 * one.heldout["kept"][0]
     assert other.heldout["kept"][1] > 2 * one.heldout["kept"][1]
+
+
+def test_trials_left_out_are_predicted_together_as_one_by_one(dragged):
+    problem, _, _, (fit, *_) = dragged
+    count = len(problem.trials)
+    fits = [dataclasses.replace(fit, errors=np.delete(fit.errors, i)) for i in range(count)]
+    before, after = left_out(problem, fits)
+    for i, trial in enumerate(problem.trials):
+        others = problem.only([t for t in problem.trials if t is not trial])
+        (one,), (other,) = before_and_after(others, fits[i], [trial])
+        assert (before[i].trial, after[i].trial) == (one.trial, other.trial) == (trial.name, trial.name)
+        assert before[i].total == pytest.approx(one.total, rel=1e-3)
+        assert after[i].total == pytest.approx(other.total, rel=1e-3)
+        assert after[i].total < 0.5 * before[i].total
 
 
 def test_it_is_told_what_would_make_an_effect_that_matters_visible(still):
