@@ -111,17 +111,23 @@ def on_a_plane(made):
     return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
 
 
+def with_planes_moved(problem, fit):
+    """Motions of each trial by the finer twin, at a fit without an effect."""
+    wall = WallOffset()
+    points = np.concatenate([np.tile(fit.point, (len(GAPS), 1)), GAPS[:, None] / wall.quantities[0].scale], 1)
+    by_fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
+    (motions,) = by_fine.simulate([((wall,), points)])
+    return motions
+
+
 def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(on_a_plane):
-    problem, fine = on_a_plane, on_a_plane.fine
+    problem = on_a_plane
     assert problem.rough  # as long as nobody has moved its planes
     fit = problem.fit([((), None)], rounds=0)[0]
     assert fit is not None
     (model,) = near(problem, [fit], closely=True)
     assert model is not None
-    wall = WallOffset()
-    points = np.concatenate([np.tile(fit.point, (len(GAPS), 1)), GAPS[:, None] / wall.quantities[0].scale], 1)
-    by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
-    (motions,) = by_fine.simulate([((wall,), points)])
+    motions = with_planes_moved(problem, fit)
     for i, (trial, motion) in enumerate(zip(problem.trials, motions, strict=True)):
         seen = [problem.observation.observe(motion.alone(k), i, fit.errors) for k in range(len(GAPS))]
         left = trial.recording.position - np.mean(seen, 0)
@@ -153,10 +159,7 @@ def test_chance_is_that_at_what_leads_where_it_is_more_than_as_stated(on_a_plane
     problem = on_a_plane
     (fit,) = problem.fit([((), None)], rounds=0)
     assert fit is not None
-    wall = WallOffset()
-    points = np.concatenate([np.tile(fit.point, (len(GAPS), 1)), GAPS[:, None] / wall.quantities[0].scale], 1)
-    by_fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
-    (motions,) = by_fine.simulate([((wall,), points)])
+    motions = with_planes_moved(problem, fit)
     seen = [
         np.stack([problem.observation.observe(m.alone(k), i, fit.errors) for k in range(len(GAPS))])
         for i, m in enumerate(motions)

@@ -162,7 +162,7 @@ def _corrected(
             found.append(_spread(data, model, moved, edges))
         return found
     if problem.touches:
-        # Chance is small, and about the same at all points: as it is in the finer twin at the setup as stated.
+        # Chance is about the same at all points, as long as nothing is looked at closely: that at the setup as stated.
         touching = [
             _with_planes_moved(problem, f, m) if finer else [] for f, m, finer in zip(fits, motions, sharp, strict=True)
         ]

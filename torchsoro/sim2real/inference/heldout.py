@@ -55,7 +55,7 @@ def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed:
         A prediction of each trial; empty where the simulation of one breaks down.
     """
     there = _there(problem, trials)
-    (motions,) = there.simulate([_asked(there, fit, believed)])
+    (motions,) = there.simulate([_as_believed(there) if believed else (fit.effects, fit.point[None])])
     return _predicted(problem, there, fit, motions)
 
 
@@ -64,7 +64,7 @@ def before_and_after(
 ) -> tuple[list[Prediction], list[Prediction]]:
     """:func:`predict` of what is believed and of a fit, simulated together."""
     there = _there(problem, trials)
-    before, after = there.simulate([_asked(there, fit, believed) for believed in (True, False)])
+    before, after = there.simulate([_as_believed(there), (fit.effects, fit.point[None])])
     return _predicted(problem, there, fit, before), _predicted(problem, there, fit, after)
 
 
@@ -77,7 +77,8 @@ def left_out(problem: FitProblem, fits: Sequence[Fit]) -> tuple[list[Prediction]
     """
     trials = problem.trials[: len(fits)]
     there = _there(problem, trials)
-    believed, *found = there.simulate([_asked(there, f, k < 0) for k, f in enumerate((fits[0], *fits), -1)])
+    # Each fit in all trials, of which one counts: lanes that are filled take no longer than empty ones.
+    believed, *found = there.simulate([_as_believed(there), *((f.effects, f.point[None]) for f in fits)])
     before: list[Prediction] = []
     after: list[Prediction] = []
     for i, (trial, fit) in enumerate(zip(trials, fits, strict=True)):
@@ -95,8 +96,9 @@ def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
     return there
 
 
-def _asked(there: FitProblem, fit: Fit, believed: bool) -> Request:
-    return ((), np.zeros((1, len(there.common)))) if believed else (fit.effects, fit.point[None])
+def _as_believed(there: FitProblem) -> Request:
+    """The setup as stated."""
+    return (), np.zeros((1, len(there.common)))
 
 
 def at_clocks_of(
