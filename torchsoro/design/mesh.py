@@ -8,17 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import lazy_loader
 import numpy as np
 from scipy import ndimage
 
-# Both take half a second to import, and most bodies are boxes.
+# trimesh and meshio take a second to import, and most bodies are boxes: whoever needs one imports it. A module that is
+# loaded when it is first looked at would be loaded at once, as ``inspect.getmodule`` looks at all.
 if TYPE_CHECKING:
-    import meshio
-    import trimesh
     from trimesh import Trimesh
-else:
-    meshio, trimesh = lazy_loader.load("meshio"), lazy_loader.load("trimesh")
 
 
 FLAT = 0.999  # cosine of the angle to an axis, above which a triangle lies across it
@@ -110,6 +106,8 @@ def read_surface(path: Path, scale: float = 1.0, origin: tuple[float, float, flo
 
 @functools.lru_cache(maxsize=4)
 def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, float] | None) -> Surface:
+    import trimesh
+
     try:
         mesh = _gmsh(path) if path.suffix.lower() == ".msh" else trimesh.load_mesh(path)
     except Exception as error:  # whatever the reader of that format raises
@@ -124,8 +122,11 @@ def _read(path: Path, _stamp: int, scale: float, origin: tuple[float, float, flo
     return Surface(mesh=mesh)
 
 
-def _gmsh(path: Path) -> trimesh.Trimesh:
+def _gmsh(path: Path) -> Trimesh:
     """The triangles of a mesh of gmsh, or the faces that only one of its tetrahedra has."""
+    import meshio
+    import trimesh
+
     mesh = meshio.read(path)
     faces = mesh.get_cells_type("triangle")
     if not len(faces) and len(tetrahedra := mesh.get_cells_type("tetra")):
@@ -151,6 +152,8 @@ def check_fit(
         ValueError: if the surface is larger than the box, leaves it, or is thinner than a spacing at more than a tenth
             of its area.
     """
+    import trimesh
+
     has = " x ".join(f"{length:.4g}" for length in surface.size)
     box = " x ".join(f"{length:.4g}" for length in size)
     if any(length > edge * (1 + 1e-6) for length, edge in zip(surface.size, size, strict=True)):

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchsoro.output.page import pixels
+from torchsoro.output.canvas import pixels
 from torchsoro.output.slider import SCRIPT
 from torchsoro.storage import atomic_write
 

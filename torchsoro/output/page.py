@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
+from torchsoro.output.canvas import canvas_of, pixels
 from torchsoro.output.levelset import as_array
 from torchsoro.output.scene import FAINT, FULL, INK, PRESSURE, REST, Camera, PlaneTuple, Scene, Shape, bounds_of
 from torchsoro.storage import atomic_write
@@ -108,12 +108,6 @@ def motion_of(
     return DrawnMotion(shape, placed, bounds_of([v for v, _ in placed]), times, kilopascal, cog, moved, along, travel)
 
 
-def canvas_of(width: int, height: int, dpi: int = 100) -> tuple[Figure, FigureCanvasAgg]:
-    """A white figure of so many pixels, without a display."""
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-    return figure, FigureCanvasAgg(figure)
-
-
 class Page:
     """A white page of so many pixels for lettered panels; places are in pixels from its upper left corner."""
 
@@ -145,12 +139,6 @@ class Page:
         with atomic_write(path) as file:
             Image.fromarray(pixels(self.canvas)).save(file, format="PNG", dpi=(self.dpi, self.dpi))
         return path
-
-
-def pixels(canvas: FigureCanvasAgg) -> np.ndarray:
-    """Draw, and return the picture as uint8 [height, width, 3]."""
-    canvas.draw()
-    return np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
 def pressure_trace(axes: Axes, time: np.ndarray, pressure: np.ndarray) -> Any:

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
+from torchsoro.output.canvas import canvas_of, pixels
 from torchsoro.output.levelset import as_array
 from torchsoro.output.page import (
     DrawnMotion,
-    canvas_of,
     check_frames,
     check_planes,
     gait_panels,
@@ -32,7 +32,6 @@ from torchsoro.output.page import (
     last_cycle,
     motion_of,
     path_panels,
-    pixels,
     pressure_trace,
 )
 from torchsoro.output.scene import FAINT, INK, REST, Camera, PlaneTuple, Scene, Shape, Skin, bounds_of, camera_path

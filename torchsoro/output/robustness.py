@@ -20,8 +20,9 @@ from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.design.scenarios import LIMITS, NOMINAL
 from torchsoro.output.archive import find, load_resampled, load_supply
+from torchsoro.output.canvas import canvas_of, pixels
 from torchsoro.output.delivery import spread_line
-from torchsoro.output.page import canvas_of, heading, pixels, plain, scenario_panel
+from torchsoro.output.page import heading, plain, scenario_panel
 from torchsoro.output.scene import INK, REST
 from torchsoro.storage import atomic_write, check_folder
 

@@ -33,12 +33,11 @@ class ElsewhereIntegrator(TotalSegmentIntegrator):
         self.features |= layout.ANY_LOAD
 
     def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
-        """Advance the state [B, L] over the segment; what is observed and returned is where ``start`` is."""
+        """Advance the state [B, L] over the segment; what is returned is where ``start`` is.
 
-        def back(k: int | list[int], state: Tensor) -> None:
-            observe(k, state.to(start.device))
-
-        return super().forward(start.to(self.device), keep=keep, observe=back).to(start.device)
+        What is observed is on the device: markers are fewer numbers than the nodes near them, and copies take time.
+        """
+        return super().forward(start.to(self.device), keep=keep, observe=observe).to(start.device)
 
     def record(self, states: Tensor) -> tuple[Tensor, ...]:
         """Nothing is kept."""

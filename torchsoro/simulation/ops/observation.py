@@ -134,7 +134,7 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
 def _at_markers(markers: Markers, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Places, velocities and deformation gradients of markers, from the motion of the nodes near them [..., 6, U]."""
     moved, drift, gradient = markers.observe(near)
-    return markers.places + moved, drift, gradient + torch.eye(3).to(near)
+    return markers.places.to(moved.device) + moved, drift, gradient + torch.eye(3).to(near)
 
 
 def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:

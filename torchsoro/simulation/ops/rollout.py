@@ -91,6 +91,7 @@ def _forward(*arguments) -> tuple[Tensor, ...]:
 
     def look(k: int | list[int], s: Tensor) -> None:
         found = observe((s, weight, inputs.coefficients, inputs.pressure[k], inputs.air), scene)
+        found = tuple(t.to(state.device) for t in found)
         seen.append(found if isinstance(k, list) else tuple(t.unsqueeze(0) for t in found))
 
     states = integrator.forward(state, keep=keep, observe=look)
