@@ -17,9 +17,10 @@ from torchsoro.sim2real.inference.candidates import (
     data_of,
     model_of,
     near,
+    planes_moved,
     weigh,
     weighing_of,
-    with_chance_at,
+    with_chance_of,
 )
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.discretization import measure
@@ -155,6 +156,20 @@ def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_
     assert one.numerics.amplitude == pytest.approx(other.numerics.amplitude, rel=1e-3)
 
 
+def test_what_was_simulated_for_chance_is_not_simulated_again_to_look_closely(on_a_plane):
+    error = on_a_plane.discretization.replace(chance=2 * CALM * on_a_plane.noise)
+    problem = on_a_plane.only(on_a_plane.trials, discretization=error)
+    (fit,) = problem.fit([((), None)], rounds=0)
+    assert fit is not None and problem.rough and not problem.many_valleys
+    seen, before = planes_moved(problem, fit), problem.tally.simulations
+    (again,) = near(problem, [fit], closely=True, seen=seen)
+    spared = problem.tally.simulations - before
+    (anew,) = near(problem, [fit], closely=True)
+    assert problem.tally.simulations - before - spared == spared + len(GAPS) * len(problem.trials)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in zip(again.residuals, anew.residuals, strict=True))
+    assert np.array_equal(again.numerics.amplitude, anew.numerics.amplitude)
+
+
 def test_chance_is_that_at_what_leads_where_it_is_more_than_as_stated(on_a_plane):
     problem = on_a_plane
     (fit,) = problem.fit([((), None)], rounds=0)
@@ -170,7 +185,7 @@ def test_chance_is_that_at_what_leads_where_it_is_more_than_as_stated(on_a_plane
 
     def after(known):
         error = problem.discretization.replace(chance=known)
-        return with_chance_at(problem.only(problem.trials, discretization=error), fit)
+        return with_chance_of(problem.only(problem.trials, discretization=error), planes_moved(problem, fit))
 
     assert after(0.0).discretization.chance == pytest.approx(chance, rel=0.02)  # recordings have lost samples
     assert after(2 * chance).discretization.chance == 2 * chance

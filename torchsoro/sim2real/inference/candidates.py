@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -32,6 +32,8 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
+
+Seen = Mapping[Fit, Sequence[Motions]]  # residuals of fits by equally good twins; none where one breaks down
 
 
 def data_of(problem: Likelihood) -> Data:
@@ -96,7 +98,9 @@ def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
     return tuple(sorted(found))
 
 
-def near(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> list[Linearised | None]:
+def near(
+    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, seen: Seen | None = None
+) -> list[Linearised | None]:
     """Fits as linearised models, with the error that finer twins leave; all simulated together.
 
     Without a finer twin, or with trials that come with a simulation of their own, models are those of the problem
@@ -106,6 +110,7 @@ def near(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> 
         problem: That was fitted.
         fits: Ends of searches.
         closely: Whether, of rough motions, planes are moved in the finer twin, which takes some times as long.
+        seen: What is known of that, see :func:`planes_moved`.
 
     Returns:
         A model of each; None where a simulation breaks down.
@@ -133,7 +138,7 @@ def near(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> 
                 numerics=TwinError(amplitude=np.sqrt(stated)),
             )
         )
-    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely)
+    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely, seen or {})
 
 
 def _corrected(
@@ -143,14 +148,16 @@ def _corrected(
     models: Sequence[Linearised | None],
     fine: Twin,
     closely: bool,
+    seen: Seen,
 ) -> list[Linearised | None]:
     """Models with the residuals by finer twins, and the error of these."""
     data = data_of(problem)
     by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
     edges = problem.twin.edge / fine.edge
     if problem.rough and closely:
-        touching = _touching(problem, by_fine, fits)
-        return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
+        fresh = [f for f in fits if f not in seen]
+        seen = {**seen, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
+        return [_spread(data, model, seen[f], edges) for f, model in zip(fits, models, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
@@ -186,7 +193,7 @@ def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], e
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
     """Residuals with planes a little nearer and farther, of each fit; none where one breaks down."""
-    moved = shifted(twin, [(f.effects, f.point[None]) for f in fits], GAPS)
+    moved = shifted(twin, [(f.effects, f.point[None]) for f in fits], GAPS) if fits else []
     return [_residuals(problem, f, motions) for f, motions in zip(fits, moved, strict=True)]
 
 
@@ -236,17 +243,22 @@ def _slopes(
     return tuple(found)
 
 
-def weigh(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) -> list[tuple[Fit, Posterior]]:
+def weigh(
+    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, seen: Seen | None = None
+) -> list[tuple[Fit, Posterior]]:
     """Posteriors near fits, each with the fit; without those that break down.
 
     Args:
         problem: That was fitted.
         fits: Ends of searches.
         closely: See :func:`near`.
+        seen: The same.
     """
     data = data_of(problem)
     models = [
-        (fit, model) for fit, model in zip(fits, near(problem, fits, closely=closely), strict=True) if model is not None
+        (fit, model)
+        for fit, model in zip(fits, near(problem, fits, closely=closely, seen=seen), strict=True)
+        if model is not None
     ]
     # Two pools, as a thread that waits for others of its own pool may wait for ever.
     with ThreadPoolExecutor(problem.threads) as pool, ThreadPoolExecutor(problem.threads) as inner:
@@ -254,14 +266,18 @@ def weigh(problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False) ->
         return list(zip((f for f, _ in models), after, strict=True))
 
 
-def with_chance_at(problem: FitProblem, fit: Fit) -> FitProblem:
-    """The problem with chance in touching as it is at a fit, by the finer twin, where that is more than as stated."""
+def planes_moved(problem: FitProblem, fit: Fit) -> Seen:
+    """Residuals of a fit by the finer twin with planes a little nearer and farther; nothing without such a twin."""
     if problem.finer_twin is None:
-        return problem
+        return {}
     by_fine = problem.only(problem.trials, twin=problem.finer_twin, discretization=DiscretizationError())
-    (variants,) = _touching(problem, by_fine, [fit])
-    found, known = chance_in(variants, GAPS) if variants else math.inf, problem.discretization
-    return problem.only(problem.trials, discretization=known.replace(chance=max(found, known.chance)))
+    return {fit: _touching(problem, by_fine, [fit])[0]}
+
+
+def with_chance_of(problem: FitProblem, seen: Seen) -> FitProblem:
+    """The problem with chance in touching as large as it is at a fit, where that is more than as stated."""
+    found, known = (chance_in(v, GAPS) if v else math.inf for v in seen.values()), problem.discretization
+    return problem.only(problem.trials, discretization=known.replace(chance=max(known.chance, *found, 0.0)))
 
 
 def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> Weighing:

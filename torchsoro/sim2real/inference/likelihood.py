@@ -180,9 +180,11 @@ class Likelihood:
         return self.only(self.trials, discretization=self.discretization.replace(correction=correction))
 
     def corrected_each(self, points: Sequence[Request]) -> Self:
-        """The same, but effects are corrected by the finer twin where each of them is now, at one point."""
-        kept = [t for t in self.experiment.heldout if t.recording is not None]
-        found = self._finer([*self.trials, *kept], points)
+        """The same, but effects are corrected by the finer twin where each of them is now, at one point.
+
+        Trials that are left out are not: the finer twin itself predicts them.
+        """
+        found = self._finer(self.trials, points)
         known = self.discretization
         own = {e: {**known.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
         return self.only(self.trials, discretization=known.replace(own={**known.own, **own}))

@@ -12,7 +12,7 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
-from torchsoro.sim2real.inference.candidates import at_mode, data_of, weigh, weighing_of, with_chance_at
+from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
@@ -141,15 +141,19 @@ def weighed(
     known = weigh(problem, [null_model, *strained, *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.best
+    leading = at_mode(problem, _fit_of(known, best), best.mode)
+    seen = {}
     if problem.touches and not problem.rough and best.near.model.effects:
-        problem = with_chance_at(problem, at_mode(problem, _fit_of(known, best), best.mode))
+        seen = planes_moved(problem, leading)
+        problem = with_chance_of(problem, seen)
     for k in range(ROUNDS):
         # Among many valleys, or once it is seen to scatter, evidence changes by as much as it is divided by.
         behind = HOPELESS * (weighing.kappa if problem.many_valleys or weighing.scattered else 1.0)
         far = _looked_at_again(weighing, behind, k) if problem.rough else _far(weighing, behind)
         if not far:
             break
-        again = weigh(problem, [at_mode(problem, _fit_of(known, p), p.mode) for p in far], closely=True)
+        ends = [leading if p is best else at_mode(problem, _fit_of(known, p), p.mode) for p in far]
+        again = weigh(problem, ends, closely=True, seen=seen)
         sound = {p.near.model.name for _, p in again}
         if not problem.rough:  # what breaks down there stays as it was
             known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]
