@@ -264,7 +264,9 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(RECIPES.p
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-@pytest.mark.parametrize("more", [{}, {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)}])
+@pytest.mark.parametrize(
+    "more", [{}, {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)}, {"feature": 0.004}]
+)
 def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(recipes, tmp_path, more):
     path = tmp_path / "two"
     begin = time.monotonic()

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoro.design.features import threshold_of
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass
 from torchsoro.design.processes import Processes
 from torchsoro.design.risk import CVaR, parse_risk
@@ -29,6 +30,7 @@ TURNS = ("turn", "turn_inflated")  # and of a turner
 # Share of the risk's gradient by scenarios that overflowed, or that fell, above which it says nothing.
 MOST = 0.5
 _END, _JUDGE, _PULL = 0.0, 1.0, 2.0  # what the other processes are told to do
+VARIANTS = ("intermediate", "eroded", "dilated")  # of a design whose features have a least thickness
 FALLEN = 0.1  # sinking beyond what is allowed, in heights of the body, from which a robot counts as fallen
 
 
@@ -53,9 +55,14 @@ def shares(robot: Robot, values: Tensor) -> Tensor:
 class Ensemble:
     """Simulates a robot in its settings' scenarios, by one process or several, with a timing that is designed, too.
 
+    With a least thickness of features, scenarios meet three variants of the design in turn: itself, eroded, dilated.
+
     Args:
         robot: The robot.
         processes: Those of the run.
+
+    Attributes:
+        thresholds: Of the projection, for each variant.
     """
 
     def __init__(self, robot: Robot, processes: Processes | None = None) -> None:
@@ -68,6 +75,10 @@ class Ensemble:
         self._places = [*self.own, *[self.own[-1]] * spare]
         self.judged = JUDGED + (TURNS if robot.settings.robot == "turner" else ())
         self._timing = {name: one for name, one in robot.supply.named_parameters() if one.requires_grad}
+        feature = robot.settings.feature
+        eroded = threshold_of(robot.settings.filter_radius, feature) if feature else 0.0
+        self.thresholds = (0.0, eroded, -eroded) if eroded else (0.0,)
+        self._variants: list[Tensor] = []  # densities, with their gradient by the design variable
         self._inputs: tuple[Tensor, ...] = ()  # density, and what is designed of the timing, of each place
         self._values = self._all = torch.empty(0)
         self.lost = 0
@@ -95,11 +106,12 @@ class Ensemble:
         robot, s = self.robot, self.robot.settings
         batch = self.sample(iteration)
         dt = robot.step(gamma, batch)
+        self._variants = [gamma, *(robot.field(threshold=one) for one in self.thresholds[1:])]
         for halving in range(s.halvings + 1):
             step = dt / 2**halving
             _tell(self.processes, _JUDGE, iteration, gravity_scale, step)
-            self._share(gamma.detach())
-            outcome = self._simulated(gamma.detach(), batch, gravity_scale, step)
+            variants = self._share(torch.stack(self._variants).detach())
+            outcome = self._simulated(variants, batch, gravity_scale, step)
             error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
             if error is None:
                 break
@@ -146,8 +158,10 @@ class Ensemble:
         for k, weight in enumerate(part.tolist()):
             if weight == 0:
                 continue
-            row = by_gamma[k] if by_mass is None else by_gamma[k] + weight * by_mass
-            (by_phi,) = torch.autograd.grad(gamma, phi, row, retain_graph=True)
+            designs, rows_k = [self._variants[k % len(self.thresholds)]], [by_gamma[k]]
+            if by_mass is not None:
+                designs, rows_k = [*designs, gamma], [*rows_k, weight * by_mass]
+            (by_phi,) = torch.autograd.grad(designs, phi, rows_k, retain_graph=True)
             groups = [[by_phi], [rows[k] for rows in by_timing]]
             norms = [float(torch.cat([one.flatten() for one in group]).norm()) if group else 0.0 for group in groups]
             if not all(map(math.isfinite, norms)):
@@ -173,26 +187,27 @@ class Ensemble:
                 for rows in self._pulled(bars):
                     self.processes.gather(rows, self.parts)
                 continue
-            gamma = self._share(like.new_empty(self.robot.domain.count))
-            outcome = self._simulated(gamma, self.sample(int(iteration)), gravity_scale, step)
+            variants = self._share(like.new_empty(len(self.thresholds), self.robot.domain.count))
+            outcome = self._simulated(variants, self.sample(int(iteration)), gravity_scale, step)
             error = self.processes.first_error(outcome if isinstance(outcome, SimulationDiverged) else None)
             if error is None:
                 self.processes.gather(self._values.detach(), self.parts)
 
     @torch.no_grad()
-    def _share(self, gamma: Tensor) -> Tensor:
-        """The design of process 0: its density [N]; its timing is put into the robot."""
+    def _share(self, variants: Tensor) -> Tensor:
+        """The design of process 0: densities of its variants [V, N]; its timing is put into the robot."""
         for one in self._timing.values():
             one.copy_(self.processes.broadcast(one.detach()))
-        return self.processes.broadcast(gamma)
+        return self.processes.broadcast(variants)
 
     @torch.enable_grad()
     def _simulated(
-        self, gamma: Tensor, batch: ScenarioBatch, gravity_scale: float, dt: float
+        self, variants: Tensor, batch: ScenarioBatch, gravity_scale: float, dt: float
     ) -> Outcome | SimulationDiverged:
         """Simulate this process's share; keeps what :meth:`_pulled` goes back through."""
-        one = (gamma, *(one.detach() for one in self._timing.values()))
-        self._inputs = tuple(value.expand(len(self._places), -1).clone().requires_grad_() for value in one)
+        met = variants[[k % len(variants) for k in self._places]]
+        timed = (one.detach().expand(len(self._places), -1).clone() for one in self._timing.values())
+        self._inputs = tuple(value.requires_grad_() for value in (met, *timed))
         rows, timing = self._inputs[0], dict(zip(self._timing, self._inputs[1:], strict=True))
         pressure = self.robot.supply.each(timing) if timing else None
         how: dict[str, Any] = {"gravity_scale": gravity_scale, "pressure": pressure, "dt": dt}

@@ -96,22 +96,28 @@ class DesignField(nn.Module):
         frozen = torch.where(domain.lattice(domain.wall), 1.0, -1.0).double()
         self.register_buffer("_frozen", frozen, persistent=False)
 
-    def forward(self, phi: Tensor | None = None) -> Tensor:
+    def forward(self, phi: Tensor | None = None, *, threshold: float = 0.0) -> Tensor:
         """Return the density of every particle.
 
         Args:
             phi: Design variable to use in place of the parameter, [nx, ny, nz] in [-1, 1]: for example the output of a
                 network of the particle positions.
+            threshold: Value of phi~ between void and solid, in (-1, 1). Above 0 the design is eroded, below dilated;
+                see :func:`torchsoro.design.features.threshold_of`.
 
         Returns:
             Density gamma in [0, 1], [N], in the type of the design variable.
 
         Raises:
-            ValueError: The design variable has the wrong shape or type, or leaves [-1, 1].
+            ValueError: The design variable has the wrong shape or type, or leaves [-1, 1], as the threshold does.
         """
+        if not -1.0 < threshold < 1.0:
+            raise ValueError(f"threshold: got {threshold!r}, want a number between -1 and 1")
         phi = self._checked(phi)
-        smooth = self._smooth(phi)
-        gamma = 0.5 * (torch.tanh(self.beta * smooth) / math.tanh(self.beta) + 1.0)
+        # What phi~ = -1 and 1 come to is mapped to 0 and 1.
+        low, high = (math.tanh(self.beta * (1.0 + side * threshold)) for side in (1.0, -1.0))
+        pushed = torch.tanh(self.beta * (self._smooth(phi) - threshold)) + 0.5 * (low - high)
+        gamma = 0.5 * (pushed / (0.5 * (low + high)) + 1.0)
         # Vectorised tanh may round two mirror images differently.
         gamma = _clip(self._mirror(gamma), 0.0, 1.0)
         gamma = torch.where(self._design, gamma, 0.5 * (self._frozen + 1.0))

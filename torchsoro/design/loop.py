@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from torchsoro.design.ensemble import MOST, Ensemble, fallen, overall, shares
+from torchsoro.design.ensemble import MOST, VARIANTS, Ensemble, fallen, overall, shares
 from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
 from torchsoro.design.processes import Processes
 from torchsoro.design.robot import Outcome, Robot
@@ -218,11 +218,16 @@ def restore(
 
 
 def spread(robot: Robot, outcome: Outcome, lost: int) -> dict[str, float]:
-    """How the travel spreads over the scenarios, falls, and gradients that overflowed, by their tags."""
+    """How the travel spreads over the scenarios, falls, and gradients that overflowed, by their tags.
+
+    With a least thickness of features, the mean of the design's variants, too.
+    """
     travel = outcome.travel.detach().double()
+    variants = VARIANTS if robot.settings.feature else ()
     quantities = {"min": travel.min(), "tenth": travel.quantile(0.1), "mean": travel.mean(), "max": travel.max()}
     return {
         **{f"scenarios/L_{name}": float(value) for name, value in quantities.items()},
+        **{f"scenarios/L_{name}": float(travel[i :: len(variants)].mean()) for i, name in enumerate(variants)},
         "scenarios/falls": int(fallen(robot, outcome).sum()),
         "scenarios/gradients_lost": lost,
     }

@@ -202,6 +202,8 @@ class Settings:
     """The same from the second iteration of ``sharpen`` on."""
     sharpen: tuple[CountOrZero, CountOrZero] = (0, 0)
     """Iterations between which the projection sharpens, and steps shrink in proportion; 0 0 for the paper's, never."""
+    feature: AtLeastZero = 0.0
+    """Least thickness of walls and gaps [m]; scenarios meet the design, an eroded and a dilated one in turn. 0: any."""
     counted: Literal["design", "body"] = "design"
     """Whose centre of gravity travels: the design domain's (the paper's) or the chamber wall's, too."""
     feet: _Density = 0.0
@@ -327,7 +329,16 @@ class Settings:
             )
 
     def _check_scenarios(self) -> None:
-        """Refuse bad ranges and a bad risk."""
+        """Refuse bad ranges, a bad risk, and features that the filter cannot tell."""
+        if self.feature > 0:
+            from torchsoro.design.features import threshold_of
+
+            threshold_of(self.filter_radius, self.feature)
+            if self.scenarios < 3:
+                raise ValueError(
+                    f"feature = {self.feature:g} m: wanted at least 3 scenarios (scenarios = {self.scenarios}), as the "
+                    "design, an eroded and a dilated one take turns in them"
+                )
         check_friction("friction_range", self.friction_range)
         for name, (least, most, unit) in LIMITS.items():
             setting = {"tilt_x": "tilt", "tilt_y": "tilt"}.get(name, name.partition("_")[0])
