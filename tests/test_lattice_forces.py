@@ -141,8 +141,11 @@ def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole:
 )
 def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, within):
     one, other = (compared(lattice, dtype, lanes=lanes, whole=whole) for lanes in (True, False))
-    off = {name: float((one[name] - t).norm() / t.norm()) for name, t in other.items() if t.any() or one[name].any()}
-    assert max(off.values()) <= within, off
+    # Where sums cancel, numbers in single precision are no nearer to those in double, and so not to each other.
+    exact = other if dtype == torch.float64 else compared(lattice, torch.float64, lanes=True, whole=whole)
+    for name, t in other.items():
+        rounding = 2 * float((t - exact[name]).norm())
+        assert float((one[name] - t).norm()) <= max(within * float(t.norm()), rounding), name
 
 
 @pytest.mark.parametrize("lattice", [uneven(), hollow()], ids=["uneven", "whole"])
