@@ -77,7 +77,7 @@ class Ensemble:
         self._timing = {name: one for name, one in robot.supply.named_parameters() if one.requires_grad}
         feature = robot.settings.feature
         eroded = threshold_of(robot.settings.filter_radius, feature) if feature else 0.0
-        self.thresholds = (0.0, eroded, -eroded) if eroded else (0.0,)
+        self.thresholds = (0.0, eroded, -eroded) if feature else (0.0,)
         self._variants: list[Tensor] = []  # densities, with their gradient by the design variable
         self._inputs: tuple[Tensor, ...] = ()  # density, and what is designed of the timing, of each place
         self._values = self._all = torch.empty(0)
@@ -158,10 +158,10 @@ class Ensemble:
         for k, weight in enumerate(part.tolist()):
             if weight == 0:
                 continue
-            designs, rows_k = [self._variants[k % len(self.thresholds)]], [by_gamma[k]]
+            designs, bars = [self._variants[k % len(self.thresholds)]], [by_gamma[k]]
             if by_mass is not None:
-                designs, rows_k = [*designs, gamma], [*rows_k, weight * by_mass]
-            (by_phi,) = torch.autograd.grad(designs, phi, rows_k, retain_graph=True)
+                designs, bars = [*designs, gamma], [*bars, weight * by_mass]
+            (by_phi,) = torch.autograd.grad(designs, phi, bars, retain_graph=True)
             groups = [[by_phi], [rows[k] for rows in by_timing]]
             norms = [float(torch.cat([one.flatten() for one in group]).norm()) if group else 0.0 for group in groups]
             if not all(map(math.isfinite, norms)):

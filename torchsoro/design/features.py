@@ -49,6 +49,6 @@ def threshold_of(radius: float, feature: float) -> float:
     def filtered(width: float, x: float) -> float:
         return 2 * (within(x + width / 2) - within(x - width / 2)) - 1
 
-    # Thicker than what is left of it, as far as it is no thicker than the filter.
+    # Of the design variable: a plate that is thinner than the filter comes out thinner than it was.
     width = root_scalar(lambda w: filtered(w, feature / 2), bracket=(feature, feature + 2 * radius)).root
     return 1 - 2 * beyond(width / 2)
