@@ -162,8 +162,8 @@ def test_what_was_simulated_for_chance_is_not_simulated_again_to_look_closely(on
     (fit,) = problem.fit([((), None)], rounds=0)
     assert fit is not None
     assert problem.rough
-    seen, before = planes_moved(problem, fit), problem.tally.simulations
-    (again,) = near(problem, [fit], closely=True, seen=seen)
+    moved, before = planes_moved(problem, fit), problem.tally.simulations
+    (again,) = near(problem, [fit], closely=True, moved=moved)
     spared = problem.tally.simulations - before
     (anew,) = near(problem, [fit], closely=True)
     assert again is not None

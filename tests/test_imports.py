@@ -157,6 +157,16 @@ def test_importing_the_package_starts_no_taichi():
     assert done.returncode == 0, done.stderr
 
 
+def test_explaining_imports_nothing_that_only_robots_and_meshes_need():
+    code = (
+        "import sys, torchsoro.sim2real.pipeline\n"
+        "found = {'trimesh', 'meshio', 'networkx'} & set(sys.modules)\n"
+        "assert not found, found"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_every_public_name_is_defined_in_one_module():
     names = getattr(torchsoro, "__all__", [])
     assert len(set(names)) == len(names)

@@ -108,8 +108,11 @@ def test_gradcheck_over_several_tiles(lanes):
     assert check(p, "state", "coefficients", "pressure", "gravity")
 
 
-def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole: bool):
-    """Outputs by name, and gradients of a weighted sum of them, of a problem in an engine."""
+def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole: bool, bits: int = 0):
+    """Outputs by name, and gradients of a weighted sum of them, of a problem in an engine.
+
+    Gravity is disturbed by so many last bits of single precision.
+    """
     p = problem(formulation="total", lattice=lattice, batch=2, steps=12, samples=(0, 5, 12), lanes=lanes)
     if whole:
         p = completed(p)
@@ -117,6 +120,7 @@ def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole:
     nodes, void = p.scene.lattice.nodes, p.tensors["coefficients"][:, layout.VOID_FRACTION] == 1  # type: ignore[union-attr]
     history = p.tensors["state"][:, 6 * nodes :].view(2, -1, void.shape[1])
     history.masked_fill_((void | (p.scene.kind != -1)).unsqueeze(1), 0)
+    p.tensors["gravity"] = p.tensors["gravity"] * (1 + bits * 2.0**-23)
     p.tensors = {name: t.to(dtype) for name, t in p.tensors.items()}
     leaves = p.leaves()
     outputs = p.run(leaves)
@@ -141,11 +145,15 @@ def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole:
 )
 def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, within):
     one, other = (compared(lattice, dtype, lanes=lanes, whole=whole) for lanes in (True, False))
-    # Where sums cancel, numbers in single precision are no nearer to those in double, and so not to each other.
-    exact = other if dtype == torch.float64 else compared(lattice, torch.float64, lanes=True, whole=whole)
-    for name, t in other.items():
-        rounding = 2 * float((t - exact[name]).norm())
-        assert float((one[name] - t).norm()) <= max(within * float(t.norm()), rounding), name
+    off = {name: float((one[name] - t).norm() / t.norm()) for name, t in other.items() if t.any() or one[name].any()}
+    beyond = {name: value for name, value in off.items() if value > within}
+    if dtype == torch.float64 or not beyond:
+        assert not beyond
+        return
+    # Where sums cancel, the last bits of an input change what one engine finds in single precision by as much.
+    others = [compared(lattice, dtype, lanes=True, whole=whole, bits=k) for k in (-3, -2, 2, 3)]
+    for name, value in beyond.items():
+        assert value <= 2 * max(float((one[name] - o[name]).norm() / one[name].norm()) for o in others), name
 
 
 @pytest.mark.parametrize("lattice", [uneven(), hollow()], ids=["uneven", "whole"])

@@ -1,17 +1,17 @@
-"""How far a design is eroded and dilated, so that its walls and gaps have a least thickness.
+"""Threshold that erodes and dilates a design, from the least thickness of its walls and gaps.
 
-A design is judged three times: as it is, eroded, and dilated, by thresholds 0, eta and -eta of the projection of the
-filtered design variable phi~ (Wang, Lazarov and Sigmund 2011). A wall that is too thin is not there when eroded, a gap
-that is too narrow not when dilated, and a design that is to do well in all three has neither.
+The intermediate, the eroded and the dilated design are projections of the same filtered design variable phi~, with
+thresholds 0, eta and -eta (Wang, Lazarov and Sigmund 2011). A wall thinner than a length b vanishes in the eroded
+design and a gap narrower than b in the dilated one; a design whose performance needs neither is good in all three.
 
-How thin that is follows from the filter. Its weights (1 - r/R)^3 within a radius R, summed over the planes beside a
-plate, leave beyond a distance x to both sides of a plane the share
+The filter relates eta to b. Its weights (1 - r/R)^3 within a radius R, integrated over planes, leave the share
 
-    T(x) = 3 (1 - x/R)^5 - 2 (1 - x/R)^6 .
+    T(x) = 3 (1 - x/R)^5 - 2 (1 - x/R)^6
 
-Of a plate of thickness w, phi = 1 within it and -1 elsewhere, the filtered variable in its middle is 1 - 2 T(w/2): with
-that threshold it is just gone. As it is, it is as thick as where phi~ > 0. Rods and balls are filtered more, so that
-those that are left when eroded are thicker.
+farther than x from a plane through the centre. For a plate with phi = 1 within a width w and -1 elsewhere, phi~ in the
+middle is 1 - 2 T(w/2), which is the threshold eta at which the plate vanishes; its thickness b in the intermediate
+design is that of the region where phi~ > 0. Rods and balls lose more in the filter: those that survive erosion are
+thicker than b.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from scipy.optimize import root_scalar
 
 
 def threshold_of(radius: float, feature: float) -> float:
-    """Threshold eta with which a plate is just eroded that is ``feature`` thick as it is.
+    """Threshold eta at which a plate of thickness ``feature`` in the intermediate design vanishes.
 
     Args:
         radius: Of the filter, R [m].
-        feature: Least thickness of walls and gaps [m].
+        feature: Least thickness of walls and gaps, b [m].
 
     Returns:
-        Between 0, for no thickness at all, and 1, for that of the filter, 2 R.
+        From 0 for a thickness of 0 to 1 for one of 2 R.
 
     Raises:
-        ValueError: if the feature is not above 0, or as wide as the filter.
+        ValueError: if ``feature`` is not between 0 and 2 R.
     """
     if not 0 < feature < 2 * radius:
         raise ValueError(
-            f"feature = {feature:g} m: wanted above 0 and below twice the filter radius, {2 * radius:g} m, of which a "
-            "plate is no more told from the solid"
+            f"feature = {feature:g} m: wanted above 0 and below twice the filter radius, {2 * radius:g} m: no "
+            "threshold erodes a thicker plate"
         )
 
     def beyond(x: float) -> float:
@@ -49,6 +49,6 @@ def threshold_of(radius: float, feature: float) -> float:
     def filtered(width: float, x: float) -> float:
         return 2 * (within(x + width / 2) - within(x - width / 2)) - 1
 
-    # Of the design variable: a plate that is thinner than the filter comes out thinner than it was.
+    # The filter makes a plate thinner: w is above b.
     width = root_scalar(lambda w: filtered(w, feature / 2), bracket=(feature, feature + 2 * radius)).root
     return 1 - 2 * beyond(width / 2)

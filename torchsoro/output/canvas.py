@@ -1,4 +1,4 @@
-"""White figures without a display, and their pixels."""
+"""White figures without a display, and their pixels; a report needs no more, and nothing of robots and meshes."""
 
 from __future__ import annotations
 

@@ -248,9 +248,7 @@ class Simulator(nn.Module):
 
     def _sound(self, recorded: dict[str, Tensor], lead: int) -> Tensor:
         """Which simulations [...] recorded finite numbers only, and places inside of the box."""
-        whole = (t.detach().flatten(lead) for t in recorded.values())
-        ends = [end for t in whole if t.shape[lead] for end in t.aminmax(dim=lead)]  # NaN is both of them
-        found = torch.isfinite(torch.stack(ends)).all(0)
+        found = torch.stack([torch.isfinite(t.detach()).flatten(lead).all(lead) for t in recorded.values()]).all(0)
         for name in ("position", "center_of_gravity"):
             x = recorded[name].detach()
             if not x.shape[-1]:  # not recorded

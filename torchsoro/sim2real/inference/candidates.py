@@ -33,7 +33,7 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
 
-Seen = Mapping[Fit, Sequence[Motions]]  # residuals of fits by equally good twins; none where one breaks down
+Moved = Mapping[Fit, Sequence[Motions]]  # residuals by the finer twin with planes moved; none where one breaks down
 
 
 def data_of(problem: Likelihood) -> Data:
@@ -99,7 +99,7 @@ def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
 
 
 def near(
-    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, seen: Seen | None = None
+    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, moved: Moved | None = None
 ) -> list[Linearised | None]:
     """Fits as linearised models, with the error that finer twins leave; all simulated together.
 
@@ -110,7 +110,7 @@ def near(
         problem: That was fitted.
         fits: Ends of searches.
         closely: Whether, of rough motions, planes are moved in the finer twin, which takes some times as long.
-        seen: What is known of that, see :func:`planes_moved`.
+        moved: What was simulated of that before, see :func:`planes_moved`.
 
     Returns:
         A model of each; None where a simulation breaks down.
@@ -138,7 +138,7 @@ def near(
                 numerics=TwinError(amplitude=np.sqrt(stated)),
             )
         )
-    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely, seen or {})
+    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely, moved or {})
 
 
 def _corrected(
@@ -148,16 +148,16 @@ def _corrected(
     models: Sequence[Linearised | None],
     fine: Twin,
     closely: bool,
-    seen: Seen,
+    moved: Moved,
 ) -> list[Linearised | None]:
     """Models with the residuals by finer twins, and the error of these."""
     data = data_of(problem)
-    by_fine = problem.only(problem.trials, twin=fine, discretization=DiscretizationError())
+    by_fine = problem.by(fine)
     edges = problem.twin.edge / fine.edge
     if problem.rough and closely:
-        fresh = [f for f in fits if f not in seen]
-        seen = {**seen, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
-        return [_spread(data, model, seen[f], edges) for f, model in zip(fits, models, strict=True)]
+        fresh = [f for f in fits if f not in moved]
+        moved = {**moved, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
+        return [_spread(data, model, moved[f], edges) for f, model in zip(fits, models, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
@@ -165,8 +165,8 @@ def _corrected(
         # What a plane's place changes, by the twin in use: it is of that order in the finer one.
         found: list[Linearised | None] = []
         for model, finer, variants in zip(models, sharp, _touching(problem, coarse, fits), strict=True):
-            moved = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
-            found.append(_spread(data, model, moved, edges))
+            finest = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
+            found.append(_spread(data, model, finest, edges))
         return found
     if problem.touches:
         # Chance is about the same at all points, as long as nothing is looked at closely: that at the setup as stated.
@@ -175,7 +175,7 @@ def _corrected(
         ]
         return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
     middle = between(problem.twin, fine)
-    by_middle = problem.only(problem.trials, twin=middle, discretization=DiscretizationError())
+    by_middle = problem.by(middle)
     dull = [_residuals(problem, f, motions) for f, motions in zip(fits, by_middle.simulate(ask), strict=True)]
     ratio = max((fine.count / middle.count) ** (1 / 3), LEAST_RATIO)
     return [
@@ -193,7 +193,7 @@ def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], e
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
     """Residuals with planes a little nearer and farther, of each fit; none where one breaks down."""
-    moved = shifted(twin, [(f.effects, f.point[None]) for f in fits], GAPS) if fits else []
+    moved = shifted(twin, [(f.effects, f.point[None]) for f in fits], GAPS)
     return [_residuals(problem, f, motions) for f, motions in zip(fits, moved, strict=True)]
 
 
@@ -244,7 +244,7 @@ def _slopes(
 
 
 def weigh(
-    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, seen: Seen | None = None
+    problem: FitProblem, fits: Sequence[Fit], *, closely: bool = False, moved: Moved | None = None
 ) -> list[tuple[Fit, Posterior]]:
     """Posteriors near fits, each with the fit; without those that break down.
 
@@ -252,12 +252,12 @@ def weigh(
         problem: That was fitted.
         fits: Ends of searches.
         closely: See :func:`near`.
-        seen: The same.
+        moved: The same.
     """
     data = data_of(problem)
     models = [
         (fit, model)
-        for fit, model in zip(fits, near(problem, fits, closely=closely, seen=seen), strict=True)
+        for fit, model in zip(fits, near(problem, fits, closely=closely, moved=moved), strict=True)
         if model is not None
     ]
     # Two pools, as a thread that waits for others of its own pool may wait for ever.
@@ -266,17 +266,16 @@ def weigh(
         return list(zip((f for f, _ in models), after, strict=True))
 
 
-def planes_moved(problem: FitProblem, fit: Fit) -> Seen:
+def planes_moved(problem: FitProblem, fit: Fit) -> Moved:
     """Residuals of a fit by the finer twin with planes a little nearer and farther; nothing without such a twin."""
     if problem.finer_twin is None:
         return {}
-    by_fine = problem.only(problem.trials, twin=problem.finer_twin, discretization=DiscretizationError())
-    return {fit: _touching(problem, by_fine, [fit])[0]}
+    return {fit: _touching(problem, problem.by(problem.finer_twin), [fit])[0]}
 
 
-def with_chance_of(problem: FitProblem, seen: Seen) -> FitProblem:
+def with_chance_of(problem: FitProblem, moved: Moved) -> FitProblem:
     """The problem with chance in touching as large as it is at a fit, where that is more than as stated."""
-    found, known = (chance_in(v, GAPS) if v else math.inf for v in seen.values()), problem.discretization
+    found, known = (chance_in(v, GAPS) if v else math.inf for v in moved.values()), problem.discretization
     return problem.only(problem.trials, discretization=known.replace(chance=max(known.chance, *found, 0.0)))
 
 

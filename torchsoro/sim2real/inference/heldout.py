@@ -12,7 +12,6 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
-from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 ROUNDS = 10  # Gauss-Newton steps in which the clock of one trial is fitted
@@ -92,7 +91,7 @@ def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
     """The trials, by the finer twin where there is one."""
     there = problem.only(trials, slips=())
     if there.fine is not None and not there.stated:
-        there = there.only(trials, twin=there.fine, discretization=DiscretizationError())
+        there = there.by(there.fine)
     return there
 
 

@@ -170,6 +170,10 @@ class Likelihood:
         """The same of other trials, with other slips, another twin, or another error of the twin."""
         return dataclasses.replace(self, trials=tuple(trials), **changes)
 
+    def by(self, twin: Twin) -> Self:
+        """The same by another twin as it is, which nothing corrects."""
+        return self.only(self.trials, twin=twin, discretization=DiscretizationError())
+
     def corrected(self, at: np.ndarray) -> Self:
         """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales.
 
@@ -180,11 +184,10 @@ class Likelihood:
         return self.only(self.trials, discretization=self.discretization.replace(correction=correction))
 
     def corrected_each(self, points: Sequence[Request]) -> Self:
-        """The same, but effects are corrected by the finer twin where each of them is now, at one point.
-
-        Trials that are left out are not: the finer twin itself predicts them.
-        """
-        found = self._finer(self.trials, points)
+        """The same, but effects are corrected by the finer twin where each of them is now, at one point."""
+        # What is left out is predicted by the finer twin itself, where there is one.
+        left_out = () if self.finer_twin is not None else self.experiment.heldout
+        found = self._finer([*self.trials, *(t for t in left_out if t.recording is not None)], points)
         known = self.discretization
         own = {e: {**known.correction, **mine} for (e, _), mine in zip(points, found, strict=True)}
         return self.only(self.trials, discretization=known.replace(own={**known.own, **own}))

@@ -13,7 +13,6 @@ from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE, Request
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
-from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
 
 BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
@@ -149,7 +148,7 @@ def _by_finer(
     an effect from afar: chi-squared itself is simulated, at evenly spread points.
     """
     assert problem.fine is not None
-    fine = problem.only(problem.trials, twin=problem.fine, discretization=DiscretizationError())
+    fine = problem.by(problem.fine)
     begin = [((), null_model.point), *_null_starts(fine)]
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:

@@ -142,10 +142,10 @@ def weighed(
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.best
     leading = at_mode(problem, _fit_of(known, best), best.mode)
-    seen = {}
+    moved = {}
     if problem.touches and not problem.rough and best.near.model.effects:
-        seen = planes_moved(problem, leading)
-        problem = with_chance_of(problem, seen)
+        moved = planes_moved(problem, leading)
+        problem = with_chance_of(problem, moved)
     for k in range(ROUNDS):
         # Among many valleys, or once it is seen to scatter, evidence changes by as much as it is divided by.
         behind = HOPELESS * (weighing.kappa if problem.many_valleys or weighing.scattered else 1.0)
@@ -153,7 +153,7 @@ def weighed(
         if not far:
             break
         ends = [leading if p is best else at_mode(problem, _fit_of(known, p), p.mode) for p in far]
-        again = weigh(problem, ends, closely=True, seen=seen)
+        again = weigh(problem, ends, closely=True, moved=moved)
         sound = {p.near.model.name for _, p in again}
         if not problem.rough:  # what breaks down there stays as it was
             known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]

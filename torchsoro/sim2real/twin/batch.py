@@ -61,11 +61,13 @@ def simulate(
         safe: Step over the bound of a stable one near rest; chosen by the body's cells if None.
 
     Returns:
-        For each scenario, its motions [B, ...]; diverged ones are not ``sound``.
+        For each scenario, its motions [B, ...]; diverged ones are not ``sound``. Of no scenario, none.
 
     Raises:
         ValueError: if one is so stiff that no step is short enough.
     """
+    if not scenarios:
+        return []
     share = safe or safety(twin.grid)
     steps = [stable(twin.grid, s, share) for s in scenarios]
     if even:
