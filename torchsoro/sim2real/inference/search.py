@@ -127,15 +127,15 @@ def search(
 def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
     """The first of fits that differ, by effects or in where they ended; so many at most."""
     found: list[Fit] = []
-
-    def same(one: Fit, other: Fit) -> bool:
-        off = np.abs(one.point - other.point) if one.name == other.name else np.array(np.inf)
-        return bool((off < APART * np.maximum(np.abs(one.point), 1)).all())
-
     for fit in fits:
-        if fit.effects and not any(same(fit, other) for other in found):
+        if fit.effects and not any(fit.name == other.name and _beside(fit, other) for other in found):
             found.append(fit)
     return found[:most]
+
+
+def _beside(one: Fit, other: Fit) -> bool:
+    """Whether fits of the same effects end at one place."""
+    return bool((np.abs(one.point - other.point) < APART * np.maximum(np.abs(one.point), 1)).all())
 
 
 def _by_finer(
@@ -167,17 +167,23 @@ def _by_finer(
 def _refined(
     problem: FitProblem, null_model: Fit, best: list[Fit], report: Callable[[str], None]
 ) -> tuple[FitProblem, Fit, list[Fit]]:
-    """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin."""
+    """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin.
+
+    A correction holds beside where it was simulated. A fit that ends there, or that is no longer among the best once it
+    is a fit of the finer twin, is not corrected again.
+    """
     leading, ends = [null_model, *running(problem, best)[:COMPLETED]], {}
     for _ in range(REFINED):
+        before = {f.effects: f for f in leading}
         problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
         leading = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
         report("by the finer twin: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in leading))
         ends |= {f.effects: f for f in leading}
+        least = min((f.chi2 for f in leading), default=0.0)
+        leading = [f for f in leading if f.chi2 < FARTHER * max(least, f.samples) and not _beside(f, before[f.effects])]
         if not leading:
             break
-        leading = [*(f for f in leading if not f.effects), *running(problem, leading)]
     # Where all of them break down once they are corrected, they are told as they were.
     return problem, ends.get((), null_model), _best(f for f in ends.values() if f.effects) or best
 
