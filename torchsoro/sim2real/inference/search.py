@@ -169,19 +169,19 @@ def _refined(
 ) -> tuple[FitProblem, Fit, list[Fit]]:
     """The best fits again, each corrected by the finer twin where it is itself, until they are fits of that twin.
 
-    A correction holds beside where it was simulated. A fit that ends there, or that is no longer among the best once it
-    is a fit of the finer twin, is not corrected again.
+    A fit that ends where it was corrected is one of the finer twin already; one that leaves far more than the best once
+    both are corrected is out of the running, chance in touching or not. Neither is corrected again.
     """
     leading, ends = [null_model, *running(problem, best)[:COMPLETED]], {}
     for _ in range(REFINED):
-        before = {f.effects: f for f in leading}
         problem = problem.corrected_each([(f.effects, f.point[None]) for f in leading])
         tasks: list[Task] = [(f.effects, f.point) for f in leading]
-        leading = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
-        report("by the finer twin: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in leading))
-        ends |= {f.effects: f for f in leading}
-        least = min((f.chi2 for f in leading), default=0.0)
-        leading = [f for f in leading if f.chi2 < FARTHER * max(least, f.samples) and not _beside(f, before[f.effects])]
+        again: list[Fit] = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
+        report("by the finer twin: " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in again))
+        ends |= {f.effects: f for f in again}
+        corrected_at = {f.effects: f for f in leading}
+        first = min(again, key=lambda fit: fit.chi2, default=null_model)
+        leading = [f for f in again if near_best(f, first) and not _beside(f, corrected_at[f.effects])]
         if not leading:
             break
     # Where all of them break down once they are corrected, they are told as they were.
@@ -191,12 +191,18 @@ def _refined(
 def running(problem: FitProblem, ends: Iterable[Fit]) -> list[Fit]:
     """Ends of searches with an effect that may be the most probable, best first."""
     order = sorted((f for f in ends if f.effects), key=lambda fit: fit.chi2)
-    return [f for k, f in enumerate(order) if k < AHEAD or near_best(problem, f, order[0])]
+    return [f for k, f in enumerate(order) if k < AHEAD or near_best(f, order[0], problem.chance)]
 
 
-def near_best(problem: FitProblem, fit: Fit, best: Fit) -> bool:
-    """Whether a fit leaves no more than some times what the best does, or what noise and chance in touching leave."""
-    return fit.chi2 < FARTHER * max(best.chi2, (1 + problem.chance**2) * fit.samples)
+def near_best(fit: Fit, best: Fit, chance: float = 0.0) -> bool:
+    """Whether a fit leaves no more than some times what the best does, or what noise and chance in touching leave.
+
+    Args:
+        fit: That may be in the running.
+        best: That leaves the least.
+        chance: In touching, over the noise.
+    """
+    return fit.chi2 < FARTHER * max(best.chi2, (1 + chance**2) * fit.samples)
 
 
 def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:
@@ -206,7 +212,7 @@ def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) ->
     it into a deep one must not be told where what is stated, a little different, does so, too.
     """
     best = min(ends, key=lambda fit: fit.chi2, default=null_model)
-    if problem.finer_twin is None or not problem.many_valleys or not near_best(problem, null_model, best):
+    if problem.finer_twin is None or not problem.many_valleys or not near_best(null_model, best, problem.chance):
         return []
     tasks: list[Task] = [((), point) for point in within_tolerances(problem)]
     return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
