@@ -20,7 +20,7 @@ PACKAGE = ROOT / "torchsoro"
 ORDER = """
 errors version
 storage command_line
-simulation.laws simulation.axis
+simulation.laws simulation.axis simulation.sums
 simulation.kernels
 simulation.threads simulation.tracing
 simulation.runtime

@@ -7,8 +7,9 @@ import torch
 from problems import H, block, simulator, vector
 
 from torchsoro import Force
+from torchsoro.simulation.ops.axis_sums import QUADRATURE
 from torchsoro.simulation.ops.inertia import Matching
-from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice
+from torchsoro.simulation.ops.lattice import Lattice
 
 
 def lattice(*points: int) -> Lattice:

@@ -13,7 +13,8 @@ from problems import DT, H, block, problem, rotations, simulator
 
 from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice, numbers
+from torchsoro.simulation.ops.axis_sums import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.lattice import Lattice, numbers
 from torchsoro.simulation.ops.scene import Inputs
 from torchsoro.simulation.ops.total import TotalSegmentIntegrator
 

@@ -338,3 +338,11 @@ def test_a_climber_has_scenarios_too():
     found = made(made.field(), scenarios=Scenarios(friction=(0.3, "stick"), tube_mass=(0.002, 0.002)).sample(2, 0))
     assert found.travel.shape == (2,)
     assert float(found.travel.diff().abs()) > 0
+
+
+def test_without_void_scenarios_in_lanes_go_as_each_alone(robot):
+    batch = WIDE.sample(16, 3)
+    together = run(robot, batch, void=False)
+    for k in (0, 15):
+        alone = run(robot, batch.part([k]), void=False, dt=together.dt)
+        torch.testing.assert_close(alone.travel[0], together.travel[k], rtol=1e-4, atol=1e-8)

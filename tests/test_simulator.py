@@ -426,3 +426,5 @@ def test_a_small_budget_is_refused_with_the_smallest_that_does():
     plan = plan_checkpoints(steps=10_000, state_bytes=2**20, element_bytes=4, budget=least * 2**20)
     assert not plan.keep
     assert 90 <= plan.segment <= 110
+    default = plan_checkpoints(steps=10_000, state_bytes=2**20, element_bytes=4, budget=10 * 2**20, binding=False)
+    assert least - 1 <= default.memory / 2**20 <= least

@@ -16,7 +16,8 @@ from tables import Row
 
 from torchsoro import Force, Prony, Simulator, Solid, ground, stable_step
 from torchsoro.design.density import part
-from torchsoro.simulation.ops.lattice import QUADRATURE, Lattice
+from torchsoro.simulation.ops.axis_sums import QUADRATURE
+from torchsoro.simulation.ops.lattice import Lattice
 
 Landing = Literal["inelastic", "elastic"]
 Curve = tuple[str, int, float, np.ndarray, np.ndarray, np.ndarray]

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.errors import refuse_gradients
+from torchsoro.simulation.sums import pairwise_sum
 
 
 def center_of_gravity(x: Tensor, mass: Tensor) -> Tensor:
@@ -46,14 +47,14 @@ def center_of_gravity(x: Tensor, mass: Tensor) -> Tensor:
     total = total_mass(mass)
     if not bool((total.detach() > 0.0).all()):
         raise ValueError(f"mass: got a total of {float(total.detach().min())} kg, want more than 0")
-    return (mass.unsqueeze(-1) * x).sum(dim=-2) / total.unsqueeze(-1)
+    return pairwise_sum(mass.unsqueeze(-2) * x.mT) / total.unsqueeze(-1)
 
 
 def total_mass(mass: Tensor) -> Tensor:
     """Total mass, kg, [...], of particle masses [..., N]."""
     if mass.ndim < 1:
         raise ValueError(f"mass: got shape {tuple(mass.shape)}, want [..., N]")
-    return mass.sum(dim=-1)
+    return pairwise_sum(mass)
 
 
 def travel(cog: Tensor, time: Tensor, *, start: float, end: float, direction: Tensor | Sequence[float]) -> Tensor:
@@ -150,10 +151,10 @@ def yaw(rest: Tensor, place: Tensor, weight: Tensor) -> Tensor:
     if rest.ndim < 2 or rest.shape[-1] != 3 or place.shape != rest.shape or weight.shape[-1:] != rest.shape[-2:-1]:
         shapes = ", ".join(str(tuple(one.shape)) for one in (rest, place, weight))
         raise ValueError(f"rest, place, weight: got shapes {shapes}, want [..., P, 3] twice and [..., P]")
-    share = (weight / weight.sum(-1, keepdim=True).clamp(min=torch.finfo(weight.dtype).tiny)).unsqueeze(-1)
-    (x, y), (u, v) = ((p - (share * p).sum(-2, keepdim=True)).unbind(-1)[:2] for p in (rest, place))
+    share = weight / pairwise_sum(weight).unsqueeze(-1).clamp(min=torch.finfo(weight.dtype).tiny)
+    (x, y), (u, v) = ((p - pairwise_sum(share * p).unsqueeze(-1) for p in one.unbind(-1)[:2]) for one in (rest, place))
     across, along = x * v - y * u, x * u + y * v
-    return torch.atan2((weight * across).sum(-1), (weight * along).sum(-1))
+    return torch.atan2(pairwise_sum(weight * across), pairwise_sum(weight * along))
 
 
 def intermediate_density(gamma: Tensor, design: Tensor) -> Tensor:

@@ -28,6 +28,7 @@ from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.simulator import Simulator
+from torchsoro.simulation.sums import pairwise_sum
 from torchsoro.simulation.trajectory import Start, Trajectory
 
 
@@ -216,7 +217,7 @@ class Robot(nn.Module):
         counts = torch.exp(-2 * height / spacing) if near else (height.detach() < 0.25 * spacing).to(height)
         share = gamma[..., probes].clamp(min=0) ** 3 * counts
         moved = (end - begin) @ place.new_tensor(self.direction)
-        return (share * moved).sum(-1) / share.sum(-1).clamp(min=torch.finfo(share.dtype).tiny)
+        return pairwise_sum(share * moved) / pairwise_sum(share).clamp(min=torch.finfo(share.dtype).tiny)
 
     def turned(self, trajectory: Trajectory, gamma: Tensor, moment: float) -> Tensor:
         """Angle by which the soles turned about z from the start of the actuation to a moment [rad].

@@ -192,7 +192,7 @@ class Settings:
     void_range: tuple[_Density, _Density] = (0.1, 0.3)
     """Densities between which stress goes over from a law of void, which stands being crushed, to the solid's."""
     memory: AtLeastZero = 0.0
-    """Memory for the gradient [GiB]; 0 for 2 on a CPU and 6 on a GPU."""
+    """Memory for the gradient [GiB]; 0 for 2 on a CPU and 6 on a GPU, or the least that it takes, if that is more."""
 
     filter_radius: _Length = 0.00525
     """Radius of the density filter [m]."""

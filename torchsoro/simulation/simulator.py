@@ -60,7 +60,8 @@ class Simulator(nn.Module):
             0.44 MPa that turns freely at 60 rad/s with a substep of 0.1 ms loses in five turns, with apic, 0.02, 0.05
             and 0.11 % of its speed for edges of 2, 4 and 6 cells; with flip 25, 6.8 and 2.8 %.
         formulation: "updated" or "total", or one of the objects in :mod:`torchsoro.simulation.formulation`.
-        memory_budget: Bytes that a rollout may keep for its gradient; 2 GiB on CPU, 6 GiB on CUDA if None.
+        memory_budget: Bytes that a rollout may keep for its gradient; if None 2 GiB on a CPU and 6 GiB on CUDA, or the
+            least that it takes, if that is more.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
         safety: Share of the largest stable step that dt = "auto" takes.
 
@@ -303,6 +304,7 @@ class Simulator(nn.Module):
                 state_bytes=state.numel() * state.element_size(),
                 element_bytes=state.element_size(),
                 budget=self.memory_budget or MEMORY[state.device.type],
+                binding=self.memory_budget is not None,
                 node_share=self.formulation.node_share(scene, state),
             )
             segment, keep = (plan.segment, plan.keep) if self.segment is None else (self.segment, False)

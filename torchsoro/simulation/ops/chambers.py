@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.scene import Scene
+from torchsoro.simulation.sums import pairwise_sum
 
 
 def chamber_means(scene: Scene, coefficients: Tensor, chambers: int) -> Tensor:
@@ -14,7 +15,8 @@ def chamber_means(scene: Scene, coefficients: Tensor, chambers: int) -> Tensor:
     rows = [coefficients.new_zeros(len(coefficients), 0, layout.CHAMBER)]
     for c in range(chambers):
         V, K = _air(scene, coefficients, c)
-        rows.append(torch.stack([(V * K).sum(-1) / V.sum(-1), V.sum(-1)], -1).unsqueeze(1))
+        whole = pairwise_sum(V)
+        rows.append(torch.stack([pairwise_sum(V * K) / whole, whole], -1).unsqueeze(1))
     return torch.cat(rows, 1)
 
 

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchsoro.simulation.sums import one_by_one, pairwise_sum
+
 # Largest share of its mass that a node may lose, as a norm over all nodes: the largest itself has no slope where a
 # symmetric body has several. Cubes of three cells ask for 0.59; beyond the first number the change fades, and is none
 # from the second: cubes of two cells get a quarter of it, of one cell almost nothing.
@@ -60,16 +62,16 @@ class Matching:
         half = (x.amax(0) - x.amin(0)) / 2
         x, y, z = ((x - x.amin(0)) / half - 1).unbind(1)
         terms = torch.stack([torch.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z], 1)
-        normal = (m.square().unsqueeze(1) * terms.T) @ terms
+        normal = one_by_one(lambda body: (body.square() * terms.T) @ terms, m)
         safe = normal + 1e-13 * torch.diag_embed(normal.diagonal(dim1=1, dim2=2))
         excess = spread.to(m) / half.square()
-        wanted = torch.nn.functional.pad(-(m @ excess), (4, 3))
+        wanted = torch.nn.functional.pad(-one_by_one(lambda body: body @ excess, m), (4, 3))
         weights = _solve(safe, wanted)
-        weights = weights + _solve(safe, wanted - (normal @ weights.unsqueeze(2)).squeeze(2))
-        q = weights @ terms.T
+        weights = weights + _solve(safe, wanted - pairwise_sum(normal * weights.unsqueeze(1)))
+        q = one_by_one(lambda row: terms @ row, weights)
         loss = (-m * q).relu()
         largest = loss.amax(1, keepdim=True)
-        norm = largest * (loss / largest).pow(_NORM).sum(1, keepdim=True).pow(1 / _NORM)
+        norm = largest * pairwise_sum((loss / largest).pow(_NORM)).unsqueeze(1).pow(1 / _NORM)
         strength = ((_NONE - norm) / (_NONE - _MOST)).clamp(0, 1)
         return cls(mass=m, terms=terms, excess=excess, normal=safe, q=q, loss=(loss, norm), strength=strength)
 
@@ -84,15 +86,17 @@ class Matching:
         bar = bar.to(m)
         change = self.strength * bar
         fades = (norm > _MOST) & (norm < _NONE)
-        strength_bar = (bar * m.square() * q).sum(1, keepdim=True)
+        strength_bar = pairwise_sum(bar * m.square() * q).unsqueeze(1)
         # By the share that each node gains.
         by_norm = torch.where(fades, strength_bar / (_NONE - _MOST), torch.zeros_like(norm))
         by_gain = by_norm * (loss / norm).pow(_NORM - 1)
-        by_wanted = _solve(self.normal, (m.square() * change + m * by_gain) @ self.terms)
-        by_square = -(by_wanted @ self.terms.T) * q
-        return bar + 2 * m * (q * change + by_square) + q * by_gain - by_wanted[:, 4:7] @ self.excess.T
+        pulled = one_by_one(lambda body: body @ self.terms, m.square() * change + m * by_gain)
+        by_wanted = _solve(self.normal, pulled)
+        by_square = -one_by_one(lambda row: self.terms @ row, by_wanted) * q
+        by_excess = one_by_one(lambda row: self.excess @ row, by_wanted[:, 4:7])
+        return bar + 2 * m * (q * change + by_square) + q * by_gain - by_excess
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
     """Solution [B, 10] without a check for singular matrices, for which the host would wait for the device."""
-    return torch.linalg.solve_ex(matrix, right).result
+    return one_by_one(lambda a, b: torch.linalg.solve_ex(a, b).result, matrix, right)

@@ -79,8 +79,8 @@ class Lanes:
         """Values by point [B, K, points] as [groups, blocks, 8, K, 16]."""
         batch, count, _ = values.shape
         if self.variations:
-            at = self.points[:, :, 0].reshape(-1)
-            wide = values[:, :, at].view(batch, count, -1, 8).permute(2, 3, 1, 0)
+            wide = values[:, :, self.points[:, :, 0].clamp(min=0).reshape(-1)].view(batch, count, -1, 8)
+            wide = torch.where(self._there[:, :, 0], wide, empty).permute(2, 3, 1, 0)
             return wide[..., self._row.reshape(-1)].unflatten(-1, (self.groups, LANES)).movedim(-2, 0).contiguous()
         wide = values[:, :, self._flat].view(batch, count, -1, 8, LANES).permute(0, 2, 3, 1, 4)
         return torch.where(self._there[None, :, :, None, :], wide, empty).contiguous()
@@ -90,8 +90,9 @@ class Lanes:
         inner = lanes.shape[3]
         found = lanes.new_zeros(self.batch, inner, count)
         if self.variations:
+            there = self._there[:, :, 0].reshape(-1)
             rows = lanes.permute(0, 4, 3, 1, 2).reshape(self.groups * LANES, inner, -1)[: self.batch]
-            return found.index_copy_(2, self.points[:, :, 0].reshape(-1), rows)
+            return found.index_copy_(2, self.points[:, :, 0].reshape(-1)[there], rows[:, :, there])
         at, places = self._where
         rows = lanes.permute(0, 3, 1, 2, 4).reshape(self.batch, inner, -1)[:, :, places]
         return found.index_copy_(2, at, rows)

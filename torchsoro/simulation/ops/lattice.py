@@ -11,31 +11,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.simulation.axis import GAUSS, MARK, Axis
+from torchsoro.simulation.axis import Axis
+from torchsoro.simulation.ops.axis_sums import PARTICLES, summed
 from torchsoro.simulation.ops.inertia import Matching
 
-# Places of a cell's two points per axis: the two of Gauss, for which the pressure of a uniformly deformed chamber does
-# no work inside it; and those of the particles, where motion is recorded.
-QUADRATURE, PARTICLES = GAUSS, MARK
 # The centre of the matter that a node outside of a face carries is 3/4 of a cell away, the face half a cell.
 _DEPTH = 0.25
 _TINY = 1e-9  # m, by which a node may be off a box that it lies in
 _OFF = 1e-3  # how far a particle may be from its place, in particle spacings
 
 _uniform = lru_cache(maxsize=256)(Axis.uniform)  # one axis, so one set of matrices, for equal arguments
-
-
-@lru_cache(maxsize=1024)
-def _matrix(kind: str, axis: Axis, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """A matrix [points, nodes] of an axis: "weight", "slope" (1/m), "moment" (m), "mark", or "back"."""
-    weight, slope = axis.tabulate(PARTICLES if kind in ("mark", "back") else QUADRATURE)
-    values = slope if kind == "slope" else weight
-    if kind == "moment":
-        values = weight * (axis.points[..., None] - axis.places[axis.first[:, None, None] + np.arange(3)])
-    wide = np.zeros((axis.cells, 2, axis.nodes))
-    np.put_along_axis(wide, axis.first[:, None, None] + np.arange(3) + np.zeros((1, 2, 1), int), values, 2)
-    found = torch.from_numpy(wide.reshape(-1, axis.nodes))
-    return (torch.linalg.pinv(found).T if kind == "back" else found).to(dtype=dtype, device=device)
 
 
 @lru_cache(maxsize=256)
@@ -300,19 +285,14 @@ class Lattice:
 
     def to_nodes(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
         """Sum over points, with weights or another kind of matrix (and one more along an axis): [..., nodes]."""
-        wx, wy, wz = self._matrices(values, kind, along)
-        wide = values.reshape(-1, *self.points)
-        return torch.einsum("bxyz,xi,yj,zk->bijk", wide, wx, wy, wz).reshape(*values.shape[:-1], self.nodes)
+        return summed(values, self.axes, self._kinds(kind, along), "nodes").reshape(*values.shape[:-1], self.nodes)
 
     def to_points(self, values: Tensor, kind: str = "weight", along: tuple[int, str] | None = None) -> Tensor:
         """Sum over nodes, likewise: [..., nodes] to [..., points]."""
-        wx, wy, wz = self._matrices(values, kind, along)
-        wide = values.reshape(-1, *self.shape)
-        return torch.einsum("bijk,xi,yj,zk->bxyz", wide, wx, wy, wz).reshape(*values.shape[:-1], self.count)
+        return summed(values, self.axes, self._kinds(kind, along), "points").reshape(*values.shape[:-1], self.count)
 
-    def _matrices(self, like: Tensor, kind: str, along: tuple[int, str] | None) -> list[Tensor]:
-        kinds = [along[1] if along and a == along[0] else kind for a in range(3)]
-        return [_matrix(k, a, like.dtype, like.device) for k, a in zip(kinds, self.axes, strict=True)]
+    def _kinds(self, kind: str, along: tuple[int, str] | None) -> list[str]:
+        return [along[1] if along and a == along[0] else kind for a in range(3)]
 
     def nodal(self, mass: Tensor, drag: Tensor, dt: float, attached: Tensor | None = None) -> Tensor:
         """What kernels need to know of the nodes.

@@ -17,10 +17,12 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.ops.lattice import PARTICLES, QUADRATURE, Lattice
+from torchsoro.simulation.ops.axis_sums import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.markers import Markers
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Scene
+from torchsoro.simulation.sums import pairwise_sum
 
 Arguments = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """State [B, S, N], or [B, L] of the total-Lagrangian form; particle weights of the centre of gravity [B, N];
@@ -41,21 +43,21 @@ def observe_adjoint(arguments: Arguments, bars: Sequence[Tensor], scene: Scene) 
 
 def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
     x, v = state[:, : layout.VELOCITY], state[:, layout.VELOCITY : layout.AFFINE]
-    share = (weight / weight.sum(-1, keepdim=True)).unsqueeze(1)
+    share = _shares(weight).unsqueeze(1)
     volumes, means = [state.new_zeros(state.shape[0], 0)], [state.new_zeros(state.shape[0], 0)]
     for c in range(pressure.shape[1]):
         gas = scene.gas(c)
         J = state[:, layout.DEFORMATION, gas]
         parts = coefficients[:, layout.VOLUME, gas] * J
         local = coefficients[:, layout.BULK, gas] * (1 - J) + pressure[:, c : c + 1]
-        volumes.append(parts.sum(-1, keepdim=True))
-        means.append((parts * local).sum(-1, keepdim=True) / volumes[-1])
+        volumes.append(_whole(parts))
+        means.append(_whole(parts * local) / volumes[-1])
     return (
         x[:, :, scene.probes].transpose(1, 2),
         v[:, :, scene.probes].transpose(1, 2),
         x.new_zeros(len(x), 0, 3, 3),
-        (share * x).sum(-1),
-        (share * v).sum(-1),
+        pairwise_sum(share * x),
+        pairwise_sum(share * v),
         torch.cat(volumes, -1),
         torch.cat(means, -1),
     )
@@ -65,7 +67,7 @@ def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[
     x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = bars
     found = torch.zeros_like(state), *_zeros(coefficients, pressure)
     state_bar, coefficients_bar, pressure_bar = found
-    share = weight / weight.sum(-1, keepdim=True)
+    share = _shares(weight)
     share_bar = torch.zeros_like(weight)
     for first, at_probes, at_center in ((0, x_bar, center_bar), (layout.VELOCITY, v_bar, drift_bar)):
         rows = slice(first, first + 3)
@@ -76,15 +78,15 @@ def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[
         gas = scene.gas(c)
         J, V, K = state[:, layout.DEFORMATION, gas], *coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
         parts, local = V * J, K * (1 - J) + pressure[:, c : c + 1]
-        whole = parts.sum(-1, keepdim=True)
-        mean = (parts * local).sum(-1, keepdim=True) / whole
+        whole = _whole(parts)
+        mean = _whole(parts * local) / whole
         by_mean = mean_bar[:, c : c + 1]
         parts_bar = volume_bar[:, c : c + 1] + by_mean * (local - mean) / whole
         local_bar = by_mean * parts / whole
         state_bar[:, layout.DEFORMATION, gas] += parts_bar * V - local_bar * K
         coefficients_bar[:, layout.VOLUME, gas] += parts_bar * J
         coefficients_bar[:, layout.BULK, gas] += local_bar * (1 - J)
-        pressure_bar[:, c] += local_bar.sum(-1)
+        pressure_bar[:, c] += pairwise_sum(local_bar)
     return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar, torch.zeros_like(air)
 
 
@@ -104,18 +106,18 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
         place = lattice.on("places", state)[scene.probes] + (d[..., at] * how).sum(-1).transpose(-1, -2)
         drift = (v[..., at] * how).sum(-1).transpose(-1, -2)
         gradient = state.new_zeros(*state.shape[:-1], 0, 3, 3)
-    share = weight / weight.sum(-1, keepdim=True)
+    share = _shares(weight)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
     nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
-    # A sum whose order does not depend on how many samples there are.
-    whole = (motion * nodal.unsqueeze(1)).sum(-1)
+    whole = pairwise_sum(motion * nodal.unsqueeze(1))
     volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
         gas, _, _, F = _chamber(d, c, scene)
         J, V = torch.linalg.det(F), coefficients[:, layout.VOLUME, gas]
-        k = (V * coefficients[:, layout.BULK, gas]).sum(-1) / V.sum(-1)
-        volumes.append((V * J).sum(-1, keepdim=True))
-        means.append((pressure[..., c] - k * (volumes[-1][..., 0] / V.sum(-1) - 1)).unsqueeze(-1))
+        full = pairwise_sum(V)
+        k = pairwise_sum(V * coefficients[:, layout.BULK, gas]) / full
+        volumes.append(_whole(V * J))
+        means.append((pressure[..., c] - k * (volumes[-1][..., 0] / full - 1)).unsqueeze(-1))
     if lattice.walls is not None:
         volumes.append(lattice.walls.enclosed(d))
         growth = volumes[-1] / lattice.walls.volume.to(d) - 1
@@ -139,7 +141,7 @@ def _at_markers(markers: Markers, near: Tensor) -> tuple[Tensor, Tensor, Tensor]
 
 def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:
     """What nodes add to the centre of gravity [B, nodes], and where that is in the undeformed body [B, 3]."""
-    return lattice.nodal_mass(share), share @ lattice.on("places", share)
+    return lattice.nodal_mass(share), pairwise_sum(share.unsqueeze(1) * lattice.on("places", share).T)
 
 
 def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
@@ -151,7 +153,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     if (m := scene.markers) is not None:
         at, how = m.nodes, m.weights.to(state)
-    share = weight / weight.sum(-1, keepdim=True)
+    share = _shares(weight)
     nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
     nodal_bar = torch.zeros_like(nodal)
     for field, field_bar, at_probes, at_center in zip(
@@ -162,15 +164,16 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
         _add_at(field_bar, at, at_probes.to(how).transpose(1, 2).unsqueeze(-1) * how)
     if m is not None:
         _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
-    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + center_bar @ lattice.on("places", state).T
+    places = lattice.on("places", state).T
+    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + pairwise_sum((center_bar.unsqueeze(-1) * places).mT)
     for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
-        whole = V.sum(-1, keepdim=True)
+        whole = _whole(V)
         a, b, e = F.unbind(-2)
         cofactor = torch.stack([torch.linalg.cross(b, e), torch.linalg.cross(e, a), torch.linalg.cross(a, b)], -2)
         J = (a * cofactor[..., 0, :]).sum(-1)
-        k, growth = (V * K).sum(-1, keepdim=True) / whole, (V * J).sum(-1, keepdim=True) / whole - 1
+        k, growth = _whole(V * K) / whole, _whole(V * J) / whole - 1
         by_mean = mean_bar[:, c : c + 1]
         swept_bar, k_bar = volume_bar[:, c : c + 1] - by_mean * k / whole, -by_mean * growth
         coefficients_bar[:, layout.VOLUME, gas] += (
@@ -196,7 +199,16 @@ def _zeros(*tensors: Tensor) -> tuple[Tensor, ...]:
 
 def _by_weight(share: Tensor, share_bar: Tensor, weight: Tensor) -> Tensor:
     """Gradient by weights, from that by their shares of the sum."""
-    return (share_bar - (share * share_bar).sum(-1, keepdim=True)) / weight.sum(-1, keepdim=True)
+    return (share_bar - _whole(share * share_bar)) / _whole(weight)
+
+
+def _whole(values: Tensor) -> Tensor:
+    """Sum over the last axis, which stays."""
+    return pairwise_sum(values).unsqueeze(-1)
+
+
+def _shares(weight: Tensor) -> Tensor:
+    return weight / _whole(weight)
 
 
 def _add_at(target: Tensor, at: Tensor, values: Tensor) -> None:

@@ -19,6 +19,7 @@ from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
 from torchsoro.simulation.ops.tiles import tiles_of
 from torchsoro.simulation.runtime import init
+from torchsoro.simulation.sums import pairwise_sum
 
 CHUNK = 1024  # substeps between two checks for divergence
 LAUNCH = 256  # substeps in a launch on a GPU, lest one that also drives a screen takes a large body's for hung
@@ -220,15 +221,15 @@ class TotalSegmentIntegrator:
         found["coefficients"] = found["coefficients"] + by_chamber
         found["coefficients"][:, layout.MASS] += mass_bar
         found["coefficients"][:, layout.DRAG] += drag_bar
-        found |= {name: found[name].sum(-1) for name in ("prony", "planes")}
-        found |= {name: found[name].sum(1) for name in ("gravity", "force")}
+        found |= {name: pairwise_sum(found[name]) for name in ("prony", "planes")}
+        found |= {name: pairwise_sum(found[name].movedim(1, -1)) for name in ("gravity", "force")}
         found["pressure"] = found["pressure"].clone()
         if self.scene.force_start is not None:
             found["force"] = (found["force"] * self._started().to(bar)).sum(0, keepdim=True)
         if self.scene.immersed:
             assert self.lattice.faces is not None
             found["fluid"] = torch.einsum("bcn,nc->b", quadratic_bar, self.lattice.faces.front.to(bar)) / 2
-        found |= {"softening": softening_bar.sum(-1), "ties": ties_bar.clone()}
+        found |= {"softening": pairwise_sum(softening_bar), "ties": ties_bar.clone()}
         found["air"] = chamber_bar[:, gas:, layout.CHAMBER_STIFFNESS].clone()
         return {**found, "attached": attached_bar}
 
