@@ -10,9 +10,9 @@ import torch
 import trimesh
 
 from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.port import AirPort
 from torchsoro.output.fabricate import fabricate, surface
 from torchsoro.output.part import Part
-from torchsoro.output.port import AirPort
 
 DENSITY = 1070.0
 PORT = AirPort(direction=(-1.0, 0.0, 0.0), diameter=0.003)

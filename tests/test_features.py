@@ -12,11 +12,13 @@ from hypothesis import strategies as st
 from tiny import TINY
 
 from torchsoro.design import loop
-from torchsoro.design.domain import Domain
+from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.ensemble import Ensemble
 from torchsoro.design.features import threshold_of
 from torchsoro.design.field import DesignField
+from torchsoro.design.port import AirPort
 from torchsoro.design.robot import walker
+from torchsoro.output.fabricate import fabricate
 
 H = 0.001  # m, spacing
 FEATURED = {"scenarios": 5, "fresh": True, "clip": 0.0, "lightness": 0.1, "feature": 0.004}
@@ -72,13 +74,18 @@ def test_thresholds_grow_with_features_from_zero_to_one_and_know_no_unit(feature
 @settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 1000), eta=st.floats(-0.9, 0.9), beta=st.floats(0.5, 20.0))
 def test_gaps_of_a_design_are_walls_of_its_negative(seed, eta, beta):
-    domain = Domain(size=(6 * H, 5 * H, 4 * H), particles=(6, 5, 4))
+    domain = Domain(size=(8 * H, 7 * H, 6 * H), particles=(8, 7, 6))
     field = DesignField(domain, radius=2.5 * H, beta=beta, symmetry=(), dtype=torch.float64)
-    phi = 2 * torch.rand(6, 5, 4, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
-    torch.testing.assert_close(field(-phi, threshold=-eta), 1 - field(phi, threshold=eta), rtol=0, atol=1e-12)
+    phi = 2 * torch.rand(8, 7, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) - 1
+
+    def deep(phi: torch.Tensor, threshold: float) -> torch.Tensor:
+        """Density where the filter does not see what is beyond the body."""
+        return domain.lattice(field(phi, threshold=threshold))[2:-2, 2:-2, 2:-2]
+
+    torch.testing.assert_close(deep(-phi, -eta), 1 - deep(phi, eta), rtol=0, atol=1e-12)
     more, less = field(phi, threshold=eta), field(phi, threshold=eta + 0.05)
     assert bool((less <= more + 1e-12).all())
-    assert float(field(torch.ones_like(phi), threshold=eta).min()) == pytest.approx(1.0)
+    assert float(deep(torch.ones_like(phi), eta).min()) == pytest.approx(1.0)
     assert float(field(-torch.ones_like(phi), threshold=eta).max()) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -144,3 +151,37 @@ def test_a_run_tells_how_far_its_variants_go(recipes, tmp_path):
         assert np.isfinite(rows[f"scenariosL_{name}"]).all()
     assert len(set(rows["scenariosL_eroded"]) | set(rows["scenariosL_dilated"])) > 2
     assert "L" in result
+
+
+def test_an_eroded_design_wears_off_at_the_faces_of_its_box():
+    size, n = 0.02, 20
+    domain = Domain(size=(size,) * 3, particles=(n,) * 3)
+    field = DesignField(domain, radius=0.004, beta=64.0, symmetry=(), dtype=torch.float64)
+    eta = threshold_of(0.004, 0.003)
+    phi = -torch.ones(domain.shape, dtype=torch.float64)
+    phi[:, :, :2] = 1  # 2 mm at a face, half as thick as the filter tells from a thick plate
+    assert float(domain.lattice(field(phi))[:, :, 0].min()) > 0.99
+    assert float(field(phi, threshold=eta).max()) < 0.01
+    assert float(field(torch.ones_like(phi), threshold=eta)[domain.nearest(torch.full((1, 3), size / 2))]) > 0.99
+
+
+def test_a_port_that_belongs_to_the_domain_leaves_limbs_as_thick_as_they_are():
+    chamber = Chamber(name="air", center=(0.01, 0.01, 0.01), size=(0.01,) * 3, wall=0.002)
+    port = AirPort(diameter=0.003)
+    how = {"size": (0.02,) * 3, "particles": (20,) * 3, "chambers": (chamber,)}
+    free, cut = Domain(**how, port=port), Domain(**how)
+    way = free.lattice(free.outside)
+    assert bool(way[:5, 8:12, 8:12].any()) and not bool(way[5:].any()) and not bool(way[:, :7].any())
+    assert torch.equal(way, way.flip(1)) and bool(DesignField(free, radius=0.003).phi.isfinite().all())
+    # Of a limb beside the way, a port that is cut afterwards leaves a thin one.
+    limb = torch.zeros(20, 20, 20)
+    limb[:5, 6:12, 5:15] = 1
+    thinnest = {
+        name: fabricate(domain, limb.flatten(), density=1e3, port=port).report.thinnest_wall_mm
+        for name, domain in (("free", free), ("cut", cut))
+    }
+    bare = fabricate(free, limb.flatten(), density=1e3).report.thinnest_wall_mm
+    assert thinnest["free"] == pytest.approx(bare, rel=0.02)
+    assert thinnest["cut"] < 0.8 * bare
+    with pytest.raises(ValueError, match=r"port\.diameter: got 0\.02"):
+        Domain(**how, port=AirPort(diameter=0.02))

@@ -13,13 +13,13 @@ from tiny import TINY, tiny
 
 from torchsoro.design.density import thickened
 from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.port import AirPort
 from torchsoro.design.robot import walker
 from torchsoro.output.archive import load_design
 from torchsoro.output.delivery import deliver, mending_line, print_part
 from torchsoro.output.fabricate import fabricate
 from torchsoro.output.mend import clearance
 from torchsoro.output.part import Part
-from torchsoro.output.port import AirPort
 
 torch.set_num_threads(1)
 H = 1e-3  # particle spacing, m

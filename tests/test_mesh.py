@@ -16,10 +16,10 @@ from torchsoro.design.density import fill
 from torchsoro.design.domain import Chamber, Domain, Region
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
+from torchsoro.design.port import AirPort
 from torchsoro.design.robot import walker
 from torchsoro.output.delivery import print_part
 from torchsoro.output.fabricate import fabricate
-from torchsoro.output.port import AirPort
 from torchsoro.simulation.material import Solid
 
 SIDE, RADIUS, BODY = 0.04, 0.008, 0.018  # m

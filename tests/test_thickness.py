@@ -11,11 +11,11 @@ import torch
 import trimesh
 
 from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.port import AirPort
 from torchsoro.output import levelset, thickness
 from torchsoro.output.fabricate import fabricate
 from torchsoro.output.meshfile import CORE
 from torchsoro.output.part import Part
-from torchsoro.output.port import AirPort
 
 STEP = 0.4  # mm between grid points; no shape's plane lies on one
 AXIS = STEP * (np.arange(64) - 31.37)

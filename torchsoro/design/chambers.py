@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.mesh import UNITS, read_surface
+from torchsoro.design.port import AirPort
 from torchsoro.design.settings import Settings
 
 
@@ -36,14 +37,16 @@ def chambers_of(s: Settings, center: tuple[float, float, float]) -> tuple[Chambe
     return tuple(made)
 
 
-def port_direction(s: Settings, travel: tuple[float, float, float]) -> tuple[float, float, float]:
-    """From each chamber to its air port: to the rear, which is against the travel, or downward for a climber.
+def port_of(s: Settings, chambers: tuple[Chamber, ...], travel: tuple[float, float, float]) -> AirPort:
+    """From each chamber to the outside: to the rear, which is against the travel, or downward for a climber.
 
     Where one of several chambers is behind the others, the ports go upward instead, or sideways.
     """
+    direction = _triple(tuple(-d for d in travel))
     if s.chambers > 1 and travel["xyz".index(s.chamber_axis)]:
-        return (0.0, 1.0, 0.0) if s.chamber_axis == "z" else (0.0, 0.0, 1.0)
-    return _triple(tuple(-d for d in travel))
+        direction = (0.0, 1.0, 0.0) if s.chamber_axis == "z" else (0.0, 0.0, 1.0)
+    cavity = min(edge - 2 * s.wall for edge in chambers[0].size)
+    return AirPort(direction=direction, diameter=s.port or 0.4 * cavity)
 
 
 def sockets(domain: Domain, direction: tuple[float, float, float]) -> Tensor:

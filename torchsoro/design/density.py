@@ -94,7 +94,7 @@ def fill(
     gas = gas or Gas()
     like = {"dtype": gamma.dtype, "device": gamma.device}
     air = (domain.region == Region.GAS).to(gamma.device)
-    if domain.body is not None:
+    if bool(domain.outside.any()):
         gamma = gamma.masked_fill(domain.outside.to(gamma.device), 0.0)
     scale = simp(gamma, epsilon=epsilon, power=power)
     zero = torch.zeros((), **like)

@@ -13,6 +13,7 @@ import enum
 import functools
 import itertools
 import math
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.design.mesh import Surface, check_fit, lined
+from torchsoro.design.port import AirPort
 
 _ON_PLANE = 1e-6  # how far a chamber face may be from a lattice plane, in particle spacings
 _CUBIC = 1e-9  # relative difference allowed between the spacings along the three axes
@@ -39,7 +41,7 @@ class Region(enum.IntEnum):
     GAS = 2
     """Air inside a chamber."""
     OUTSIDE = 3
-    """Of the lattice, but not of the body: always void."""
+    """Of the lattice, but not of the body, or where an air port passes: always void."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -101,10 +103,13 @@ class Domain:
         chambers: Air chambers. Every face of a box, inner and outer, lies on a lattice plane; of a shape, the particles
             whose centres lie inside are air.
         body: Closed surface of the body within the box; the whole box if None.
+        port: Air port whose way from each chamber to the outside stays free, so that limbs are designed around it;
+            None where it may be cut through them afterwards.
 
     Raises:
         ValueError: A length or count is not positive and finite; the spacing is not cubic; a chamber leaves the body,
-            overlaps another, shares its name, or has a face between two lattice planes.
+            overlaps another, shares its name, or has a face between two lattice planes; the port does not fit the
+            chambers.
 
     Example:
         The paper's walker: a 35 mm cube of 64,000 particles.
@@ -120,9 +125,10 @@ class Domain:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     chambers: tuple[Chamber, ...] = ()
     body: Surface | None = None
+    port: AirPort | None = None
 
     def __post_init__(self) -> None:
-        """Check that body, lattice and chambers fit together."""
+        """Check that body, lattice, chambers and port fit together."""
         object.__setattr__(self, "size", _triple("size", self.size, positive=True))
         object.__setattr__(self, "origin", _triple("origin", self.origin))
         counts = tuple(self.particles)
@@ -149,6 +155,8 @@ class Domain:
                 raise ValueError(f"chambers: got two named {one.name!r}, want unique names")
             if (self._masks(one)[0] & self._masks(other)[0]).any():
                 raise ValueError(f"chambers: got {one.name!r} overlapping {other.name!r}, want them apart")
+        if self.port is not None:
+            check_port(self.chambers, self.port)
 
     # The lattice ------------------------------------------------------------------------------------------------
 
@@ -193,6 +201,7 @@ class Domain:
         """What each particle is made of, a :class:`Region` value, int64 [N]."""
         region = torch.full(self.shape, int(Region.DESIGN), dtype=torch.int64)
         region[~torch.from_numpy(self._filled)] = int(Region.OUTSIDE)
+        region[torch.from_numpy(self._ways)] = int(Region.OUTSIDE)
         for chamber in self.chambers:
             shell, cavity = self._masks(chamber)
             region[torch.from_numpy(shell)] = int(Region.WALL)
@@ -294,6 +303,20 @@ class Domain:
         """Which particles the body has, bool [nx, ny, nz]."""
         return np.ones(self.shape, bool) if self.body is None else self._inside(self.body)
 
+    @cached_property
+    def _ways(self) -> np.ndarray:
+        """Particles whose cells the port's holes touch outside of the chambers, about, bool [nx, ny, nz]."""
+        found = np.zeros(self.shape, bool)
+        if self.port is None:
+            return found
+        place = self.positions.numpy().reshape(*self.shape, 3)
+        across = [a for a in range(3) if a != self.port.axis]
+        for chamber in self.chambers:
+            off = place - np.array(chamber.center)
+            beside = np.hypot(*(off[..., a] for a in across)) < (self.port.diameter + self.spacing) / 2
+            found |= beside & (off @ np.array(self.port.direction) > 0)
+        return found
+
     def _inside(self, surface: Surface) -> np.ndarray:
         """Which particles' centres lie inside of a surface, bool [nx, ny, nz]."""
         axes = [start + (np.arange(n) + 0.5) * self.spacing for start, n in zip(self.origin, self.shape, strict=True)]
@@ -364,6 +387,35 @@ class Domain:
                 planes.append(round(exact))
             corners.append(tuple(planes))
         return corners[0], corners[1]  # pyright: ignore[reportReturnType]  # three planes each
+
+
+def check_port(chambers: Sequence[Chamber], port: AirPort) -> None:
+    """Refuse a port without a chamber, wider than a cavity, or that runs into another chamber.
+
+    Raises:
+        ValueError: saying which.
+    """
+    if not chambers:
+        raise ValueError("port: got one for a domain without a chamber, want None")
+    across = [a for a in range(3) if a != port.axis]
+    for chamber in chambers:
+        room = min(chamber.size[a] for a in across) - 2 * chamber.wall
+        if port.diameter > room:
+            raise ValueError(
+                f"port.diameter: got {port.diameter} m, want at most {room:.4g} m, the cavity of {chamber.name!r}"
+            )
+        for other in chambers:
+            if other is not chamber and _runs_into(chamber, other, port):
+                raise ValueError(
+                    f"port.direction: got {port.direction}, by which the port of {chamber.name!r} "
+                    f"runs into chamber {other.name!r}"
+                )
+
+
+def _runs_into(chamber: Chamber, other: Chamber, port: AirPort) -> bool:
+    apart = [abs(other.center[a] - chamber.center[a]) for a in range(3)]
+    beside = any(apart[a] > (other.size[a] + port.diameter) / 2 for a in range(3) if a != port.axis)
+    return not beside and (other.center[port.axis] - chamber.center[port.axis]) * port.direction[port.axis] > 0
 
 
 def _triple(name: str, values: tuple[float, float, float], *, positive: bool = False) -> tuple[float, float, float]:

@@ -34,8 +34,10 @@ class DesignField(nn.Module):
 
         phi~_i = sum_j w_ij phi_j / sum_j w_ij ,    w_ij = (1 - |X_i - X_j| / R)^3 ,
 
-    with distances in the undeformed body. It is evaluated in double precision. The density and the gradient with
-    respect to ``phi`` are mirror symmetric to the last bit about the mid planes of the axes in ``symmetry``.
+    with distances in the undeformed body. Where the design is eroded (``threshold`` above 0), void surrounds the body,
+    with phi = -1, so that it wears off at the faces of its box, too. The filter is evaluated in double precision. The
+    density and the gradient with respect to ``phi`` are mirror symmetric to the last bit about the mid planes of the
+    axes in ``symmetry``.
 
     Args:
         domain: Body with its lattice and regions.
@@ -91,6 +93,10 @@ class DesignField(nn.Module):
         weight_sum = _Convolution.apply(design.double(), kernel)
         self.register_buffer("_kernel", kernel, persistent=False)
         self.register_buffer("_weight_sum", torch.where(design, weight_sum, 1.0), persistent=False)
+        inside = _Convolution.apply(domain.lattice(~domain.outside).double(), kernel)
+        beyond = kernel[0].sum() + 2 * kernel[1:].sum() - inside
+        self._beyond: Tensor
+        self.register_buffer("_beyond", torch.where(design, beyond, 0.0), persistent=False)
         self.register_buffer("_design", design, persistent=False)
         # What phi~ is outside the design particles: the projection turns -1 and 1 into exactly 0 and 1.
         frozen = torch.where(domain.lattice(domain.wall), 1.0, -1.0).double()
@@ -116,7 +122,8 @@ class DesignField(nn.Module):
         phi = self._checked(phi)
         # What phi~ = -1 and 1 come to is mapped to 0 and 1.
         low, high = (math.tanh(self.beta * (1.0 + side * threshold)) for side in (1.0, -1.0))
-        pushed = torch.tanh(self.beta * (self._smooth(phi) - threshold)) + 0.5 * (low - high)
+        smooth = self._smooth(phi, beyond=threshold > 0)
+        pushed = torch.tanh(self.beta * (smooth - threshold)) + 0.5 * (low - high)
         gamma = 0.5 * (pushed / (0.5 * (low + high)) + 1.0)
         # Vectorised tanh may round two mirror images differently.
         gamma = _clip(self._mirror(gamma), 0.0, 1.0)
@@ -156,10 +163,11 @@ class DesignField(nn.Module):
             )
         return phi
 
-    def _smooth(self, phi: Tensor) -> Tensor:
-        """Mirror mean and filter on the lattice, in the type of the kernel (double)."""
+    def _smooth(self, phi: Tensor, beyond: bool = False) -> Tensor:
+        """Mirror mean and filter on the lattice, with void beyond the body or not, in the type of the kernel."""
         values = self._mirror(phi.to(self._kernel.dtype)) * self._design
-        smooth = _Convolution.apply(values, self._kernel) / self._weight_sum
+        void = self._beyond if beyond else 0.0
+        smooth = (_Convolution.apply(values, self._kernel) - void) / (self._weight_sum + void)
         # The sums of the filter are rounded in an order that has no mirror symmetry; this mean has.
         return _clip(self._mirror(smooth), -1.0, 1.0)
 

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsoro.design.chambers import chambers_of, port_direction, sockets
+from torchsoro.design.chambers import chambers_of, port_of, sockets
 from torchsoro.design.density import fill, without_void
 from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
@@ -97,12 +97,16 @@ class Robot(nn.Module):
                 )
         self.planes, self.direction = planes, direction
         half = (s.size[0] / 2, s.size[1] / 2)
+        chambers = chambers_of(s, (0.0, 0.0, s.size[2] / 2))
+        self.port = port_of(s, chambers, direction)
         self.domain = Domain(
             size=s.size,
             particles=s.particles,
             origin=(-half[0], -half[1], 0.0),
-            chambers=chambers_of(s, (0.0, 0.0, s.size[2] / 2)),
+            chambers=chambers,
             body=None if s.body_mesh is None else read_surface(s.body_mesh, UNITS[s.mesh_unit]),
+            # Cut through limbs afterwards, a port would leave thin ones.
+            port=self.port if s.feature else None,
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
@@ -122,8 +126,7 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         self.soles = _outermost(self.domain, planes).to(s.target)
-        self.port = port_direction(s, direction)
-        self.socket = sockets(self.domain, self.port).to(s.target)
+        self.socket = sockets(self.domain, self.port.direction).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         everywhere = self.filled(torch.ones(self.domain.count))
         self.full_mass = float(everywhere.mass[~self.domain.gas].sum())

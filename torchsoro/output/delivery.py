@@ -30,7 +30,6 @@ from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
-from torchsoro.output.port import AirPort
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
 from torchsoro.storage import atomic_write
@@ -440,7 +439,5 @@ def record(
 def print_part(robot: Robot, density: np.ndarray) -> Part:
     """The printable part, with the robot's air ports."""
     s = robot.settings
-    cavity = min(c - 2 * s.wall for c in robot.domain.chambers[0].size)
-    port = AirPort(direction=robot.port, diameter=s.port or 0.4 * cavity)
     how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.min_wall}
-    return fabricate(robot.domain, density, port=port, **how)
+    return fabricate(robot.domain, density, port=robot.port, **how)

@@ -19,11 +19,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import ndimage
 
+from torchsoro.design.domain import check_port
 from torchsoro.design.limits import points_across
+from torchsoro.design.port import AirPort
 from torchsoro.output import levelset, mend, thickness
 from torchsoro.output.levelset import as_array
 from torchsoro.output.part import Mended, Part, PartReport
-from torchsoro.output.port import AirPort, away_from_ports, check_port, with_sleeve
+from torchsoro.output.port import away_from_ports, with_sleeve
 
 if TYPE_CHECKING:
     from torchsoro.design.domain import Domain
@@ -78,7 +80,7 @@ def fabricate(
     if refine is not None and not (isinstance(refine, int) and 2 <= refine <= 32):
         raise ValueError(f"refine: got {refine}, want a whole number from 2 to 32")
     if port is not None:
-        check_port(domain, port)
+        check_port(domain.chambers, port)
     spacing = float(domain.spacing)
     if not (math.isfinite(min_wall) and min_wall >= 0):
         raise ValueError(f"min_wall: got {min_wall} m, want 0 or a positive length")
