@@ -306,7 +306,8 @@ def show(
     }
     way = f"travel L = {1e3 * found['L']:.2f} mm"
     if s.robot == "turner":
-        way = f"turns by {math.degrees(found['turn_left']):.1f} degrees to the left"
+        left, right = (math.degrees(found[f"turn_{side}"]) for side in ("left", "right"))
+        way = f"turns by {left:.1f} degrees to the left, {right:.1f} to the right"
     title = f"{name}: {way} in {s.duration:g} s"
     record(path, name, robot, shown, frames, time, supply)
     if history is not None:
@@ -324,7 +325,7 @@ def show(
                 limit=s.c_max,
                 period=1 / s.frequency,
                 title=title,
-                note=numbers(found),
+                note=numbers({**found, "turn_left": None}),  # which the title tells
                 scenarios=None if scenarios is None else scenarios.travel,
             )
     print(f"writing {path / name}.mp4", file=sys.stderr, flush=True)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.figure import Figure
 from PIL import Image
 
 from torchsoro.output.canvas import canvas_of, pixels
@@ -297,7 +298,8 @@ def summary(
         gamma: density per particle [N].
         frames: positions of the particles [S, N, 3] in m.
         time: of the frames [S] in s.
-        history: per iteration, "L" [m] and "C" [-] (or "objective/L" and "constraint/C").
+        history: per iteration, "L" [m] and "C" [-] (or "objective/L" and "constraint/C"); of a turner its angle,
+            "objective/turn" [rad], which is drawn instead of L.
         pressure: gauge pressure at the frames [S] in Pa.
         planes: ground and walls to draw, each (axis, position [m], side of the robot).
         direction: unit vector of the travel.
@@ -306,7 +308,7 @@ def summary(
         limit: C_max, drawn as a line.
         period: of the actuation [s]; None takes it from the pressure, or else the whole time.
         title: written above.
-        note: written at the right of the title.
+        note: written at the right of the title, as small as it takes.
         azimuth: of the camera [degrees].
         elevation: of the camera [degrees].
         tilt: as for a movie [degrees].
@@ -321,15 +323,16 @@ def summary(
         ValueError: for another suffix, arrays of the wrong shape, a history without L or C, times that do not increase.
     """
     target = _target(path, (".png",))
-    objective, constraint = _history(history, "L", "objective/L"), _history(history, "C", "constraint/C")
+    constraint = _history(history, "C", "constraint/C")
+    if "objective/turn" in history:
+        objective, unit, said = np.degrees(_history(history, "objective/turn")), "turn [degrees]", "objective, angle"
+    else:
+        objective, unit, said = 1e3 * _history(history, "L", "objective/L"), "L [mm]", "objective L"
     if period is not None and not (math.isfinite(period) and period > 0):
         raise ValueError(f"period: got {period} s, want a positive number")
     motion = motion_of(domain, gamma, frames, time, pressure, planes, direction, level, displacement)
     figure, canvas = canvas_of(1760, 1120, 110)
-    if title:
-        figure.text(0.03, 0.975, title, va="top", fontsize=17, weight="bold", color=INK)
-    if note:
-        figure.text(0.975, 0.97, note, va="top", ha="right", fontsize=11, color=INK)
+    _headline(figure, title or "", note or "")
     camera = Camera(azimuth, elevation, tilt)
     view = figure.add_axes((0.02, 0.46, 0.34, 0.46))
     vertices, cavity = motion.shape.place(as_array(domain.positions))
@@ -337,7 +340,7 @@ def summary(
     heading(view, "design (orange: chamber wall; inside: cavity)")
 
     upper = figure.add_axes((0.425, 0.74, 0.24, 0.175))
-    history_panel(upper, objective * 1e3, REST, "L [mm]", "objective L (dot: this design)", chosen=chosen)
+    history_panel(upper, objective, REST, unit, f"{said} (dot: this design)", chosen=chosen)
     lower = figure.add_axes((0.425, 0.48, 0.24, 0.175), sharex=upper)
     history_panel(lower, constraint, "#b5651d", "C [-]", "intermediate density C (dot: this design)", limit, chosen)
     lower.set_xlabel("iteration", color=INK)
@@ -348,6 +351,14 @@ def summary(
     with atomic_write(target) as file:
         image.save(file, format="PNG", dpi=(110, 110))
     return target
+
+
+def _headline(figure: Figure, title: str, note: str) -> None:
+    """A title, and at its right a note in letters as small as it takes."""
+    left = figure.text(0.03, 0.975, title, va="top", fontsize=17, weight="bold", color=INK).get_window_extent()
+    right = figure.text(0.975, 0.97, note, va="top", ha="right", fontsize=11, color=INK)
+    room, wanted = 0.965 * figure.bbox.width - left.x1, right.get_window_extent().width
+    right.set_fontsize(11 * min(1.0, room / max(wanted, 1.0)))
 
 
 def _history(history: Mapping[str, Sequence[float]], *names: str) -> np.ndarray:
