@@ -147,6 +147,14 @@ def test_an_archived_robot_keeps_its_files_and_those_early_designs_that_there_ar
     assert not torch.allclose(load_shape(folder, DOMAIN, 0), load_shape(folder, DOMAIN, 5), atol=0.1)
 
 
+def test_a_run_of_a_gpu_is_archived_where_there_is_none(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    settings = json.loads((run / "settings.json").read_text())
+    (run / "settings.json").write_text(json.dumps({**settings, "device": "cuda"}))
+    archive(run, tmp_path / "mine", DOMAIN, (0,))
+    assert read_settings(tmp_path / "mine" / "settings.json", device="cpu").device == "cpu"
+
+
 def test_of_an_iteration_that_was_not_kept_those_are_named_that_were(run, tmp_path):
     archive(run, tmp_path / "mine", DOMAIN, (0, 5))
     for folder in (run, tmp_path / "mine"):

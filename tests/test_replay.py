@@ -141,7 +141,8 @@ def test_an_archived_robot_is_small_and_within_its_limit(folder):
     lattice = robot.domain.lattice(gamma)
     assert torch.equal(lattice, lattice.flip(1))
     first = load_shape(folder, robot.domain, 0)
-    assert intermediate_density(first, robot.design).item() == pytest.approx(0.25, abs=1e-3)  # grey all over
+    if not s.start_from:
+        assert intermediate_density(first, robot.design).item() == pytest.approx(0.25, abs=1e-3)  # grey all over
 
 
 @pytest.mark.parametrize("folder", COMMITTED, ids=named)

@@ -211,7 +211,7 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
     files = ("design.npz", "metrics.csv", "summary.png", "settings.json", "result.json")
     if missing := [name for name in files if not (run / name).is_file()]:
         raise ValueError(f"run: {run} has no {', '.join(missing)}, wanted a finished run")
-    held = read_settings(run / "settings.json")
+    held = read_settings(run / "settings.json", device="auto")  # of a GPU, maybe, that is not here
     if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
         raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
     folder.mkdir(parents=True, exist_ok=True)
