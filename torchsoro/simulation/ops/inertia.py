@@ -11,6 +11,8 @@ alone, as they set the stable step: c_i = m_i^2 q(x_i), with a polynomial q of s
 
 from __future__ import annotations
 
+import functools
+import operator
 from dataclasses import dataclass
 
 import torch
@@ -68,7 +70,7 @@ class Matching:
         wanted = torch.nn.functional.pad(-one_by_one(lambda body: body @ excess, m), (4, 3))
         weights = _solve(safe, wanted)
         weights = weights + _solve(safe, wanted - pairwise_sum(normal * weights.unsqueeze(1)))
-        q = one_by_one(lambda row: terms @ row, weights)
+        q = _combined(weights, terms)
         loss = (-m * q).relu()
         largest = loss.amax(1, keepdim=True)
         norm = largest * pairwise_sum((loss / largest).pow(_NORM)).unsqueeze(1).pow(1 / _NORM)
@@ -92,11 +94,24 @@ class Matching:
         by_gain = by_norm * (loss / norm).pow(_NORM - 1)
         pulled = one_by_one(lambda body: body @ self.terms, m.square() * change + m * by_gain)
         by_wanted = _solve(self.normal, pulled)
-        by_square = -one_by_one(lambda row: self.terms @ row, by_wanted) * q
-        by_excess = one_by_one(lambda row: self.excess @ row, by_wanted[:, 4:7])
-        return bar + 2 * m * (q * change + by_square) + q * by_gain - by_excess
+        by_square = -_combined(by_wanted, self.terms) * q
+        return bar + 2 * m * (q * change + by_square) + q * by_gain - _combined(by_wanted[:, 4:7], self.excess)
+
+
+def _combined(weights: Tensor, columns: Tensor) -> Tensor:
+    """Sum of columns [n, K] with weights of each body [B, K], term by term [B, n]."""
+    parts = (w.unsqueeze(1) * column for w, column in zip(weights.unbind(1), columns.unbind(1), strict=True))
+    return functools.reduce(operator.add, parts)
 
 
 def _solve(matrix: Tensor, right: Tensor) -> Tensor:
-    """Solution [B, 10] without a check for singular matrices, for which the host would wait for the device."""
-    return one_by_one(lambda a, b: torch.linalg.solve_ex(a, b).result, matrix, right)
+    """Solution [B, K] of positive definite systems [B, K, K] by Gauss and Jordan, of all bodies at once.
+
+    Element by element: solvers for batches choose their order by their size, and wait for the device.
+    """
+    wide = torch.cat([matrix, right.unsqueeze(2)], 2)
+    for k in range(wide.shape[1]):
+        pivot = wide[:, k] / wide[:, k, k, None]
+        wide = wide - wide[:, :, k, None] * pivot.unsqueeze(1)
+        wide[:, k] = pivot
+    return wide[..., -1]

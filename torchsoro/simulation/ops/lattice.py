@@ -352,11 +352,15 @@ class Lattice:
 
     def nodal_mass(self, mass: Tensor) -> Tensor:
         """Masses of the nodes [B, nodes] kg, from those of the points [B, points]: the first of :meth:`nodal`."""
-        return self._matching(self.to_nodes(mass)).matched.to(mass)
+        return self.matching(mass).matched.to(mass)
 
-    def nodal_mass_adjoint(self, mass: Tensor, bar: Tensor) -> Tensor:
-        """Gradient by the masses of the points, from that by :meth:`nodal_mass`."""
-        return self.to_points(self._matching(self.to_nodes(mass)).adjoint(bar).to(mass))
+    def matching(self, mass: Tensor) -> Matching:
+        """How :meth:`nodal_mass` finds them."""
+        return self._matching(self.to_nodes(mass))
+
+    def nodal_mass_adjoint(self, masses: Matching, bar: Tensor) -> Tensor:
+        """Gradient by the masses of the points, from that by those of the nodes and how they were found."""
+        return self.to_points(masses.adjoint(bar).to(bar))
 
     def nodal_adjoint(
         self, mass: Tensor, drag: Tensor, dt: float, attached: Tensor, bar: Tensor

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.axis_sums import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.inertia import Matching
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.markers import Markers
 from torchsoro.simulation.ops.once import once
@@ -108,7 +109,7 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
         gradient = state.new_zeros(*state.shape[:-1], 0, 3, 3)
     share = _shares(weight)
     # Weighted by the nodes' masses, so that momentum balances the impulse of the forces.
-    nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
+    _, nodal, center = once(scene, "center", [weight], lambda: _center(lattice, share))
     whole = pairwise_sum(motion * nodal.unsqueeze(1))
     volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
@@ -139,9 +140,10 @@ def _at_markers(markers: Markers, near: Tensor) -> tuple[Tensor, Tensor, Tensor]
     return markers.places.to(moved.device) + moved, drift, gradient + torch.eye(3).to(near)
 
 
-def _center(lattice: Lattice, share: Tensor) -> tuple[Tensor, Tensor]:
-    """What nodes add to the centre of gravity [B, nodes], and where that is in the undeformed body [B, 3]."""
-    return lattice.nodal_mass(share), pairwise_sum(share.unsqueeze(1) * lattice.on("places", share).T)
+def _center(lattice: Lattice, share: Tensor) -> tuple[Matching, Tensor, Tensor]:
+    """What nodes add to the centre of gravity, as it is found and [B, nodes], and its place in the undeformed body."""
+    masses = lattice.matching(share)
+    return masses, masses.matched.to(share), pairwise_sum(share.unsqueeze(1) * lattice.on("places", share).T)
 
 
 def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
@@ -154,7 +156,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
     if (m := scene.markers) is not None:
         at, how = m.nodes, m.weights.to(state)
     share = _shares(weight)
-    nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
+    masses, nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
     nodal_bar = torch.zeros_like(nodal)
     for field, field_bar, at_probes, at_center in zip(
         motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
@@ -165,7 +167,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
     if m is not None:
         _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
     places = lattice.on("places", state).T
-    share_bar = lattice.nodal_mass_adjoint(share, nodal_bar) + pairwise_sum((center_bar.unsqueeze(-1) * places).mT)
+    share_bar = lattice.nodal_mass_adjoint(masses, nodal_bar) + pairwise_sum((center_bar.unsqueeze(-1) * places).mT)
     for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
