@@ -101,7 +101,7 @@ NUMBERS: dict[str, Tensor] = {
 }
 LENGTHS = dict.fromkeys(("Plane.offset", "second Plane.offset", "Body.position"), 1e-3)  # m, of which to take steps
 # Long steps suffer from what is not smooth, as a node that lifts off, short ones from rounding.
-STEPS_TRIED = (1e-3, 1e-2, 1e-4, 1e-5, 3e-2)
+STEPS_TRIED = (1e-3, 3e-3, 1e-2, 1e-4, 1e-5, 3e-2)
 # Fields that are no numbers: indices, and names of kinds.
 NO_NUMBERS = {
     *(f"{load}.particles" for load in ("Force", "PointMass", "Spring", "Drag")),

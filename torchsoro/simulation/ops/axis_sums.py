@@ -52,7 +52,7 @@ def _matrix(kind: str, axis: Axis) -> np.ndarray:
     wide = np.zeros((axis.cells, 2, axis.nodes))
     np.put_along_axis(wide, axis.first[:, None, None] + np.arange(3) + np.zeros((1, 2, 1), int), values, 2)
     found = wide.reshape(-1, axis.nodes)
-    return np.linalg.pinv(found).T if kind == "back" else found
+    return torch.linalg.pinv(torch.from_numpy(found)).T.numpy() if kind == "back" else found
 
 
 @lru_cache(maxsize=2048)
