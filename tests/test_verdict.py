@@ -12,7 +12,7 @@ from ringing import effect
 
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.heldout import before_and_after, left_out
+from torchsoro.sim2real.inference.heldout import predict, predictions
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, _unconstrained, distinct, running
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
@@ -119,14 +119,17 @@ def test_trials_left_out_are_predicted_together_as_one_by_one(dragged):
     problem, _, _, (fit, *_) = dragged
     count = len(problem.trials)
     fits = [dataclasses.replace(fit, errors=np.delete(fit.errors, i)) for i in range(count)]
-    before, after = left_out(problem, fits)
+    found = predictions(problem, fit, [], fits)
+    assert list(found.left_out) == [t.name for t in problem.trials]
     for i, trial in enumerate(problem.trials):
         others = problem.only([t for t in problem.trials if t is not trial])
-        (one,), (other,) = before_and_after(others, fits[i], [trial])
-        assert (before[i].trial, after[i].trial) == (one.trial, other.trial) == (trial.name, trial.name)
-        assert before[i].total == pytest.approx(one.total, rel=1e-3)
-        assert after[i].total == pytest.approx(other.total, rel=1e-3)
-        assert after[i].total < 0.5 * before[i].total
+        (one,), (other,) = (predict(others, fits[i], [trial], believed=b) for b in (True, False))
+        before, after = found.left_out[trial.name]
+        assert before == pytest.approx(one.total, rel=1e-3)
+        assert after == pytest.approx(other.total, rel=1e-3)
+        assert after < 0.5 * before
+        (own,) = predict(problem, fit, [trial])
+        assert found.after[i].total == pytest.approx(own.total, rel=1e-3)
 
 
 def test_it_is_told_what_would_make_an_effect_that_matters_visible(still):

@@ -19,10 +19,11 @@ from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.data.recording import write_table
 from torchsoro.sim2real.inference.believed_motion import against_belief
 from torchsoro.sim2real.inference.discretization import measure
-from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
-from torchsoro.sim2real.inference.heldout import Prediction, at_clocks_of, before_and_after
+from torchsoro.sim2real.inference.heldout import at_clocks_of
 from torchsoro.sim2real.inference.isolability import isolability
+from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
 from torchsoro.sim2real.inference.phases import mismatches
@@ -99,18 +100,6 @@ def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> 
     )
 
 
-def shown(
-    problem: FitProblem, best: Fit, trials: list[Trial], kept: list[Trial], note: Callable[[str], None]
-) -> tuple[list[Trial], tuple[Prediction, ...], tuple[Prediction, ...]]:
-    """The trials that do not break down, as believed and as explained."""
-    for asked in ([*trials, *kept], trials):
-        before, after = map(tuple, before_and_after(problem, best, asked))
-        if before and after:
-            break
-        note("A held-out trial cannot be simulated with what was found, and is not shown.")
-    return asked, before, after
-
-
 @threadpool_limits.wrap(limits=1)  # products of small matrices: threads would wait for each other, and round otherwise
 def explain(options: Options) -> Explanation:
     """Explain an experiment, and write report.html, explanation.json and model.toml.
@@ -172,7 +161,12 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     if len(verdict.chosen) > 1:  # beside one name the set may hold what is unknown
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
-    everything, before, after = shown(problem, best, trials, kept, progress.note)
+    before, after = verdict.before, verdict.after
+    everything = [t for t in (*trials, *kept) if t.name in {p.trial for p in before}]
+    if not everything:
+        raise ValueError(BREAKS)
+    if len(everything) < len(trials) + len(kept):
+        progress.note("Trials that cannot be simulated with what was found are not shown.")
     # With the error that the simulation has as it is corrected, not that of the twin in the search.
     own = verdict.posterior.near.numerics.amplitude.T
     deviation = {t.name: own for t in problem.trials}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -38,6 +39,22 @@ class Prediction:
     motion: MarkerTrajectory
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Predictions:
+    """All trials, once it is decided what was left out.
+
+    Attributes:
+        before: As believed; of trials whose simulations do not break down.
+        after: Of the same, with what was found.
+        left_out: By trial that did not take part in the fit that predicts it, the errors as believed and with what was
+            found [m]; none where one breaks down.
+    """
+
+    before: tuple[Prediction, ...]
+    after: tuple[Prediction, ...]
+    left_out: dict[str, tuple[float, float]]
+
+
 def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed: bool = False) -> list[Prediction]:
     """Predict trials with the parameters and measurement errors of a fit; only the clock of each trial is fitted.
 
@@ -55,36 +72,37 @@ def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed:
     """
     there = _there(problem, trials)
     (motions,) = there.simulate([_as_believed(there) if believed else (fit.effects, fit.point[None])])
-    return _predicted(problem, there, fit, motions)
+    found = [_predicted(problem, there.only([t]), fit, m) for t, m in zip(there.trials, motions, strict=True)]
+    return [p for p in found if p] if all(found) else []
 
 
-def before_and_after(
-    problem: FitProblem, fit: Fit, trials: Sequence[Trial]
-) -> tuple[list[Prediction], list[Prediction]]:
-    """:func:`predict` of what is believed and of a fit, simulated together."""
-    there = _there(problem, trials)
-    before, after = there.simulate([_as_believed(there), (fit.effects, fit.point[None])])
-    return _predicted(problem, there, fit, before), _predicted(problem, there, fit, after)
-
-
-def left_out(problem: FitProblem, fits: Sequence[Fit]) -> tuple[list[Prediction], list[Prediction]]:
-    """The first trials, each as :func:`before_and_after` by a fit of all others, simulated together.
+def predictions(problem: FitProblem, fit: Fit, heldout: Sequence[Trial], folds: Sequence[Fit] = ()) -> Predictions:
+    """Predict the trials of a fit, those that were held out, and some of the former by fits without them, all at once.
 
     Args:
-        problem: The fits', with all trials.
-        fits: One for each trial that is left out, with the measurement errors of the others.
+        problem: The fit's.
+        fit: What was found.
+        heldout: Trials with recordings that did not take part.
+        folds: Fits, each without one of the first trials, in order, and with the measurement errors of the others; only
+            of interest where no trial was held out.
     """
-    trials = problem.trials[: len(fits)]
-    there = _there(problem, trials)
-    # Each fit in all trials, of which one counts: lanes that are filled take no longer than empty ones.
-    believed, *found = there.simulate([_as_believed(there), *((f.effects, f.point[None]) for f in fits)])
-    before: list[Prediction] = []
-    after: list[Prediction] = []
-    for i, (trial, fit) in enumerate(zip(trials, fits, strict=True)):
-        others, one = problem.only([t for t in problem.trials if t is not trial]), there.only([trial])
-        before += _predicted(others, one, fit, [believed[i]])
-        after += _predicted(others, one, fit, [found[i][i]])
-    return before, after
+    there = _there(problem, [*problem.trials, *heldout])
+    every = range(len(there.trials))
+    requests = [_as_believed(there), *((f.effects, f.point[None]) for f in (fit, *folds))]
+    believed, found, *each = there.simulate(requests, of=[every, every, *([i] for i in range(len(folds)))])
+    alone = [there.only([trial]) for trial in there.trials]
+    shown = [_pair(problem, *own) for own in zip(alone, itertools.repeat(fit), believed, found)]
+    asked = shown[len(problem.trials) :]
+    if folds:
+        others = [problem.only([t for t in problem.trials if t is not trial]) for trial in problem.trials]
+        motions = [motion for (motion,) in each]
+        asked = [_pair(*own) for own in zip(others, alone, folds, believed, motions, strict=False)]
+    sound, left_out = ([pair for pair in pairs if pair] for pairs in (shown, asked))
+    return Predictions(
+        before=tuple(before for before, _ in sound),
+        after=tuple(after for _, after in sound),
+        left_out={b.trial: (b.total, a.total) for b, a in left_out} if len(left_out) == len(asked) else {},
+    )
 
 
 def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
@@ -124,37 +142,41 @@ def _errors(problem: FitProblem, there: FitProblem, fit: Fit) -> np.ndarray:
     return np.concatenate([np.zeros(count), known])
 
 
-def _predicted(
-    problem: FitProblem, there: FitProblem, fit: Fit, motions: Sequence[MarkerTrajectory]
-) -> list[Prediction]:
-    found: list[Prediction] = []
-    if not all(m.sound.all() for m in motions):
-        return found
-    for i, (motion, trial) in enumerate(zip(motions, there.trials, strict=True)):
-        assert trial.recording is not None
-        one = motion.alone()
-        errors = _errors(problem, there, fit)
-        deviation = there.observation.deviations[i]
-        weight, most = (problem.noise / deviation) ** 2, CLOCK_LIMIT * deviation
-        clock, least, step = 0.0, math.inf, 0.0
-        for _ in range(ROUNDS):
-            seen, by = there.observation.linearise(one, i, errors)
-            left, slope = trial.recording.position - seen, by[..., i]
-            good = np.isfinite(left)
-            now = float((left[good] ** 2).sum()) + weight * errors[i] ** 2
-            if now < least:
-                clock, least = float(errors[i]), now
-                step = (float((left[good] * slope[good]).sum()) - weight * clock) / (
-                    float((slope[good] ** 2).sum()) + weight
-                )
-            else:  # the step was too long
-                step /= 4
-            # The fit of a simulation that is far off would otherwise move the clock without limit.
-            errors[i] = np.clip(clock + step, -most, most)
-        errors[i] = clock
-        seen = there.observation.observe(one, i, errors)
-        square = (trial.recording.position - seen) ** 2
-        error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
-        total = float(np.sqrt(np.nanmean(square.sum(-1))))
-        found.append(Prediction(trial=trial.name, seen=seen, error=error, total=total, clock=clock, motion=one))
-    return found
+def _pair(
+    problem: FitProblem, there: FitProblem, fit: Fit, believed: MarkerTrajectory, found: MarkerTrajectory
+) -> tuple[Prediction, Prediction] | None:
+    """One trial as believed and with what was found; none where a simulation broke down."""
+    before, after = (_predicted(problem, there, fit, motion) for motion in (believed, found))
+    return (before, after) if before and after else None
+
+
+def _predicted(problem: FitProblem, there: FitProblem, fit: Fit, motion: MarkerTrajectory) -> Prediction | None:
+    """One trial, which is the only one there; none where its simulation broke down."""
+    if not motion.sound.all():
+        return None
+    (trial,), motion = there.trials, motion.alone()
+    assert trial.recording is not None
+    errors = _errors(problem, there, fit)
+    deviation = there.observation.deviations[0]
+    weight, most = (problem.noise / deviation) ** 2, CLOCK_LIMIT * deviation
+    clock, least, step = 0.0, math.inf, 0.0
+    for _ in range(ROUNDS):
+        seen, by = there.observation.linearise(motion, 0, errors)
+        left, slope = trial.recording.position - seen, by[..., 0]
+        good = np.isfinite(left)
+        now = float((left[good] ** 2).sum()) + weight * errors[0] ** 2
+        if now < least:
+            clock, least = float(errors[0]), now
+            step = (float((left[good] * slope[good]).sum()) - weight * clock) / (
+                float((slope[good] ** 2).sum()) + weight
+            )
+        else:  # the step was too long
+            step /= 4
+        # The fit of a simulation that is far off would otherwise move the clock without limit.
+        errors[0] = np.clip(clock + step, -most, most)
+    errors[0] = clock
+    seen = there.observation.observe(motion, 0, errors)
+    square = (trial.recording.position - seen) ** 2
+    error = np.sqrt(np.nanmean(square.reshape(len(square), square.shape[1], -1).sum(-1), axis=0))
+    total = float(np.sqrt(np.nanmean(square.sum(-1))))
+    return Prediction(trial=trial.name, seen=seen, error=error, total=total, clock=clock, motion=motion)

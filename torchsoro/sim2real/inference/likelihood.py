@@ -271,21 +271,30 @@ class Likelihood:
                 scenario = effect(scenario, part, self.twin)
         return scenario
 
-    def simulate(self, requests: Sequence[Request]) -> list[list[MarkerTrajectory]]:
-        """For each request, the motions of all trials, each with a leading batch; all at once."""
+    def simulate(
+        self, requests: Sequence[Request], of: Sequence[Sequence[int]] | None = None
+    ) -> list[list[MarkerTrajectory]]:
+        """For each request, the motions of its trials, each with a leading batch; all at once.
+
+        Args:
+            requests: Effects and points.
+            of: Numbers of the trials of each; all if None.
+        """
         begin = time.perf_counter()
-        varied = [self.vary(s, effects, points) for effects, points in requests for s in self.scenarios]
-        count = len(self.scenarios)
-        found = []
-        for k, motion in enumerate(simulate(self.twin, varied, threads=self.threads, even=self.even)):
-            error, name = self.discretization, self.trials[k % count].name
-            known = error.own.get(requests[k // count][0], error.correction)
-            found.append(motion.plus(known[name]) if name in known else motion)
+        asked = [range(len(self.trials)) for _ in requests] if of is None else of
+        lanes = [(k, i) for k, own in enumerate(asked) for i in own]
+        varied = [self.vary(self.scenarios[i], *requests[k]) for k, i in lanes]
+        found: list[list[MarkerTrajectory]] = [[] for _ in requests]
+        moving = simulate(self.twin, varied, threads=self.threads, even=self.even)
+        for (k, i), motion in zip(lanes, moving, strict=True):
+            error, name = self.discretization, self.trials[i].name
+            known = error.own.get(requests[k][0], error.correction)
+            found[k].append(motion.plus(known[name]) if name in known else motion)
         spent = time.perf_counter() - begin
-        simulations = count * sum(len(points) for _, points in requests)
+        simulations = sum(len(points) * len(own) for (_, points), own in zip(requests, asked, strict=True))
         self.tally.count(simulations)
         self.report(f"{simulations} simulations, {spent:.1f} s")
-        return [found[k : k + count] for k in range(0, len(found), count)]
+        return found
 
     # Residuals --------------------------------------------------------------------------------------------------
 

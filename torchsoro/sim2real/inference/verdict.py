@@ -16,7 +16,7 @@ from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_mov
 from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
 from torchsoro.sim2real.inference.evidence import Posterior, told
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.heldout import before_and_after, left_out
+from torchsoro.sim2real.inference.heldout import Prediction, predictions
 from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
@@ -65,6 +65,8 @@ class Verdict:
         ranking: What was weighed, most probable first.
         chosen: What explains the difference: one, or several that cannot be told apart.
         conclusion: What that follows from.
+        before: Trials as believed, those that were held out last; without those whose simulations break down.
+        after: The same trials by the fit that is shown.
         heldout: Of trials that were left out, the error as believed and with the best effect [m]; decides nothing.
     """
 
@@ -74,6 +76,8 @@ class Verdict:
     ranking: tuple[Candidate, ...]
     chosen: tuple[Candidate, ...] = ()
     conclusion: Conclusion
+    before: tuple[Prediction, ...] = ()
+    after: tuple[Prediction, ...] = ()
     heldout: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -187,7 +191,8 @@ def weighed(
         chosen=tuple(by_name[name] for name in found.chosen) if found.kind in NAMED else (),
         conclusion=found,
     )
-    return dataclasses.replace(verdict, heldout=_predicted(verdict, data, weighing.kappa, heldout))
+    ahead = predictions(problem, verdict.best, heldout, _folds(verdict, data, weighing.kappa) if not heldout else ())
+    return dataclasses.replace(verdict, before=ahead.before, after=ahead.after, heldout=ahead.left_out)
 
 
 def _far(weighing: Weighing, behind: float) -> list[Posterior]:
@@ -246,18 +251,13 @@ def tell(fit: Fit) -> str:
     return ", ".join(parts)
 
 
-def _predicted(verdict: Verdict, data: Data, kappa: float, trials: Sequence[Trial]) -> dict[str, tuple[float, float]]:
-    """By trial that was left out, the error as believed and with what was found [m]."""
+def _folds(verdict: Verdict, data: Data, kappa: float) -> list[Fit]:
+    """What is shown, as it would be without one of the first trials, for each; none of fewer than three trials."""
     problem, best = verdict.problem, verdict.best
-    if trials:
-        before, after = before_and_after(problem, best, trials)
-    elif len(problem.trials) < 3:
-        return {}
-    else:
-        trials = problem.trials[:FOLDS]
-        fits = [at_mode(problem, best, told(data, verdict.posterior, kappa, but=i)) for i in range(len(trials))]
-        fits = [dataclasses.replace(fit, errors=np.delete(fit.errors, i)) for i, fit in enumerate(fits)]
-        before, after = left_out(problem, fits)
-    if not len(before) == len(after) == len(trials):  # one breaks down
-        return {}
-    return {b.trial: (b.total, a.total) for b, a in zip(before, after, strict=True)}
+    if len(problem.trials) < 3:
+        return []
+    found = []
+    for i in range(len(problem.trials[:FOLDS])):
+        fit = at_mode(problem, best, told(data, verdict.posterior, kappa, but=i))
+        found.append(dataclasses.replace(fit, errors=np.delete(fit.errors, i)))
+    return found
