@@ -20,6 +20,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from tiny import TINY, tiny
 
 import torchsoro.design.ensemble
+import torchsoro.design.robot
 from torchsoro.design import loop
 from torchsoro.design.ensemble import Ensemble, evaluate, fallen, overall
 from torchsoro.design.processes import Processes
@@ -29,6 +30,7 @@ from torchsoro.output.archive import load_design
 from torchsoro.output.robustness import UNSEEN, compare_scenarios
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+MEMORY = 0.04  # GiB, in which twice as many lanes keep states more often
 MANY = {"scenarios": 5, "risk": "cvar:0.5", "fresh": True, "dt": "auto"}
 
 
@@ -318,7 +320,20 @@ def test_more_processes_than_scenarios_and_several_starts_are_refused(recipes, m
 def test_lanes_are_as_many_as_a_cpu_carries():
     from torchsoro.simulation.kernels.lanes import LANES
 
-    assert torchsoro.design.ensemble.LANES == LANES
+    assert torchsoro.design.robot.LANES == LANES
+
+
+def test_a_part_of_the_scenarios_keeps_states_as_often_as_all_and_has_their_gradient_bit_by_bit():
+    made = robot_of(scenarios=20, memory=MEMORY)
+    batch, gamma = Ensemble(made).sample(0), made.field().detach()
+    dt = made.step(gamma, batch)
+
+    def of(part: list[int]) -> torch.Tensor:
+        rows = gamma.expand(len(part), -1).clone().requires_grad_()
+        return torch.autograd.grad(made(rows, scenarios=batch.part(part), dt=dt).travel.sum(), rows)[0]
+
+    whole = of([*range(20), *[19] * 12])
+    assert torch.equal(of([*range(16)]), whole[:16])
 
 
 @pytest.mark.gpu

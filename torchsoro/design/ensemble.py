@@ -20,11 +20,10 @@ from torchsoro.design.features import threshold_of
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass
 from torchsoro.design.processes import Processes
 from torchsoro.design.risk import CVaR, parse_risk
-from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.robot import LANES, Outcome, Robot
 from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.errors import SimulationDiverged
 
-LANES = 16  # simulations that a CPU carries on at a time; fewer are filled up
 JUDGED = ("travel", "feet", "soles", "inflated", "fall")  # what is gathered of every scenario,
 TURNS = ("turn", "turn_inflated")  # and of a turner
 # Share of the risk's gradient by scenarios that overflowed, or that fell, above which it says nothing.

@@ -31,6 +31,8 @@ from torchsoro.simulation.simulator import Simulator
 from torchsoro.simulation.sums import pairwise_sum
 from torchsoro.simulation.trajectory import Start, Trajectory
 
+LANES = 16  # simulations that a CPU carries on at a time; fewer are filled up
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Outcome:
@@ -351,6 +353,12 @@ class Robot(nn.Module):
         probes = torch.arange(len(rest), device=rest.device)
         return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
+    @property
+    def together(self) -> int:
+        """Scenarios that are simulated at once, by however many processes; lanes are filled."""
+        count = self.settings.scenarios
+        return count + -count % LANES if self.formulation.in_lanes(self.field.phi) else count
+
     def simulator(self, parts: int = 1, dt: float | None = None) -> Simulator:
         """A simulator, in whose box it moves, that takes a part of the usual step; or the step ``dt`` [s]."""
         s = self.settings
@@ -363,6 +371,7 @@ class Robot(nn.Module):
             high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
             formulation=self.formulation,
             memory_budget=int(s.memory * 2**30) or None,
+            together=self.together or None,
         )
 
 

@@ -62,6 +62,8 @@ class Simulator(nn.Module):
         formulation: "updated" or "total", or one of the objects in :mod:`torchsoro.simulation.formulation`.
         memory_budget: Bytes that a rollout may keep for its gradient; if None 2 GiB on a CPU and 6 GiB on CUDA, or the
             least that it takes, if that is more.
+        together: Simulations that a call may be a part of: what is kept is planned as for all of them, so that the
+            gradient of each has the same bits in any part; those of the call if None.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
         safety: Share of the largest stable step that dt = "auto" takes.
 
@@ -79,11 +81,13 @@ class Simulator(nn.Module):
         transfer: str | None = None,
         formulation: FormulationName | Formulation = "updated",
         memory_budget: int | None = None,
+        together: int | None = None,
         segment: int | None = None,
         safety: float = 0.9,
     ) -> None:
         super().__init__()
         numbers = {"cell": cell, "dt": dt, "memory_budget": memory_budget, "segment": segment, "safety": safety}
+        numbers |= {"together": together}
         refuse_gradients(**numbers, low=low, high=high)
         if dt == "auto":
             del numbers["dt"]
@@ -96,7 +100,7 @@ class Simulator(nn.Module):
         self.cell, self.safety = float(cell), safety
         self.dt: float | Literal["auto"] = "auto" if dt == "auto" else float(dt)
         self.low, self.high = _triple(low), _triple(high)
-        self.memory_budget, self.segment = memory_budget, segment
+        self.memory_budget, self.together, self.segment = memory_budget, together, segment
 
     def extra_repr(self) -> str:
         """For ``print``."""
@@ -301,7 +305,7 @@ class Simulator(nn.Module):
         if differentiable:
             plan = plan_checkpoints(
                 steps=steps,
-                state_bytes=state.numel() * state.element_size(),
+                state_bytes=state[0].numel() * state.element_size() * max(self.together or 0, len(state)),
                 element_bytes=state.element_size(),
                 budget=self.memory_budget or MEMORY[state.device.type],
                 binding=self.memory_budget is not None,
