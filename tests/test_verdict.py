@@ -132,6 +132,21 @@ def test_trials_left_out_are_predicted_together_as_one_by_one(dragged):
         assert found.after[i].total == pytest.approx(own.total, rel=1e-3)
 
 
+def test_a_trial_that_breaks_down_is_left_out_and_the_others_are_predicted(dragged):
+    problem, _, _, (fit, *_) = dragged
+    trial = problem.trials[0]
+    crushed = dataclasses.replace(trial.setup, gravity=(0.0, 0.0, -1e6))
+    broken, kept = (
+        dataclasses.replace(trial, name=name, setup=setup)
+        for name, setup in (("broken", crushed), ("kept", trial.setup))
+    )
+    found = predictions(problem, fit, [broken, kept])
+    names = [*(t.name for t in problem.trials), "kept"]
+    assert [p.trial for p in found.before] == [p.trial for p in found.after] == names
+    assert found.left_out == {}
+    assert list(predictions(problem, fit, [kept]).left_out) == ["kept"]
+
+
 def test_it_is_told_what_would_make_an_effect_that_matters_visible(still):
     problem, null_model = still
     found = weighed(problem, [effect("drag"), effect("density")], null_model, [], report=quiet)
