@@ -70,7 +70,7 @@ class Ensemble:
         self.count = robot.settings.scenarios
         self.parts = self.processes.deal(self.count)
         self.own = self.parts[self.processes.rank]
-        spare = -len(self.own) % LANES if robot.formulation.in_lanes(robot.field.phi) else 0
+        spare = robot.carried(len(self.own)) - len(self.own)
         self._places = [*self.own, *[self.own[-1]] * spare]
         self.judged = JUDGED + (TURNS if robot.settings.robot == "turner" else ())
         self._timing = {name: one for name, one in robot.supply.named_parameters() if one.requires_grad}

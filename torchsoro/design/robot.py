@@ -353,10 +353,8 @@ class Robot(nn.Module):
         probes = torch.arange(len(rest), device=rest.device)
         return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
-    @property
-    def together(self) -> int:
-        """Scenarios that are simulated at once, by however many processes; lanes are filled."""
-        count = self.settings.scenarios
+    def carried(self, count: int) -> int:
+        """Simulations that are carried on where so many are asked for: lanes are filled."""
         return count + -count % LANES if self.formulation.in_lanes(self.field.phi) else count
 
     def simulator(self, parts: int = 1, dt: float | None = None) -> Simulator:
@@ -371,7 +369,7 @@ class Robot(nn.Module):
             high=(half[0] + s.room, half[1] + s.room, s.size[2] + s.room),
             formulation=self.formulation,
             memory_budget=int(s.memory * 2**30) or None,
-            together=self.together or None,
+            together=self.carried(s.scenarios) or None,  # by however many processes
         )
 
 

@@ -162,7 +162,8 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
         one, other = ((c.fit.effects, c.fit.point) for c in verdict.chosen[:2])
         following = next_experiment(problem, one, other)
     before, after = verdict.before, verdict.after
-    everything = [t for t in (*trials, *kept) if t.name in {p.trial for p in before}]
+    simulated = {p.trial for p in before}
+    everything = [t for t in (*trials, *kept) if t.name in simulated]
     if not everything:
         raise ValueError(BREAKS)
     if len(everything) < len(trials) + len(kept):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -83,20 +82,18 @@ def predictions(problem: FitProblem, fit: Fit, heldout: Sequence[Trial], folds: 
         problem: The fit's.
         fit: What was found.
         heldout: Trials with recordings that did not take part.
-        folds: Fits, each without one of the first trials, in order, and with the measurement errors of the others; only
-            of interest where no trial was held out.
+        folds: Fits, each without one of the first trials, in order, and with the measurement errors of the others.
     """
     there = _there(problem, [*problem.trials, *heldout])
     every = range(len(there.trials))
     requests = [_as_believed(there), *((f.effects, f.point[None]) for f in (fit, *folds))]
     believed, found, *each = there.simulate(requests, of=[every, every, *([i] for i in range(len(folds)))])
     alone = [there.only([trial]) for trial in there.trials]
-    shown = [_pair(problem, *own) for own in zip(alone, itertools.repeat(fit), believed, found)]
+    shown = [_pair(problem, one, fit, *motions) for one, *motions in zip(alone, believed, found, strict=True)]
     asked = shown[len(problem.trials) :]
-    if folds:
-        others = [problem.only([t for t in problem.trials if t is not trial]) for trial in problem.trials]
-        motions = [motion for (motion,) in each]
-        asked = [_pair(*own) for own in zip(others, alone, folds, believed, motions, strict=False)]
+    for i, (own, (motion,)) in enumerate(zip(folds, each, strict=True)):
+        others = problem.only([t for k, t in enumerate(problem.trials) if k != i])
+        asked.append(_pair(others, alone[i], own, believed[i], motion))
     sound, left_out = ([pair for pair in pairs if pair] for pairs in (shown, asked))
     return Predictions(
         before=tuple(before for before, _ in sound),
