@@ -221,6 +221,7 @@ def problem(
         share=share.to(dtype),
         plane_kind=torch.tensor([[2, 1, int(stick), 0], [0, -1, 0, 0], [1, 1, 0, 0]], dtype=torch.int32),
         springs=True,
+        drags=True,
         viscous=True,
         stiffens=True,
         probes=torch.tensor([0, 7, int((kind == -1).nonzero()[-1])]),

@@ -214,7 +214,7 @@ def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamb
     kind[p.scene.kind == layout.ABSENT] = layout.ABSENT
     p.scene = replace(
         p.scene,
-        **{"kind": kind, "springs": False, "viscous": False, "stiffens": False},
+        **{"kind": kind, "springs": False, "drags": False, "viscous": False, "stiffens": False},
         **{"share": p.scene.share[:0], "plane_kind": p.scene.plane_kind[:0]},
     )
     p.tensors |= {"force": p.tensors["force"][:, :, :0], "planes": p.tensors["planes"][:, :0]}

@@ -79,6 +79,19 @@ def test_shares_weight_a_group():
     torch.testing.assert_close(springs, torch.tensor([[3.0], [5.0]], dtype=torch.float64) * both)
 
 
+def test_kernels_deal_with_springs_only_where_there_are_any():
+    body = block()[1]
+    dragged = replace(body, drag=torch.full_like(body.mass, 0.1))
+    for loads, spring in (
+        ([], False),
+        ([Drag(particles=EVERY, coefficient=0.1)], False),
+        ([hold := Spring(particles=EVERY, stiffness=1.0)], True),
+    ):
+        found = attach(dragged, loads)
+        assert (found.spring is not None, found.anchor is not None, found.drag is not None) == (spring, spring, True)
+    assert attach(body, [hold]).drag is None
+
+
 @ways("apic", "total")
 def test_a_point_mass_has_inertia_and_weight(way):
     push, load = Force(particles=EVERY, value=vector(0.01, 0.0, 0.0)), PointMass(particles=EVERY, mass=3 * MASS)

@@ -115,6 +115,7 @@ def test_gradcheck_of_a_bare_body(form):
     p.scene = replace(
         p.scene,
         springs=False,
+        drags=False,
         viscous=False,
         stiffens=False,
         share=p.scene.share[:0],

@@ -171,7 +171,7 @@ class Attached:
 
     Attributes:
         body: The body, with the point masses added.
-        spring: [..., N] N/m, or None without springs and drag.
+        spring: [..., N] N/m, or None without springs.
         anchor: [..., N, 3] m, or None.
         drag: [..., N] N s/m, or None.
         forces: The forces, one group each; those on particles come first.
@@ -240,12 +240,13 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
                 _check_vector("spring shift", load.shift)
                 place = there.to(x).unsqueeze(-1)
                 anchor = anchor + place * load.shift.to(x).unsqueeze(-2)
-    loose = body.drag is None and not any(isinstance(load, Spring | Drag) for load in loads)
+    tied = any(isinstance(load, Spring) for load in loads)
+    dragged = body.drag is not None or any(isinstance(load, Drag) for load in loads)
     return Attached(
         body=replace(body, mass=mass),
-        spring=None if loose else spring,
-        anchor=None if loose else anchor,
-        drag=None if loose else drag,
+        spring=spring if tied else None,
+        anchor=anchor if tied else None,
+        drag=drag if dragged else None,
         forces=tuple(forces),
         share=torch.cat(shares),
         more=more,

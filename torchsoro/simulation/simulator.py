@@ -277,6 +277,7 @@ class Simulator(nn.Module):
             share=attached.share,
             plane_kind=kind.new_tensor(contact).reshape(-1, layout.PLANE_INTEGERS),
             springs=attached.spring is not None,
+            drags=attached.drag is not None,
             viscous=_present(body, body.viscosity, body.volume_viscosity),
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
             probes=probes,

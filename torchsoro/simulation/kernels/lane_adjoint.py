@@ -12,7 +12,7 @@ import numpy as np
 
 from torchsoro.simulation.kernels.lane_contact import add_vector, meets_adjoint, spread, store_vector, vector
 from torchsoro.simulation.kernels.lane_march import SCRATCH
-from torchsoro.simulation.kernels.lane_nodes import gravity_row, slow, sum_areas, sum_chamber, sum_items, tied, touches
+from torchsoro.simulation.kernels.lane_nodes import gravity_row, pressed, slow, sum_chamber, sum_items, tied
 from torchsoro.simulation.kernels.lane_points import ROOM
 from torchsoro.simulation.kernels.lane_points_adjoint import add, gas_end, points_backward
 from torchsoro.simulation.kernels.lane_threads import meet
@@ -53,20 +53,22 @@ class Sums(NamedTuple):
 def retreat(mesh, case, work, sums, g, p, t, steps):
     """Finish the gradients by the nodes of plane p after t + 1 substeps, and go back to the forces in substep t."""
     n, own, dt = mesh.component, g * 6 * mesh.component, case.dt
-    items, size = len(mesh.item_plane), 9 * mesh.patch
+    first = g * len(mesh.item_plane) * 9 * mesh.patch
     finishes, planes = t + 1 < steps, len(case.plane_stick)
-    if finishes and p == 0:
+    if finishes:
         for k in range(mesh.chambers):
             one = 16 * (g * mesh.chambers + k)
             step = 16 * ((t + 1) * case.groups + g) * mesh.chambers + 16 * k
             p_bar = sum_chamber(work.swept, mesh, g, k)
             stiffness, reference = load(case.air, 2 * one), load(case.air, 2 * one + 16)
-            growth = load(work.volumes, step) / reference
             volume_bar = -p_bar * stiffness / reference
-            store(sums.volume_bar, one, volume_bar)
-            store(sums.pressure, step, p_bar)
-            add(sums.air, 2 * one, -p_bar * (growth - 1))
-            add(sums.air, 2 * one + 16, -volume_bar * growth)
+            store(work.by_plane, 16 * ((g * mesh.planes + p) * mesh.chambers + k), volume_bar)
+            if p == 0:
+                growth = load(work.volumes, step) / reference
+                store(sums.volume_bar, one, volume_bar)
+                store(sums.pressure, step, p_bar)
+                add(sums.air, 2 * one, -p_bar * (growth - 1))
+                add(sums.air, 2 * one + 16, -volume_bar * growth)
     sample = work.seen_at[t + 1]
     for at in range(0, mesh.plane, 16):
         i = mesh.front + p * mesh.plane + at
@@ -74,19 +76,8 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
         d0, d1, d2 = load(sums.bar, a), load(sums.bar, a + n), load(sums.bar, a + 2 * n)
         v0, v1, v2 = load(sums.bar, a + 3 * n), load(sums.bar, a + 4 * n), load(sums.bar, a + 5 * n)
         if finishes:
-            first = g * items * size
-            d0 = d0 + sum_items(work.forces, mesh, first, size, p, 0, at)
-            d1 = d1 + sum_items(work.forces, mesh, first, size, p, 1, at)
-            d2 = d2 + sum_items(work.forces, mesh, first, size, p, 2, at)
-            for k in range(mesh.chambers):
-                if touches(mesh, p, k):
-                    one = 16 * (g * mesh.chambers + k)
-                    volume_bar = (
-                        -sum_chamber(work.swept, mesh, g, k) * load(case.air, 2 * one) / load(case.air, 2 * one + 16)
-                    )
-                    d0 = d0 + volume_bar * sum_areas(mesh, work, g, k, p, 0, at)
-                    d1 = d1 + volume_bar * sum_areas(mesh, work, g, k, p, 1, at)
-                    d2 = d2 + volume_bar * sum_areas(mesh, work, g, k, p, 2, at)
+            f0, f1, f2 = pressed(mesh, work, g, p, at, sum_items(work.forces, mesh, first, p, at))
+            d0, d1, d2 = d0 + f0, d1 + f1, d2 + f2
             if case.tie_stiffness.size:
                 d0, d1, d2 = (
                     d0 + tied(mesh, case, work, g, 0, i),
@@ -98,9 +89,8 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
                 s0, s1, s2 = spread(mesh, case, work.states, after, sums.surfaces, (t + 1) % 2, g, i)
                 d0, d1, d2 = d0 + s0, d1 + s1, d2 + s2
             if case.flags[2]:
-                v0 = v0 + sum_items(sums.rates, mesh, first, size, p, 0, at)
-                v1 = v1 + sum_items(sums.rates, mesh, first, size, p, 1, at)
-                v2 = v2 + sum_items(sums.rates, mesh, first, size, p, 2, at)
+                f0, f1, f2 = sum_items(sums.rates, mesh, first, p, at)
+                v0, v1, v2 = v0 + f0, v1 + f1, v2 + f2
         if sample >= 0:
             o = (sample * case.groups + g) * 6 * n + i
             d0, d1, d2 = (

@@ -131,9 +131,9 @@ def least_ratio(void_fraction):
 @law
 def fade(ratio, least):
     """Smooth step from 0 where a solid is turned inside out to 1 at the least volume ratio, and its slope."""
-    back = 1 / larger(least, 1e-30)
+    below = ratio < least  # never of solid matter, whose least is 0, unless it is turned inside out
+    back = select(least > 0, 0 * least + 1 / CRUSHED, 0 * least + 1e30)
     t = larger(ratio, 0.0) * back
-    below = ratio < least
     return select(below, t * t * (3 - 2 * t), 0 * t + 1), select(below, 6 * t * (1 - t) * back, 0 * t)
 
 
@@ -192,9 +192,8 @@ def pull_back_adjoint(F, cof, ratio, least, B):
 
 
 @law
-def void_slope(J):
-    """l'(J) of the law of void, l = ln J above J = 1 and its second-order expansion below; and l''."""
-    back = 1 / J
+def void_slope(J, back):
+    """l'(J) of the law of void, l = ln J above J = 1 and its second-order expansion below, and l''; back is 1 / J."""
     return select(J > 1, back, 2 - J), select(J > 1, -back * back, 0 * J - 1)
 
 
@@ -213,14 +212,15 @@ def piola(F, Q, bulk, shear, factor, void_fraction):
     cof = cofactor(F)
     ratio = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
     J = larger(ratio, least_ratio(void_fraction))
+    back = 1 / J
     log = logarithm(J)
     root = inverse_cube_root(J)
     A = times(F, (J * Q[0] + factor, J * Q[1] + factor, J * Q[2] + factor, J * Q[3], J * Q[4], J * Q[5]))
     solid = 1 - void_fraction
     m = solid * shear[0] * root * root
-    beta = (solid * bulk * 0.5 * (J * (J - 1) + log) - m * contract(F, A) * (1 / 3)) / J
+    beta = (solid * bulk * 0.5 * (J * (J - 1) + log) - m * contract(F, A) * (1 / 3)) * back
     void = void_fraction * shear[1]
-    slope, _ = void_slope(ratio)
+    slope, _ = void_slope(ratio, back)
     beta = beta - void * slope
     P = plus(m, A, beta, cof)
     return plus(1.0, P, void, F), cof, ratio
@@ -250,7 +250,7 @@ def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
     J_bar = pressure_bar * (bulk * (J - 0.5 + 0.5 * back) - beta) - (2 / 3) * alpha * alpha_bar * back
     J_bar = select(ratio < least, 0 * J, J_bar + contract(B, FQ))
     solid = 1 - void_fraction
-    slope, curvature = void_slope(ratio)
+    slope, curvature = void_slope(ratio, back)
     void = void_fraction * shear[1]
     BQ = times(B, Q)
     turned = cross(F, P_bar)

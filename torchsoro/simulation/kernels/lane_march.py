@@ -38,7 +38,8 @@ class Mesh(NamedTuple):
     """Cells and nodes, the same for all simulations.
 
     A plane of nodes takes ``plane`` numbers of a component, a component ``component`` numbers, a simulation (or sixteen
-    variations) three components for displacements and three for velocities; nodes begin at ``front``.
+    variations) three components for displacements and three for velocities; nodes begin at ``front``. Of its planes an
+    item touches the numbers ``item_from`` to ``item_to``; each sixteen of a plane has a list of those that touch it.
     """
 
     unit: int
@@ -52,6 +53,8 @@ class Mesh(NamedTuple):
     item_plane: np.ndarray
     item_x: np.ndarray
     item_begin: np.ndarray
+    item_from: np.ndarray
+    item_to: np.ndarray
     block_at: np.ndarray
     block_y: np.ndarray
     block_z: np.ndarray
@@ -61,9 +64,9 @@ class Mesh(NamedTuple):
     X: np.ndarray
     Y: np.ndarray
     Z: np.ndarray
-    plane_begin: np.ndarray
-    plane_item: np.ndarray
-    plane_slot: np.ndarray
+    near_begin: np.ndarray
+    near_item: np.ndarray
+    near_slot: np.ndarray
     places: np.ndarray
     own: np.ndarray
     wall_begin: np.ndarray
@@ -129,6 +132,7 @@ class Work(NamedTuple):
     forces: np.ndarray
     areas: np.ndarray
     swept: np.ndarray
+    by_plane: np.ndarray
     tension: np.ndarray
     collapsed: np.ndarray
     sync: np.ndarray
@@ -136,11 +140,23 @@ class Work(NamedTuple):
 
 
 @law
-def clear(a, begin, end):
-    """Fill a part of an array with zeros, sixteen at a time."""
-    zero = load(a, begin) * 0
-    for n in range(begin, end, 16):
-        store(a, n, zero)
+def clear(mesh, item, a, at):
+    """Fill with zeros what an item touches of its three planes, the three components of each."""
+    zero = 0 * load(mesh.own, 0)
+    for column in range(at, at + 9 * mesh.patch, mesh.patch):
+        for n in range(column + mesh.item_from[item], column + mesh.item_to[item], 16):
+            store(a, n, zero)
+
+
+@law
+def clear_sums(mesh, work, g, item):
+    """Empty the sums of an item."""
+    one = g * len(mesh.item_plane) + item
+    clear(mesh, item, work.forces, 9 * one * mesh.patch)
+    for c in range(mesh.chambers):
+        if mesh.item_gas[item, c]:
+            clear(mesh, item, work.areas, 9 * (one * mesh.chambers + c) * mesh.patch)
+            store(work.swept, 16 * (one * mesh.chambers + c), 0 * load(mesh.own, 0))
 
 
 # What follows is rare, and not part of the loop over blocks: with it inlined that takes half as long again.
@@ -184,13 +200,7 @@ def points_forward(mesh, case, work, g, item, past, future, state, room, G, rate
     size = 9 * mesh.patch
     out = (g * items + item) * size
     forces = work.forces
-    clear(forces, out, out + size)
-    for c in range(mesh.chambers):
-        if mesh.item_gas[item, c]:
-            o = ((g * items + item) * mesh.chambers + c) * size
-            clear(work.areas, o, o + size)
-            s = 16 * ((g * items + item) * mesh.chambers + c)
-            clear(work.swept, s, s + 16)
+    clear_sums(mesh, work, g, item)
     corner = state + mesh.front + mesh.item_plane[item] * mesh.plane
     x, collapsed = mesh.item_x[item], False
     blocks, each = len(mesh.block_at), 16 * case.history

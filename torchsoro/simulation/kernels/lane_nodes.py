@@ -25,14 +25,15 @@ def pressure_of(case, work, chamber, step):
 
 
 @law
-def sum_items(values, mesh, first, stride, p, c, at):
-    """Component c at a place of plane p, summed over the items that touch the plane."""
-    found = load(values, first + at) * 0
-    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
-        found = found + load(
-            values, first + mesh.plane_item[e] * stride + (3 * mesh.plane_slot[e] + c) * mesh.patch + at
-        )
-    return found
+def sum_items(values, mesh, first, p, at):
+    """The vector at a place of plane p, summed over the items that hand anything to it."""
+    zero = load(values, first + at) * 0
+    f0, f1, f2 = zero, zero, zero
+    place = (p * mesh.plane + at) // 16
+    for e in range(mesh.near_begin[place], mesh.near_begin[place + 1]):
+        o = first + (9 * mesh.near_item[e] + 3 * mesh.near_slot[e]) * mesh.patch + at
+        f0, f1, f2 = f0 + load(values, o), f1 + load(values, o + mesh.patch), f2 + load(values, o + 2 * mesh.patch)
+    return f0, f1, f2
 
 
 @law
@@ -49,11 +50,8 @@ def sum_chamber(values, mesh, g, c):
 
 
 @law
-def force_at(mesh, case, work, g, p, c, at, t):
-    """Internal force on a component of the nodes at a place of plane p, group forces taken off."""
-    items = len(mesh.item_plane)
-    size = 9 * mesh.patch
-    found = sum_items(work.forces, mesh, g * items * size, size, p, c, at)
+def outer_force(mesh, case, work, found, g, p, c, at, t):
+    """Component c of the internal force on the nodes at a place of plane p, with group forces taken off."""
     i = mesh.front + p * mesh.plane + at
     for k in range(case.share.shape[0]):
         start = case.force_start[k]
@@ -82,25 +80,21 @@ def gravity_row(case, g, t):
 
 
 @law
-def touches(mesh, p, c):
-    """Whether a plane of nodes touches a chamber."""
-    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
-        if mesh.item_gas[mesh.plane_item[e], c]:
-            return True
-    return False
-
-
-@law
-def sum_areas(mesh, work, g, k, p, c, at):
-    """Component c of the area vector of chamber k at a place of plane p."""
-    items, size = len(mesh.item_plane), 9 * mesh.patch
-    found = load(work.areas, 0) * 0
-    for e in range(mesh.plane_begin[p], mesh.plane_begin[p + 1]):
-        item = mesh.plane_item[e]
-        if mesh.item_gas[item, k]:
-            o = ((g * items + item) * mesh.chambers + k) * size + (3 * mesh.plane_slot[e] + c) * mesh.patch
-            found = found + load(work.areas, o + at)
-    return found
+def pressed(mesh, work, g, p, at, f):
+    """A vector at a place of plane p, and on it each chamber's number in ``by_plane`` times its area vector."""
+    items = len(mesh.item_plane)
+    f0, f1, f2 = f
+    place = (p * mesh.plane + at) // 16
+    for e in range(mesh.near_begin[place], mesh.near_begin[place + 1]):
+        item = mesh.near_item[e]
+        for k in range(mesh.chambers):
+            if mesh.item_gas[item, k]:
+                one = load(work.by_plane, 16 * ((g * mesh.planes + p) * mesh.chambers + k))
+                o = (9 * ((g * items + item) * mesh.chambers + k) + 3 * mesh.near_slot[e]) * mesh.patch + at
+                f0 = f0 + one * load(work.areas, o)
+                f1 = f1 + one * load(work.areas, o + mesh.patch)
+                f2 = f2 + one * load(work.areas, o + 2 * mesh.patch)
+    return f0, f1, f2
 
 
 @law
@@ -118,29 +112,27 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
     d = work.states
     slot = t % (work.pushed.size // (case.groups * 3 * mesh.component)) if work.pushed.size else 0
     sample = work.seen_at[t + 1]
+    for k in range(mesh.chambers):
+        one, volume = (g * mesh.chambers + k) * 16, sum_chamber(work.swept, mesh, g, k)
+        step = 16 * mesh.chambers * case.groups * t + one
+        if p == 0:
+            store(work.volumes, step if work.volumes.size > 16 * mesh.chambers * case.groups else one, volume)
+        stiffness, reference = load(case.air, 2 * one), load(case.air, 2 * one + 16)
+        pressure = chamber_pressure(load(case.pressure, step), stiffness, volume, reference)
+        store(work.by_plane, 16 * ((g * mesh.planes + p) * mesh.chambers + k), -pressure)
+    forces = g * len(mesh.item_plane) * 9 * mesh.patch
     for at in range(0, mesh.plane, 16):
         i = mesh.front + p * mesh.plane + at
         node = g * mesh.component + i
         free, light = load(case.moves, node), load(case.inverse_mass, node)
         left = load(case.drag_factor, node)
+        f0, f1, f2 = sum_items(work.forces, mesh, forces, p, at)
         f0, f1, f2 = (
-            force_at(mesh, case, work, g, p, 0, at, t),
-            force_at(mesh, case, work, g, p, 1, at, t),
-            force_at(mesh, case, work, g, p, 2, at, t),
+            outer_force(mesh, case, work, f0, g, p, 0, at, t),
+            outer_force(mesh, case, work, f1, g, p, 1, at, t),
+            outer_force(mesh, case, work, f2, g, p, 2, at, t),
         )
-        for k in range(mesh.chambers):
-            one = (g * mesh.chambers + k) * 16
-            volume = sum_chamber(work.swept, mesh, g, k)
-            step = 16 * mesh.chambers * case.groups * t + one
-            if p == 0 and at == 0:
-                store(work.volumes, step if work.volumes.size > 16 * mesh.chambers * case.groups else one, volume)
-            if touches(mesh, p, k):
-                pressure = chamber_pressure(
-                    load(case.pressure, step), load(case.air, 2 * one), volume, load(case.air, 2 * one + 16)
-                )
-                f0 = f0 - pressure * sum_areas(mesh, work, g, k, p, 0, at)
-                f1 = f1 - pressure * sum_areas(mesh, work, g, k, p, 1, at)
-                f2 = f2 - pressure * sum_areas(mesh, work, g, k, p, 2, at)
+        f0, f1, f2 = pressed(mesh, work, g, p, at, (f0, f1, f2))
         a, b = now + own + i, then + own + i
         n = mesh.component
         d0, d1, d2 = load(d, a), load(d, a + n), load(d, a + 2 * n)

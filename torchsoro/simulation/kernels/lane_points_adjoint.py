@@ -14,7 +14,7 @@ from torchsoro.simulation.kernels.lane_laws import (
     pull_back_adjoint,
     viscous_piola_adjoint,
 )
-from torchsoro.simulation.kernels.lane_march import clear
+from torchsoro.simulation.kernels.lane_march import clear, clear_sums
 from torchsoro.simulation.kernels.lane_nodes import pressure_of
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
@@ -238,15 +238,9 @@ def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room,
     """Gradients by the nodes' places of an item, from those by the forces."""
     items, size = len(mesh.item_plane), 9 * mesh.patch
     out = (g * items + item) * size
-    clear(work.forces, out, out + size)
+    clear_sums(mesh, work, g, item)
     if case.flags[2]:
-        clear(sums.rates, out, out + size)
-    for c in range(mesh.chambers):
-        if mesh.item_gas[item, c]:
-            o = ((g * items + item) * mesh.chambers + c) * size
-            clear(work.areas, o, o + size)
-            s = 16 * ((g * items + item) * mesh.chambers + c)
-            clear(work.swept, s, s + 16)
+        clear(mesh, item, sums.rates, out)
     place = mesh.front + mesh.item_plane[item] * mesh.plane
     corner, force = state + place, g * 3 * mesh.component + place
     x = mesh.item_x[item]

@@ -310,6 +310,7 @@ class LaneIntegrator:
             forces=numbers(like.new_zeros(tasks, size)),
             areas=numbers(like.new_zeros(tasks, mesh.chambers, size)),
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
+            by_plane=numbers(like.new_zeros(groups, mesh.planes, mesh.chambers, LANES)),
             tension=np.zeros(3 * self.case.tie_stiffness.size, numbers(like).dtype),
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),

@@ -270,11 +270,13 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         np.repeat(np.arange(len(items)), np.diff(walls["wall_begin"])), walls["wall_chamber"], strict=True
     ):
         item_gas[item, chamber] = True
+    touched = _touched(items, [b[0] for b in blocks], walls, 2 * row + 2 * unit + LANES)
     entries = defaultdict(list)
     for i, (layer, _, _) in enumerate(items):
         for slot in range(3):
-            entries[int(first[0][layer]) + slot].append((i, slot))
-    listed = [entries[p] for p in range(nx)]
+            for at in range(touched[i, 0], min(touched[i, 1], plane), LANES):
+                entries[(int(first[0][layer]) + slot) * plane + at].append((i, slot))
+    listed = [entries[at] for at in range(0, nx * plane, LANES)]
     grid = np.stack(np.meshgrid(np.arange(nx) * plane, np.arange(ny) * row, np.arange(nz) * unit, indexing="ij")).sum(0)
     nodes = torch.from_numpy(front + grid.reshape(-1))
     places = torch.zeros(3, component, dtype=dtype)
@@ -287,6 +289,8 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         item_plane=np.array([first[0][i[0]] for i in items], whole),
         item_x=np.array([12 * i[0] for i in items], whole),
         item_begin=np.array([*(i[1] for i in items), len(blocks)], whole),
+        item_from=touched[:, 0].copy(),
+        item_to=touched[:, 1].copy(),
         block_at=np.array([b[0] for b in blocks], whole),
         block_y=np.array([192 * Y[b[2]] for b in blocks], whole),
         block_z=np.array([192 * Z[b[3]] for b in blocks], whole),
@@ -296,9 +300,9 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         X=tables[0].numbers.astype(real).reshape(-1),
         Y=np.frombuffer(b"".join(Y), real).copy(),
         Z=np.frombuffer(b"".join(Z), real).copy(),
-        plane_begin=np.cumsum([0, *(len(e) for e in listed)]).astype(whole),
-        plane_item=np.array([i for e in listed for i, _ in e], whole),
-        plane_slot=np.array([s for e in listed for _, s in e], whole),
+        near_begin=np.cumsum([0, *(len(e) for e in listed)]).astype(whole),
+        near_item=np.array([i for e in listed for i, _ in e], whole),
+        near_slot=np.array([s for e in listed for _, s in e], whole),
         places=places.numpy().reshape(-1),
         own=(np.arange(LANES) < unit).astype(real),
         **walls,
@@ -313,6 +317,15 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         variations=bool(variations),
         absent=bool((points < 0).any()),
     )
+
+
+def _touched(items: list[tuple[int, int, int]], at: list[int], walls: dict[str, np.ndarray], reach: int) -> np.ndarray:
+    """From where to where each item touches its planes, in sixteens; ``reach`` numbers are touched from a place on."""
+    found = []
+    for i, (_, a, b) in enumerate(items):
+        places = [*at[a:b], *walls["wall_at"][walls["wall_begin"][i] : walls["wall_begin"][i + 1]]]
+        found.append((min(places) // LANES * LANES, LANES * math.ceil((max(places) + reach) / LANES)))
+    return np.array(found, np.int64)
 
 
 def _walls(lattice: Lattice, row: int, unit: int, planes: np.ndarray, gas: int, real: type) -> dict[str, np.ndarray]:

@@ -41,7 +41,8 @@ class Scene:
         share: [groups, N], each particle's share of its group's force.
         plane_kind: int32 [planes, PLANE_INTEGERS]: axis (-1 if oblique), side (+1 or -1), 1 for stick or 0 for Coulomb,
             1 for elastic landing or 0.
-        springs: Whether any particle has a spring or drag, be it of zero.
+        springs: Whether any particle has a spring, be it of zero.
+        drags: Whether any particle has drag, be it of zero.
         viscous: Whether any solid particle has a viscosity, or one of zero with a gradient; of the total form only.
         stiffens: Whether any solid particle stiffens with stretch, or by zero with a gradient; a kernel of its own.
         softens: Whether solids soften below their largest stretch; a number more of every point in the state.
@@ -73,6 +74,7 @@ class Scene:
     share: Tensor
     plane_kind: Tensor
     springs: bool
+    drags: bool
     viscous: bool
     stiffens: bool
     probes: Tensor

@@ -225,7 +225,7 @@ class SegmentIntegrator:
         chambers = self.inputs.pressure.shape[2]
         return [
             *(self.batch, self.count, self.lanes, self.components, self.elements, chambers, groups),
-            *(int(self.scene.springs), planes, *chunk.size, chunk.first, chunk.steps),
+            *(int(self.scene.springs or self.scene.drags), planes, *chunk.size, chunk.first, chunk.steps),
         ]
 
     def _advance(self, chunk: Chunk, states: Tensor, observe: Observe) -> bool:
