@@ -17,7 +17,7 @@ from torchsoro.simulation.kernels.lane_points import ROOM
 from torchsoro.simulation.kernels.lane_points_adjoint import add, gas_end, points_backward
 from torchsoro.simulation.kernels.lane_threads import meet
 from torchsoro.simulation.kernels.lane_walls import ties_backward
-from torchsoro.simulation.kernels.lanes import fast, load, select, store
+from torchsoro.simulation.kernels.lanes import fast, load, part, select, store
 from torchsoro.simulation.kernels.laws_lanes import laws
 
 quadratic_drag_adjoint = laws.quadratic_drag_adjoint
@@ -49,7 +49,7 @@ class Sums(NamedTuple):
     pressure: np.ndarray
 
 
-@fast
+@part
 def retreat(mesh, case, work, sums, g, p, t, steps):
     """Finish the gradients by the nodes of plane p after t + 1 substeps, and go back to the forces in substep t."""
     n, own, dt = mesh.component, g * 6 * mesh.component, case.dt

@@ -28,7 +28,7 @@ from torchsoro.simulation.kernels.lane_points import (
 )
 from torchsoro.simulation.kernels.lane_threads import look, meet
 from torchsoro.simulation.kernels.lane_walls import ties_forward, walls_forward
-from torchsoro.simulation.kernels.lanes import fast, law, load, store
+from torchsoro.simulation.kernels.lanes import fast, law, load, part, store
 
 NEVER = 2**62
 SCRATCH = ROOM + 5 * 1152  # numbers of a thread: for sums, and tensors of eight points of five kinds
@@ -160,7 +160,7 @@ def clear_sums(mesh, work, g, item):
 
 
 # What follows is rare, and not part of the loop over blocks: with it inlined that takes half as long again.
-@fast
+@part
 def gas_forward(mesh, case, work, g, item, b, G, rates, room):
     """Area vectors and volume that a block adds to its chambers; whether any gas collapsed."""
     size, collapsed = 9 * mesh.patch, False
@@ -178,7 +178,7 @@ def gas_forward(mesh, case, work, g, item, b, G, rates, room):
     return collapsed
 
 
-@fast
+@part
 def springs_forward(mesh, case, work, g, item, b, corner, rates):
     """Forces of the springs of a block."""
     x, out = mesh.item_x[item], (g * len(mesh.item_plane) + item) * 9 * mesh.patch
@@ -193,7 +193,7 @@ def springs_forward(mesh, case, work, g, item, b, corner, rates):
     hand_on(mesh, b, x, work.forces, out, rates[1152:])
 
 
-@fast
+@part
 def points_forward(mesh, case, work, g, item, past, future, state, room, G, rates):
     """Forces of an item on the nodes of its planes; whether any solid or gas collapsed."""
     items = len(mesh.item_plane)

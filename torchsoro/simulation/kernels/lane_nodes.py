@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_contact import meets, store_vector, vector
-from torchsoro.simulation.kernels.lanes import fast, law, load, select, store, total
+from torchsoro.simulation.kernels.lanes import law, load, part, select, store, total
 from torchsoro.simulation.kernels.laws_lanes import laws
 
 quadratic_drag = laws.quadratic_drag
@@ -104,7 +104,7 @@ def slow(mesh, case, g, i, light, u0, u1, u2):
     return quadratic_drag(u0, sink * q[0]), quadratic_drag(u1, sink * q[1]), quadratic_drag(u2, sink * q[2])
 
 
-@fast
+@part
 def advance(mesh, case, work, g, p, t, ring, now, then):
     """Move the nodes of plane p over substep t."""
     dt = case.dt

@@ -37,7 +37,7 @@ from torchsoro.simulation.kernels.lane_points import (
     value,
 )
 from torchsoro.simulation.kernels.lane_walls import walls_backward
-from torchsoro.simulation.kernels.lanes import fast, larger, law, load, select, store
+from torchsoro.simulation.kernels.lanes import larger, law, load, part, select, store
 from torchsoro.simulation.kernels.laws_lanes import laws
 
 softening, softening_adjoint = laws.softening, laws.softening_adjoint
@@ -183,7 +183,7 @@ def point_adjoint(
     keep(G, at, F_bar, 0 * volume + 1)
 
 
-@fast
+@part
 def gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates):
     """Through the area vectors of a block's gas, at a pressure that is known."""
     x, items, size, pairs = mesh.item_x[item], len(mesh.item_plane), 9 * mesh.patch, len(mesh.gas_chamber)
@@ -213,7 +213,7 @@ def gas_backward(mesh, case, work, sums, g, item, b, t, last, room, G, B, rates)
         scatter(mesh, b, x, work.forces, (g * items + item) * size, room, rates[2304:])
 
 
-@fast
+@part
 def springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates):
     """Through the springs of a block."""
     x, out = mesh.item_x[item], (g * len(mesh.item_plane) + item) * 9 * mesh.patch
@@ -233,7 +233,7 @@ def springs_backward(mesh, case, work, sums, g, item, b, corner, force, rates):
     hand_on(mesh, b, x, work.forces, out, rates[1152:])
 
 
-@fast
+@part
 def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room, G, B, rates):
     """Gradients by the nodes' places of an item, from those by the forces."""
     items, size = len(mesh.item_plane), 9 * mesh.patch
@@ -271,7 +271,7 @@ def points_backward(mesh, case, work, sums, g, item, t, last, state, past, room,
         walls_backward(mesh, case, work, sums, g, item, t, corner, force)
 
 
-@fast
+@part
 def gas_end(mesh, sums, g, item):
     """The gradient by volumes of gas that the first substep still owes."""
     pairs = len(mesh.gas_chamber)

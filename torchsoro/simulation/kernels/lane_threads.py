@@ -10,7 +10,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from torchsoro.simulation.kernels.lanes import fast
+from torchsoro.simulation.kernels.lanes import part
 
 PATIENCE = 4000  # looks at the clock of a barrier, a few microseconds, before a thread lets others run
 COUNT, GENERATION, SYNC = 0, 8, 16  # places in an int64 buffer, on cache lines of their own
@@ -53,7 +53,7 @@ def let_others(typingctx: Any) -> Any:
     return types.void(), lower
 
 
-@fast
+@part
 def meet(sync, threads):
     """Wait until all threads have come here."""
     if threads > 1:

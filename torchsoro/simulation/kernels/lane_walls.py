@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_contact import dot
 from torchsoro.simulation.kernels.lane_nodes import pressure_of
-from torchsoro.simulation.kernels.lanes import fast, law, load, store, total
+from torchsoro.simulation.kernels.lanes import law, load, part, store, total
 
 
 @law
@@ -56,7 +56,7 @@ def crossed(scale, a, b):
     return scale * (a[1] * b[2] - a[2] * b[1]), scale * (a[2] * b[0] - a[0] * b[2]), scale * (a[0] * b[1] - a[1] * b[0])
 
 
-@fast
+@part
 def walls_forward(mesh, case, work, g, item, corner):
     """Area vectors and volumes that the wall points of an item add to their chambers."""
     items, size, zero = len(mesh.item_plane), 9 * mesh.patch, 0 * load(mesh.own, 0)
@@ -83,7 +83,7 @@ def wall_value(mesh, w, field, at):
     return u0, u1, u2
 
 
-@fast
+@part
 def walls_backward(mesh, case, work, sums, g, item, t, corner, force):
     """Through the area vectors of an item's wall points, at a pressure that is known.
 
@@ -120,7 +120,7 @@ def mean_of(mesh, case, shares, field, at):
     return found
 
 
-@fast
+@part
 def ties_forward(mesh, case, work, g, state):
     """Force that each spring to the mean displacement of some nodes takes."""
     ties = case.tie_stiffness.size // (16 * case.groups)
@@ -130,7 +130,7 @@ def ties_forward(mesh, case, work, g, state):
             store(work.tension, 16 * (3 * tie + c), load(case.tie_stiffness, 16 * tie) * mean)
 
 
-@fast
+@part
 def ties_backward(mesh, case, work, sums, g, state):
     """Gradient by the mean displacements, left in ``tension``, and by the stiffnesses."""
     ties = case.tie_stiffness.size // (16 * case.groups)

@@ -20,7 +20,10 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 LANES = 16
 # Without counts of references to arrays: every slice would be counted, which takes longer than what is done with some.
 _OPTIONS: dict[str, Any] = {"boundscheck": False, "error_model": "numpy", "nogil": True, "_nrt": False}
-law = njit(**_OPTIONS, forceinline=True)
+# What only kernels call needs no way in from Python, whose making takes a third of the time to compile.
+_INNER: dict[str, Any] = {**_OPTIONS, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+law = njit(**_INNER, forceinline=True)
+part = njit(**_INNER)
 fast = njit(**_OPTIONS, cache=True)
 FLAGS = ("nsz", "arcp", "contract")
 
