@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 # Here and in processes that tests start: what is small gains nothing by threads, and two processes share two cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -16,6 +17,7 @@ import hypothesis
 import matplotlib
 import pytest
 import torch
+from problems import problem
 from ringing import bar
 from tiny import tiny
 
@@ -30,12 +32,32 @@ hypothesis.settings.register_profile("torchsoro", max_examples=25, deadline=None
 hypothesis.settings.load_profile("torchsoro")
 
 
+def _whole(config: pytest.Config) -> bool:
+    """Whether all tests run, and not only some files or some that were chosen."""
+    chosen = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
+    return not (chosen or config.option.keyword or config.option.markexpr)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Judge the coverage of the whole suite only, not that of a chosen file or test."""
-    chosen = config.args_source is not pytest.Config.ArgsSource.TESTPATHS
     coverage = config.pluginmanager.get_plugin("_cov")
-    if coverage is not None and (chosen or config.option.keyword or config.option.markexpr):
+    if coverage is not None and not _whole(config):
         coverage.options.cov_fail_under = 0
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    """Tell a process of pytest-xdist for which numbers it compiles the vector kernels before its first test, if for any."""
+    types = {"gw0": "float32", "gw1": "float64"} if _whole(node.config) else {}
+    node.workerinput["compiles"] = types.get(node.gateway.id, "")
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Compile what else each of two processes would compile, one of them while the other waits or does it again."""
+    if compiles := getattr(session.config, "workerinput", {}).get("compiles"):
+        p = problem(formulation="total")
+        p.tensors = {name: t.to(getattr(torch, compiles)) for name, t in p.tensors.items()}
+        torch.stack([output.sum() for output in p.run(p.leaves())]).sum().backward()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -134,14 +134,23 @@ def compared(lattice: Lattice | None, dtype: torch.dtype, *, lanes: bool, whole:
     return {name: t.double() for name, t in (found | by).items()}
 
 
-@pytest.mark.parametrize(("dtype", "within"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+LATTICES = {
+    **{"uniform": (None, False), "uneven": (uneven(), False), "wide": (wide(), False), "whole": (hollow(), True)},
+    **{"x".join(map(str, shape.nodes)): (filled(shape), False) for shape in layout.SHAPES},
+}
+# Each takes 12 s to compile.
+AT_ONCE = {*((name, torch.float64) for name in ("uniform", "uneven", "wide", "whole")), ("whole", torch.float32)}
+
+
 @pytest.mark.parametrize(
-    ("lattice", "whole"),
+    ("lattice", "whole", "dtype", "within"),
     [
-        *((None, False), (uneven(), False), (wide(), False), (hollow(), True)),
-        *(pytest.param(filled(shape), False, marks=pytest.mark.slow) for shape in layout.SHAPES),
+        pytest.param(
+            *case, dtype, within, id=f"{name}-{dtype}", marks=[] if (name, dtype) in AT_ONCE else pytest.mark.slow
+        )
+        for name, case in LATTICES.items()
+        for dtype, within in ((torch.float64, 1e-12), (torch.float32, 1e-5))
     ],
-    ids=["uniform", "uneven", "wide", "whole", *("x".join(map(str, shape.nodes)) for shape in layout.SHAPES)],
 )
 def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, within):
     one, other = (compared(lattice, dtype, lanes=lanes, whole=whole) for lanes in (True, False))
