@@ -47,7 +47,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_configure_node(node: Any) -> None:
-    """Tell a process of pytest-xdist for which numbers it compiles the vector kernels before its first test, if for any."""
+    """Tell a process for which type of numbers it compiles the vector kernels before its first test, if for any."""
     types = {"gw0": "float32", "gw1": "float64"} if _whole(node.config) else {}
     node.workerinput["compiles"] = types.get(node.gateway.id, "")
 
