@@ -15,6 +15,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 JUDGE = Path(__file__).parents[1] / "recipes" / "judge"
 YOUNG, NU, RHO = 100e3, 0.4, 1000.0
@@ -238,6 +239,24 @@ def test_a_setup_survives_toml_and_an_experiment_its_files(judge, tmp_path):
             back = judge.experiment.Trial.read(tmp_path / specimen.name / trial.name)
             assert back.tables == tomllib.loads(judge.experiment.toml(trial.tables))
             assert np.allclose(np.array(back.pressure), np.array(trial.pressure), rtol=1e-5)
+
+
+def test_a_body_with_cuts_has_the_volume_and_the_surface_of_what_is_told_of_it(judge, tmp_path):
+    body = {"origin": [0.0, 0.0, 0.0], "size": [0.03, 0.02, 0.02], "missing": [[[0.01, 0.0, 0.0], [0.02, 0.02, 0.01]]]}
+    mesh = judge.lobatto.box_mesh(body["origin"], body["size"], [], 0.004, body["missing"])
+    (tmp_path / "cut.stl").write_bytes(judge.specimens.stl(judge.specimens.surface(body)))
+    told = trimesh.load_mesh(tmp_path / "cut.stl")
+    assert told.is_watertight
+    assert mesh.weight.sum() == pytest.approx(10e-6)
+    assert told.volume == pytest.approx(10e-6, rel=1e-6)
+    # The cut takes nothing from the sum of the sides but uncovers two more of its own.
+    assert mesh.outside.area.sum() == pytest.approx(32e-4 + 2e-4)
+    assert told.area == pytest.approx(32e-4 + 2e-4, rel=1e-6)
+    robot = judge.specimens.SPECIMENS["robot"]()
+    robot.write(tmp_path, robot.setup["recording"])
+    assert tomllib.loads((tmp_path / "setup.toml").read_text())["body"] == {"shape": "mesh", "file": "body.stl"}
+    chamber = judge.specimens.mesh_for("robot")
+    assert robot.body_mass == pytest.approx(chamber.weight.sum() * robot.setup["material"]["density"], rel=1e-9)
 
 
 def test_batches_of_the_former_bodies_are_drawn_as_they_were(judge):

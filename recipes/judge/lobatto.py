@@ -1,4 +1,4 @@
-"""Boxes with voids as 27-node hexahedra whose nodes are their quadrature points (Gauss-Lobatto, three to an edge).
+"""Boxes with voids and cuts as 27-node hexahedra whose nodes are quadrature points (Gauss-Lobatto, three to an edge).
 
 The mass matrix of such elements is diagonal without lumping, and quadratic displacements neither lock in shear, in
 volume (at a Poisson ratio of 0.4), nor have zero-energy modes. Local node l = i + 3 j + 9 k.
@@ -19,6 +19,7 @@ Box = tuple[Sequence[float], Sequence[float]]
 
 SIMPSON = np.array([1.0, 4.0, 1.0]) / 6
 _NEAR = 1e-7
+_SOLID, _CUT = -1, -2  # kinds of elements; others are numbers of chambers
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -42,7 +43,7 @@ class Faces:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mesh:
-    """A box of hexahedra, less its chambers.
+    """A box of hexahedra, less its chambers and what is cut off.
 
     Attributes:
         nodes: Reference positions [N, 3] m.
@@ -52,7 +53,7 @@ class Mesh:
         outside: The outer surface.
         chambers: The walls of each chamber.
         lines: Planes of nodes along each axis, m.
-        number: Node at each crossing of the planes [., ., .], -1 inside a chamber.
+        number: Node at each crossing of the planes [., ., .], -1 inside a chamber or a cut.
     """
 
     nodes: Floats
@@ -111,27 +112,31 @@ def planes(low: float, high: float, features: Sequence[float], target: float) ->
     return np.append(np.concatenate(parts), stops[-1])
 
 
-def box_mesh(origin: Sequence[float], size: Sequence[float], chambers: Sequence[Box], target: float) -> Mesh:
-    """Mesh of a box.
+def box_mesh(
+    origin: Sequence[float], size: Sequence[float], chambers: Sequence[Box], target: float, missing: Sequence[Box] = ()
+) -> Mesh:
+    """Mesh of a box, or of what is left of one.
 
     Args:
         origin: Lower corner [3] m.
         size: Edges [3] m.
         chambers: Boxes that are void, each inside the body; their walls become planes of the mesh.
         target: Edge that elements shall have about [m]; nodes are half as far apart.
+        missing: Boxes that are cut off, as between legs; what they uncover is outside.
     """
+    features = [*chambers, *missing]
     edges = [
-        planes(origin[d], origin[d] + size[d], [c[s][d] for c in chambers for s in (0, 1)], target) for d in range(3)
+        planes(origin[d], origin[d] + size[d], [c[s][d] for c in features for s in (0, 1)], target) for d in range(3)
     ]
     lines = [np.sort(np.concatenate([e, (e[1:] + e[:-1]) / 2])) for e in edges]
     shape = tuple(len(e) - 1 for e in edges)
     middle = np.stack(np.meshgrid(*[(e[1:] + e[:-1]) / 2 for e in edges], indexing="ij"), -1)
-    kind = np.full(shape, -1)
-    for number, (low, high) in enumerate(chambers):
+    kind = np.full(shape, _SOLID)
+    for number, (low, high) in [*((_CUT, box) for box in missing), *enumerate(chambers)]:
         kind[((middle > np.asarray(low)) & (middle < np.asarray(high))).all(-1)] = number
     step = np.stack(np.meshgrid(*[np.diff(e) for e in edges], indexing="ij"), -1)
 
-    solid = np.argwhere(kind < 0)
+    solid = np.argwhere(kind == _SOLID)
     local = np.array([(i, j, k) for k in range(3) for j in range(3) for i in range(3)])
     counts = tuple(len(line) for line in lines)
     flat = np.ravel_multi_index(tuple((2 * solid[:, None, :] + local).transpose(2, 0, 1)), counts)
@@ -148,8 +153,8 @@ def box_mesh(origin: Sequence[float], size: Sequence[float], chambers: Sequence[
         for axis, way in itertools.product(range(3), (0, 1)):
             beside = place.copy()
             beside[axis] += 2 * way - 1
-            out = bool(beside[axis] < 0 or beside[axis] >= shape[axis])
-            if not out and kind[tuple(beside)] < 0:
+            out = bool(beside[axis] < 0 or beside[axis] >= shape[axis]) or kind[tuple(beside)] == _CUT
+            if not out and kind[tuple(beside)] == _SOLID:
                 continue
             first, second = (axis + 1) % 3, (axis + 2) % 3
             chosen = np.flatnonzero(local[:, axis] == 2 * way)

@@ -94,7 +94,8 @@ def _filled(box: Sequence[Sequence[float]], mesh: Mesh, parts: int = 9) -> Float
 def mesh_of(setup: dict[str, Any], target: float) -> Mesh:
     """Mesh of the body of setup.toml, elements about ``target`` [m] long."""
     body = setup["body"]
-    return box_mesh(body["origin"], body["size"], [c["box"] for c in setup.get("chamber", [])], target)
+    chambers = [c["box"] for c in setup.get("chamber", [])]
+    return box_mesh(body["origin"], body["size"], chambers, target, body.get("missing", ()))
 
 
 def case_of(setup: dict[str, Any], mesh: Mesh, pressure: Sequence[tuple[float, float]] = (), **times: float) -> Case:

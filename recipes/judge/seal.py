@@ -28,14 +28,14 @@ import tyro
 from believed import believed_motion
 from camera import DECOYS, Errors, decoy, draw_errors, film, instants
 from effects import LIBRARY, OUTSIDE, Effect, own_world
-from experiment import Trial, toml
+from experiment import Trial
 from lobatto import Floats
 from march import Broken, March, case_of
 from specimens import FORMER, SPECIMENS, Specimen, mesh_for
 from visible import detectability
 from world import Line, World
 
-Body = Literal["bar", "finger", "pad", "slider", "post", "crawler", "block"]
+Body = Literal["bar", "finger", "pad", "slider", "post", "crawler", "block", "robot"]
 BATCHES = ("calibration", "test", "smoke")
 DRAWS = 60  # of a case, until a body bears what was drawn
 
@@ -145,7 +145,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     recording = dict(specimen.setup["recording"])
     if errors.told:
         recording["noise"] = float(f"{errors.noise:.2g}")
-    (folder / "setup.toml").write_text(toml({**specimen.setup, "recording": recording}))
+    specimen.write(folder, recording)
     count, trials, believed = len(errors.places), {}, 0.0
     for trial, moved, still in zip(specimen.trials, runs, plain, strict=True):
         told, _ = instants(specimen, errors, trial.name)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from experiment import Trial
-from lobatto import Mesh
+from experiment import Trial, toml
+from lobatto import Floats, Mesh
 from march import mesh_of
 
 
@@ -44,9 +46,50 @@ class Specimen:
     def body_mass(self) -> float:
         """Believed mass [kg]."""
         volume = np.prod(self.setup["body"]["size"])
-        for low, high in (c["box"] for c in self.setup.get("chamber", [])):
+        boxes = [c["box"] for c in self.setup.get("chamber", [])] + self.setup["body"].get("missing", [])
+        for low, high in boxes:
             volume -= np.prod(np.asarray(high) - np.asarray(low))
         return float(volume * self.setup["material"]["density"])
+
+    def write(self, folder: Path, recording: dict[str, Any]) -> None:
+        """Write setup.toml, and the outer surface of a body that is no box."""
+        told = {**self.setup, "recording": recording}
+        if self.setup["body"].get("missing"):
+            told["body"] = {"shape": "mesh", "file": "body.stl"}
+            (folder / "body.stl").write_bytes(stl(surface(self.setup["body"])))
+        (folder / "setup.toml").write_text(toml(told))
+
+
+def surface(body: dict[str, Any]) -> Floats:
+    """Outer surface of a box less what is missing, of the bricks between all planes of these: triangles [T, 3, 3] m."""
+    low = np.asarray(body["origin"])
+    cuts = np.array([[low, low + body["size"]], *body["missing"]], float)
+    lines = [np.unique(np.round(cuts[..., axis], 9)) for axis in range(3)]
+    middle = np.stack(np.meshgrid(*((line[1:] + line[:-1]) / 2 for line in lines), indexing="ij"), -1)
+    solid = np.ones(middle.shape[:3], bool)
+    for first, last in cuts[1:]:
+        solid &= ~((middle > first) & (middle < last)).all(-1)
+    padded = np.pad(solid, 1)
+    triangles = []
+    for axis, way in itertools.product(range(3), (0, 1)):
+        beside = np.roll(padded, 1 - 2 * way, axis)[1:-1, 1:-1, 1:-1]
+        for brick in np.argwhere(solid & ~beside):
+            first, second = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
+            corner = brick + way * np.eye(3, dtype=int)[axis]
+            ring = np.array([corner, corner + first, corner + first + second, corner + second])[:: 2 * way - 1]
+            places = np.stack([line[ring[:, d]] for d, line in enumerate(lines)], -1)
+            triangles += [places[[0, 1, 2]], places[[0, 2, 3]]]
+    return np.array(triangles)
+
+
+def stl(triangles: Floats) -> bytes:
+    """Triangles [T, 3, 3] as a binary STL."""
+    facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    facets = np.zeros(len(triangles), facet)
+    facets["corners"] = triangles
+    facets["normal"] = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    facets["normal"] /= np.linalg.norm(facets["normal"], axis=1, keepdims=True)
+    return bytes(80) + np.uint32(len(facets)).tobytes() + facets.tobytes()
 
 
 def _setup(title: str, size: Sequence[float], origin: Sequence[float], **tables: Any) -> dict[str, Any]:
@@ -76,6 +119,10 @@ def _load(box: Sequence[Sequence[float]], force: Sequence[float], start: float =
 
 MATERIAL = ("viscoelastic", "modulus", "soft_side", "density", "attached_mass", "stiffening", "softening", "drag")
 AIR = ("pressure_lag", "pressure_loss", "leak", "air_stiffness")
+WALKING = (
+    *("viscoelastic", "modulus", "soft_side", "density", "attached_mass", "tether", "friction", "gravity_tilt"),
+    *AIR,
+)
 
 
 @functools.cache
@@ -255,6 +302,12 @@ def slider() -> Specimen:
     )
 
 
+def _beats(period: float, *peaks: float) -> tuple[tuple[float, float], ...]:
+    """Pressure that comes and goes, to each peak once a period [s]."""
+    stops = [(0.06 + period * (i + on / 2), (1 - on) * p) for i, p in enumerate(peaks) for on in (0, 1)]
+    return _pulses(1.0, *stops)
+
+
 @functools.cache
 def crawler() -> Specimen:
     """A block with a chamber off its middle, which walks on a plate to which it is believed to stick."""
@@ -270,30 +323,14 @@ def crawler() -> Specimen:
             (0.064, 0.018, 0.018), (0.052, 0.0, 0.010),
         ],
     )  # fmt: skip
-
-    def beats(period: float, *peaks: float) -> tuple[tuple[float, float], ...]:
-        stops = [(0.06 + period * (i + on / 2), (1 - on) * p) for i, p in enumerate(peaks) for on in (0, 1)]
-        return _pulses(1.0, *stops)
-
     trials = (
-        Trial(name="a", pressure=beats(0.18, *(13e3,) * 5)),
-        Trial(name="b", pressure=beats(0.30, 16e3, 10e3, 16e3)),
-        Trial(name="c", pressure=beats(0.12, *(11e3,) * 7)),
-        Trial(name="d", held_out=True, pressure=beats(0.22, 15e3, 13e3, 11e3, 15e3)),
-    )
-    names = (
-        "viscoelastic",
-        "modulus",
-        "soft_side",
-        "density",
-        "attached_mass",
-        "tether",
-        "friction",
-        "gravity_tilt",
-        *AIR,
+        Trial(name="a", pressure=_beats(0.18, *(13e3,) * 5)),
+        Trial(name="b", pressure=_beats(0.30, 16e3, 10e3, 16e3)),
+        Trial(name="c", pressure=_beats(0.12, *(11e3,) * 7)),
+        Trial(name="d", held_out=True, pressure=_beats(0.22, 15e3, 13e3, 11e3, 15e3)),
     )
     return Specimen(
-        name="crawler", setup=setup, trials=trials, rate=150, edge=0.0062, effects=names,
+        name="crawler", setup=setup, trials=trials, rate=150, edge=0.0062, effects=WALKING,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 
@@ -336,6 +373,40 @@ def block() -> Specimen:
     )  # fmt: skip
 
 
+@functools.cache
+def robot() -> Specimen:
+    """A trunk with a chamber on four legs, which walks on a plate to which it is believed to stick."""
+    setup = _setup(
+        "pneumatic robot on four legs",
+        (0.064, 0.036, 0.038),
+        (0.0, 0.0, 0.0002),
+        material={"youngs_modulus": 150e3, "density": 1080.0, "prony": [[0.4, 0.004]]},
+        chamber=[{"name": "c1", "box": [[0.012, 0.008, 0.0162], [0.048, 0.028, 0.0262]], "air_stiffness": 0.0}],
+        plane=[{"point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0], "friction": "stick"}],
+        markers=[
+            (0.032, 0.018, 0.0382), (0.060, 0.004, 0.0382), (0.060, 0.032, 0.0382), (0.004, 0.018, 0.0382),
+            (0.064, 0.018, 0.026), (0.052, 0.0, 0.006), (0.010, 0.0, 0.006),
+        ],
+    )  # fmt: skip
+    setup["body"]["missing"] = [
+        [[0.016, 0.0, 0.0002], [0.048, 0.036, 0.0122]],
+        [[0.0, 0.012, 0.0002], [0.016, 0.024, 0.0122]],
+        [[0.048, 0.010, 0.0002], [0.064, 0.026, 0.0122]],
+        [[0.056, 0.0, 0.0002], [0.064, 0.010, 0.0122]],
+        [[0.056, 0.026, 0.0002], [0.064, 0.036, 0.0122]],
+    ]
+    trials = (
+        Trial(name="a", pressure=_beats(0.18, *(13e3,) * 5)),
+        Trial(name="b", pressure=_beats(0.30, 16e3, 10e3, 16e3)),
+        Trial(name="c", pressure=_beats(0.12, *(11e3,) * 7)),
+        Trial(name="d", held_out=True, pressure=_beats(0.22, 15e3, 13e3, 11e3, 15e3)),
+    )
+    return Specimen(
+        name="robot", setup=setup, trials=trials, rate=150, edge=0.0062, effects=WALKING,
+        outside=("foam", "magnet", "gust", "sloshing"),
+    )  # fmt: skip
+
+
 SPECIMENS = {
     "bar": bar,
     "finger": finger,
@@ -344,6 +415,7 @@ SPECIMENS = {
     "post": post,
     "crawler": crawler,
     "block": block,
+    "robot": robot,
 }
 FORMER = ("bar", "finger", "pad", "slider", "post")  # of which the batches up to the tenth were drawn
 
