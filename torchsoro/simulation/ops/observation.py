@@ -3,9 +3,12 @@
 The observations are seven tensors: positions and velocities of the probes [B, P, 3] (m, m/s), deformation gradients
 there [B, P, 3, 3] if the probes are markers (else of none), position and velocity of the centre of gravity [B, 3],
 volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An adjoint takes the gradients by
-them and returns those by the arguments. In the total-Lagrangian form states and pressures may be those of several
-samples, with one more leading axis, which the observations then have, too. Where only markers are observed, the state
-is the motion of the nodes near them, and what is not observed has no numbers.
+them, None of those that nothing depends on, and returns those by the arguments; in place of that by the weights what it
+follows from linearly, so that samples are added up before :func:`weight_adjoint` is called once.
+
+In the total-Lagrangian form states and pressures may be those of several samples, with one more leading axis, which the
+observations then have, too. Where only markers are observed, the state is the motion of the nodes near them, and what
+is not observed has no numbers.
 """
 
 from __future__ import annotations
@@ -36,10 +39,25 @@ def observe(arguments: Arguments, scene: Scene) -> tuple[Tensor, ...]:
     return form(*arguments, scene)
 
 
-def observe_adjoint(arguments: Arguments, bars: Sequence[Tensor], scene: Scene) -> Arguments:
-    """Gradients by the arguments of :func:`observe`, from those by the observations."""
+def observe_adjoint(
+    arguments: Arguments, bars: Sequence[Tensor | None], scene: Scene
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Gradients by all arguments of :func:`observe` but the weights, and of these what :func:`weight_adjoint` takes."""
     form = _observe_adjoint if scene.lattice is None else _total_observe_adjoint
     return form(*arguments, bars, scene)
+
+
+def weight_adjoint(weight: Tensor, sums: Sequence[Tensor], scene: Scene) -> Tensor:
+    """Gradient by the weights [B, N], from what :func:`observe_adjoint` gives for it, added up over samples."""
+    share, lattice = _shares(weight), scene.lattice
+    if lattice is None:
+        (share_bar,) = sums
+    else:
+        nodal_bar, center_bar = sums
+        masses, _, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
+        places = lattice.on("places", weight).T
+        share_bar = lattice.nodal_mass_adjoint(masses, nodal_bar) + pairwise_sum((center_bar.unsqueeze(-1) * places).mT)
+    return (share_bar - _whole(share * share_bar)) / _whole(weight)
 
 
 def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
@@ -64,8 +82,8 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
     )
 
 
-def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene) -> Arguments:
-    x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = bars
+def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor | None], scene: Scene):
+    x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = _all(bars, state, weight, pressure, scene)
     found = torch.zeros_like(state), *_zeros(coefficients, pressure)
     state_bar, coefficients_bar, pressure_bar = found
     share = _shares(weight)
@@ -88,7 +106,7 @@ def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[
         coefficients_bar[:, layout.VOLUME, gas] += parts_bar * J
         coefficients_bar[:, layout.BULK, gas] += local_bar * (1 - J)
         pressure_bar[:, c] += pairwise_sum(local_bar)
-    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar, torch.zeros_like(air)
+    return (state_bar, coefficients_bar, pressure_bar, torch.zeros_like(air)), (share_bar,)
 
 
 def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tensor, air: Tensor, scene: Scene):
@@ -146,17 +164,17 @@ def _center(lattice: Lattice, share: Tensor) -> tuple[Matching, Tensor, Tensor]:
     return masses, masses.matched.to(share), pairwise_sum(share.unsqueeze(1) * lattice.on("places", share).T)
 
 
-def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene):
+def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor | None], scene: Scene):
     lattice = scene.lattice
     assert lattice is not None
-    x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
+    x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = _all(bars, state, weight, pressure, scene)
     state_bar, coefficients_bar, pressure_bar = torch.zeros_like(state), *_zeros(coefficients, pressure)
     motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
     if (m := scene.markers) is not None:
         at, how = m.nodes, m.weights.to(state)
     share = _shares(weight)
-    masses, nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
+    _, nodal, _ = once(scene, "center", [weight], lambda: _center(lattice, share))
     nodal_bar = torch.zeros_like(nodal)
     for field, field_bar, at_probes, at_center in zip(
         motion, motion_bar, (x_bar, v_bar), (center_bar, drift_bar), strict=True
@@ -166,8 +184,9 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
         _add_at(field_bar, at, at_probes.to(how).transpose(1, 2).unsqueeze(-1) * how)
     if m is not None:
         _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
-    places = lattice.on("places", state).T
-    share_bar = lattice.nodal_mass_adjoint(masses, nodal_bar) + pairwise_sum((center_bar.unsqueeze(-1) * places).mT)
+    air_bar = torch.zeros_like(air)
+    if bars[5] is None and bars[6] is None:
+        return (state_bar, coefficients_bar, pressure_bar, air_bar), (nodal_bar, center_bar)
     for c in range(scene.gas_chambers):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
@@ -185,23 +204,26 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
         pressure_bar[:, c] += by_mean[:, 0]
         by_nodes = torch.einsum("bpca,pan->bcpn", (swept_bar * V)[..., None, None] * cofactor, slopes)
         _add_at(motion_bar[0], at, by_nodes)
-    air_bar = torch.zeros_like(air)
     if lattice.walls is not None:
         by_mean, whole = mean_bar[:, scene.gas_chambers :], lattice.walls.volume.to(state)
         pressure_bar[:, scene.gas_chambers :] += by_mean
         air_bar -= by_mean * (lattice.walls.enclosed(motion[0]) / whole - 1)
         swept_bar = volume_bar[:, scene.gas_chambers :] - by_mean * air / whole
         _add_at(motion_bar[0], lattice.walls.nodes, lattice.walls.enclosed_adjoint(motion[0], swept_bar))
-    return state_bar, _by_weight(share, share_bar, weight), coefficients_bar, pressure_bar, air_bar
+    return (state_bar, coefficients_bar, pressure_bar, air_bar), (nodal_bar, center_bar)
+
+
+def _all(bars: Sequence[Tensor | None], state: Tensor, weight: Tensor, pressure: Tensor, scene: Scene) -> list[Tensor]:
+    """The gradients by the observations of a sample, zero of those that nothing depends on."""
+    batch, chambers = pressure.shape
+    marked = 0 if scene.markers is None else len(scene.markers.places)
+    probes = marked or len(scene.probes)
+    shapes = ((probes, 3), (probes, 3), (marked, 3, 3), (3,), (3,), (chambers,), (chambers,))
+    return [state.new_zeros(batch, *shape) if bar is None else bar for bar, shape in zip(bars, shapes, strict=True)]
 
 
 def _zeros(*tensors: Tensor) -> tuple[Tensor, ...]:
     return tuple(torch.zeros_like(t) for t in tensors)
-
-
-def _by_weight(share: Tensor, share_bar: Tensor, weight: Tensor) -> Tensor:
-    """Gradient by weights, from that by their shares of the sum."""
-    return (share_bar - _whole(share * share_bar)) / _whole(weight)
 
 
 def _whole(values: Tensor) -> Tensor:

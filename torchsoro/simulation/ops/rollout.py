@@ -26,7 +26,7 @@ from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.lane_segment import LaneIntegrator, in_lanes
 from torchsoro.simulation.ops.limits import refuse_gradient
 from torchsoro.simulation.ops.memory import empty_record
-from torchsoro.simulation.ops.observation import observe, observe_adjoint
+from torchsoro.simulation.ops.observation import observe, observe_adjoint, weight_adjoint
 from torchsoro.simulation.ops.scene import Inputs, Scene, scene_of
 
 if TYPE_CHECKING:
@@ -173,24 +173,25 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
         integrator.samples = tuple(samples)
     states: Any = integrator.restore(record)
     bar = torch.zeros_like(state) if end_bar is None else end_bar.clone(memory_format=torch.contiguous_format)
-    weight_bar, coefficients_bar = torch.zeros_like(weight), torch.zeros_like(inputs.coefficients)
+    coefficients_bar, by_weight = torch.zeros_like(inputs.coefficients), list[Tensor]()
     pressure_bar, air_bar = torch.zeros_like(inputs.pressure), torch.zeros_like(inputs.air)
 
     def add(k: int, bar: Tensor) -> None:
         at = samples.index(k)
         arguments = states[k], weight, inputs.coefficients, inputs.pressure[k], inputs.air
-        given = [zero if g is None else g[at] for g, zero in zip(seen_bar, nothing, strict=True)]
-        parts = observe_adjoint(arguments, given, scene)
-        for total, part in zip((bar, weight_bar, coefficients_bar, pressure_bar[k], air_bar), parts, strict=True):
+        given = [None if g is None else g[at] for g in seen_bar]
+        parts, sums = observe_adjoint(arguments, given, scene)
+        by_weight[:] = [a + b for a, b in zip(by_weight, sums, strict=True)] if by_weight else sums
+        for total, part in zip((bar, coefficients_bar, pressure_bar[k], air_bar), parts, strict=True):
             total += part
 
-    nothing = [state.new_zeros(shape[1:]) for shape in _observed(scene, inputs, ())]
     observed = any(g is not None for g in seen_bar)
     names = frozenset(name for name, needed in zip(_TENSORS, wanted, strict=True) if needed)
     sums = integrator.backward(states, bar, add if observed else lambda k, s: None, wanted=names)
     found = {name: torch.zeros_like(getattr(inputs, name)) for name in _INPUTS} | sums
     for name, more in (("coefficients", coefficients_bar), ("pressure", pressure_bar), ("air", air_bar)):
         found[name] += more
+    weight_bar = weight_adjoint(weight, by_weight, scene) if by_weight else torch.zeros_like(weight)
     return bar, weight_bar, *(found[name] for name in _INPUTS)
 
 
