@@ -308,6 +308,16 @@ def _beats(period: float, *peaks: float) -> tuple[tuple[float, float], ...]:
     return _pulses(1.0, *stops)
 
 
+def _walks() -> tuple[Trial, ...]:
+    """Trials of a body that walks, of different rhythms."""
+    return (
+        Trial(name="a", pressure=_beats(0.18, *(13e3,) * 5)),
+        Trial(name="b", pressure=_beats(0.30, 16e3, 10e3, 16e3)),
+        Trial(name="c", pressure=_beats(0.12, *(11e3,) * 7)),
+        Trial(name="d", held_out=True, pressure=_beats(0.22, 15e3, 13e3, 11e3, 15e3)),
+    )
+
+
 @functools.cache
 def crawler() -> Specimen:
     """A block with a chamber off its middle, which walks on a plate to which it is believed to stick."""
@@ -323,14 +333,8 @@ def crawler() -> Specimen:
             (0.064, 0.018, 0.018), (0.052, 0.0, 0.010),
         ],
     )  # fmt: skip
-    trials = (
-        Trial(name="a", pressure=_beats(0.18, *(13e3,) * 5)),
-        Trial(name="b", pressure=_beats(0.30, 16e3, 10e3, 16e3)),
-        Trial(name="c", pressure=_beats(0.12, *(11e3,) * 7)),
-        Trial(name="d", held_out=True, pressure=_beats(0.22, 15e3, 13e3, 11e3, 15e3)),
-    )
     return Specimen(
-        name="crawler", setup=setup, trials=trials, rate=150, edge=0.0062, effects=WALKING,
+        name="crawler", setup=setup, trials=_walks(), rate=150, edge=0.0062, effects=WALKING,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 
@@ -395,14 +399,8 @@ def robot() -> Specimen:
         [[0.056, 0.0, 0.0002], [0.064, 0.010, 0.0122]],
         [[0.056, 0.026, 0.0002], [0.064, 0.036, 0.0122]],
     ]
-    trials = (
-        Trial(name="a", pressure=_beats(0.18, *(13e3,) * 5)),
-        Trial(name="b", pressure=_beats(0.30, 16e3, 10e3, 16e3)),
-        Trial(name="c", pressure=_beats(0.12, *(11e3,) * 7)),
-        Trial(name="d", held_out=True, pressure=_beats(0.22, 15e3, 13e3, 11e3, 15e3)),
-    )
     return Specimen(
-        name="robot", setup=setup, trials=trials, rate=150, edge=0.0062, effects=WALKING,
+        name="robot", setup=setup, trials=_walks(), rate=150, edge=0.0062, effects=WALKING,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 
