@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from experiment import Trial, toml
-from lobatto import Floats, Mesh
+from lobatto import Floats, Mesh, box_mesh
 from march import mesh_of
 
 
@@ -61,25 +61,11 @@ class Specimen:
 
 
 def surface(body: dict[str, Any]) -> Floats:
-    """Outer surface of a box less what is missing, of the bricks between all planes of these: triangles [T, 3, 3] m."""
-    low = np.asarray(body["origin"])
-    cuts = np.array([[low, low + body["size"]], *body["missing"]], float)
-    lines = [np.unique(np.round(cuts[..., axis], 9)) for axis in range(3)]
-    middle = np.stack(np.meshgrid(*((line[1:] + line[:-1]) / 2 for line in lines), indexing="ij"), -1)
-    solid = np.ones(middle.shape[:3], bool)
-    for first, last in cuts[1:]:
-        solid &= ~((middle > first) & (middle < last)).all(-1)
-    padded = np.pad(solid, 1)
-    triangles = []
-    for axis, way in itertools.product(range(3), (0, 1)):
-        beside = np.roll(padded, 1 - 2 * way, axis)[1:-1, 1:-1, 1:-1]
-        for brick in np.argwhere(solid & ~beside):
-            first, second = np.eye(3, dtype=int)[(axis + 1) % 3], np.eye(3, dtype=int)[(axis + 2) % 3]
-            corner = brick + way * np.eye(3, dtype=int)[axis]
-            ring = np.array([corner, corner + first, corner + first + second, corner + second])[:: 2 * way - 1]
-            places = np.stack([line[ring[:, d]] for d, line in enumerate(lines)], -1)
-            triangles += [places[[0, 1, 2]], places[[0, 2, 3]]]
-    return np.array(triangles)
+    """Outer surface of a box less what is missing, of elements as large as they can be: triangles [T, 3, 3] m."""
+    mesh = box_mesh(body["origin"], body["size"], [], math.inf, body["missing"])
+    corners = mesh.nodes[mesh.outside.nodes[:, [0, 2, 8, 6]]]
+    outward = np.where(mesh.outside.sign[:, None, None] > 0, corners, corners[:, ::-1])
+    return np.concatenate([outward[:, [0, 1, 2]], outward[:, [0, 2, 3]]])
 
 
 def stl(triangles: Floats) -> bytes:

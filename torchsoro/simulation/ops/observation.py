@@ -3,8 +3,8 @@
 The observations are seven tensors: positions and velocities of the probes [B, P, 3] (m, m/s), deformation gradients
 there [B, P, 3, 3] if the probes are markers (else of none), position and velocity of the centre of gravity [B, 3],
 volume of each chamber [B, chambers] in m3, mean gas pressure in each (Eq. 10) in Pa. An adjoint takes the gradients by
-them, None of those that nothing depends on, and returns those by the arguments; in place of that by the weights what it
-follows from linearly, so that samples are added up before :func:`weight_adjoint` is called once.
+them and returns those by the arguments; in place of that by the weights what it follows from linearly, so that samples
+are added up before :func:`weight_adjoint` is called once.
 
 In the total-Lagrangian form states and pressures may be those of several samples, with one more leading axis, which the
 observations then have, too. Where only markers are observed, the state is the motion of the nodes near them, and what
@@ -40,11 +40,14 @@ def observe(arguments: Arguments, scene: Scene) -> tuple[Tensor, ...]:
 
 
 def observe_adjoint(
-    arguments: Arguments, bars: Sequence[Tensor | None], scene: Scene
+    arguments: Arguments, bars: Sequence[Tensor], scene: Scene, *, chambers: bool
 ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Gradients by all arguments of :func:`observe` but the weights, and of these what :func:`weight_adjoint` takes."""
+    """Gradients by all arguments of :func:`observe` but the weights, and of these what :func:`weight_adjoint` takes.
+
+    Without ``chambers`` nothing depends on what is observed of these.
+    """
     form = _observe_adjoint if scene.lattice is None else _total_observe_adjoint
-    return form(*arguments, bars, scene)
+    return form(*arguments, bars, scene, chambers)
 
 
 def weight_adjoint(weight: Tensor, sums: Sequence[Tensor], scene: Scene) -> Tensor:
@@ -82,8 +85,8 @@ def _observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure: Tens
     )
 
 
-def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor | None], scene: Scene):
-    x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = _all(bars, state, weight, pressure, scene)
+def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene, chambers: bool):
+    x_bar, v_bar, _, center_bar, drift_bar, volume_bar, mean_bar = bars
     found = torch.zeros_like(state), *_zeros(coefficients, pressure)
     state_bar, coefficients_bar, pressure_bar = found
     share = _shares(weight)
@@ -93,7 +96,7 @@ def _observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[
         state_bar[:, rows] += share.unsqueeze(1) * at_center.unsqueeze(-1)
         share_bar += (state[:, rows] * at_center.unsqueeze(-1)).sum(1)
         _add_at(state_bar[:, rows], scene.probes, at_probes.transpose(1, 2))
-    for c in range(pressure.shape[1]):
+    for c in range(pressure.shape[1] if chambers else 0):
         gas = scene.gas(c)
         J, V, K = state[:, layout.DEFORMATION, gas], *coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
         parts, local = V * J, K * (1 - J) + pressure[:, c : c + 1]
@@ -164,10 +167,12 @@ def _center(lattice: Lattice, share: Tensor) -> tuple[Matching, Tensor, Tensor]:
     return masses, masses.matched.to(share), pairwise_sum(share.unsqueeze(1) * lattice.on("places", share).T)
 
 
-def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Sequence[Tensor | None], scene: Scene):
+def _total_observe_adjoint(
+    state, weight, coefficients, pressure, air, bars: Sequence[Tensor], scene: Scene, chambers: bool
+):
     lattice = scene.lattice
     assert lattice is not None
-    x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = _all(bars, state, weight, pressure, scene)
+    x_bar, v_bar, gradient_bar, center_bar, drift_bar, volume_bar, mean_bar = bars
     state_bar, coefficients_bar, pressure_bar = torch.zeros_like(state), *_zeros(coefficients, pressure)
     motion, motion_bar = _motion(state, lattice.nodes), _motion(state_bar, lattice.nodes)
     at, how, _ = _stencil(scene, "probes", lambda: scene.probes, PARTICLES, state)
@@ -184,10 +189,7 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
         _add_at(field_bar, at, at_probes.to(how).transpose(1, 2).unsqueeze(-1) * how)
     if m is not None:
         _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
-    air_bar = torch.zeros_like(air)
-    if bars[5] is None and bars[6] is None:
-        return (state_bar, coefficients_bar, pressure_bar, air_bar), (nodal_bar, center_bar)
-    for c in range(scene.gas_chambers):
+    for c in range(scene.gas_chambers if chambers else 0):
         gas, at, slopes, F = _chamber(motion[0], c, scene)
         V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
         whole = _whole(V)
@@ -204,22 +206,14 @@ def _total_observe_adjoint(state, weight, coefficients, pressure, air, bars: Seq
         pressure_bar[:, c] += by_mean[:, 0]
         by_nodes = torch.einsum("bpca,pan->bcpn", (swept_bar * V)[..., None, None] * cofactor, slopes)
         _add_at(motion_bar[0], at, by_nodes)
-    if lattice.walls is not None:
+    air_bar = torch.zeros_like(air)
+    if lattice.walls is not None and chambers:
         by_mean, whole = mean_bar[:, scene.gas_chambers :], lattice.walls.volume.to(state)
         pressure_bar[:, scene.gas_chambers :] += by_mean
         air_bar -= by_mean * (lattice.walls.enclosed(motion[0]) / whole - 1)
         swept_bar = volume_bar[:, scene.gas_chambers :] - by_mean * air / whole
         _add_at(motion_bar[0], lattice.walls.nodes, lattice.walls.enclosed_adjoint(motion[0], swept_bar))
     return (state_bar, coefficients_bar, pressure_bar, air_bar), (nodal_bar, center_bar)
-
-
-def _all(bars: Sequence[Tensor | None], state: Tensor, weight: Tensor, pressure: Tensor, scene: Scene) -> list[Tensor]:
-    """The gradients by the observations of a sample, zero of those that nothing depends on."""
-    batch, chambers = pressure.shape
-    marked = 0 if scene.markers is None else len(scene.markers.places)
-    probes = marked or len(scene.probes)
-    shapes = ((probes, 3), (probes, 3), (marked, 3, 3), (3,), (3,), (chambers,), (chambers,))
-    return [state.new_zeros(batch, *shape) if bar is None else bar for bar, shape in zip(bars, shapes, strict=True)]
 
 
 def _zeros(*tensors: Tensor) -> tuple[Tensor, ...]:

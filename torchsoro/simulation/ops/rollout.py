@@ -179,13 +179,14 @@ def _backward(*arguments) -> tuple[Tensor, ...]:
     def add(k: int, bar: Tensor) -> None:
         at = samples.index(k)
         arguments = states[k], weight, inputs.coefficients, inputs.pressure[k], inputs.air
-        given = [None if g is None else g[at] for g in seen_bar]
-        parts, sums = observe_adjoint(arguments, given, scene)
+        given = [zero if g is None else g[at] for g, zero in zip(seen_bar, nothing, strict=True)]
+        parts, sums = observe_adjoint(arguments, given, scene, chambers=chambers)
         by_weight[:] = [a + b for a, b in zip(by_weight, sums, strict=True)] if by_weight else sums
         for total, part in zip((bar, coefficients_bar, pressure_bar[k], air_bar), parts, strict=True):
             total += part
 
-    observed = any(g is not None for g in seen_bar)
+    nothing = [state.new_zeros(shape[1:]) for shape in _observed(scene, inputs, ())]
+    observed, chambers = (any(g is not None for g in bars) for bars in (seen_bar, seen_bar[-2:]))
     names = frozenset(name for name, needed in zip(_TENSORS, wanted, strict=True) if needed)
     sums = integrator.backward(states, bar, add if observed else lambda k, s: None, wanted=names)
     found = {name: torch.zeros_like(getattr(inputs, name)) for name in _INPUTS} | sums
