@@ -23,10 +23,10 @@ from world import World, chain_step
 
 SAFETY = 0.8
 STICK = 1e6
-# Of the plate, in units of the softest layer of elements that lands on it: by a plate as soft as that, bodies bounce
-# higher, a thrown block comes to rest 0.8 mm elsewhere, and a body that walks goes elsewhere altogether.
+# Stiffness of the plate over that of the thinnest layer of elements. With 1 in place of 16, bodies bounce higher:
+# a thrown block moves differently by 0.8 mm, a body that hops by millimetres.
 PLATE = 16.0
-LANDING = 10.0  # loss where nodes press on it, in units of the impedance of plane waves: they land and do not chatter
+LANDING = 10.0  # loss of nodes that press on the plate, over the impedance of plane waves: they land without chatter
 
 
 class Broken(RuntimeError):
@@ -190,8 +190,8 @@ class March:
     def _ground(self) -> None:
         case, world, mesh = self.case, self.world, self.case.mesh
         wave = float((self.bulk + 4 / 3 * self.shear).max())
-        stiff = world.foam or PLATE * wave / float(mesh.size.min())
-        loss = world.foam_loss if world.foam else LANDING * math.sqrt(wave * float(case.density))
+        plate = PLATE * wave / mesh.size.min(), LANDING * math.sqrt(wave * case.density)
+        stiff, loss = (world.foam, world.foam_loss) if world.foam else plate
         self.ground = np.array([stiff, loss, world.adhesion, world.adhesion_reach])
         self.plane, self.coulomb = np.zeros(6), np.array([0.0, 0.0, 1.0])
         if case.plane is None:

@@ -105,7 +105,8 @@ def _load(box: Sequence[Sequence[float]], force: Sequence[float], start: float =
 
 MATERIAL = ("viscoelastic", "modulus", "soft_side", "density", "attached_mass", "stiffening", "softening", "drag")
 AIR = ("pressure_lag", "pressure_loss", "leak", "air_stiffness")
-SLOWLY = 0.018  # lag of the supply of bodies that walk [s]: by one of 8 ms they hop, and land elsewhere on every mesh
+SUPPLY_LAG = 0.008  # of each of the two volumes in series through which pressure reaches a chamber [s]
+WALKING_LAG = 0.018  # the same of bodies that walk [s]: with 8 ms they hop, and land elsewhere on every mesh
 WALKING = (
     *("viscoelastic", "modulus", "soft_side", "density", "attached_mass", "tether", "friction", "gravity_tilt"),
     *AIR,
@@ -169,16 +170,16 @@ def post() -> Specimen:
     )  # fmt: skip
 
 
-def _pulses(duration: float, *stops: tuple[float, float], lag: float = 0.008) -> tuple[tuple[float, float], ...]:
-    """A pressure that follows stops (time [s], pressure [Pa]) through two volumes of a lag [s], rises of twice that."""
+def _pulses(duration: float, *stops: tuple[float, float], lag: float = SUPPLY_LAG) -> tuple[tuple[float, float], ...]:
+    """Pressure behind two volumes in series, each with a lag [s]; the supply steps at (time [s], pressure [Pa])."""
     t = np.arange(0, duration + 0.1, 0.004)
     target = np.zeros_like(t)
     for start, pressure in stops:
         target[t >= start] = pressure
-    p, now = np.empty_like(t), np.zeros(2)
+    p, now, share = np.empty_like(t), np.zeros(2), 1 - np.exp(-0.004 / lag)
     for i, goal in enumerate(target):
-        now[0] += (1 - np.exp(-0.004 / lag)) * (goal - now[0])
-        now[1] += (1 - np.exp(-0.004 / lag)) * (now[0] - now[1])
+        now[0] += share * (goal - now[0])
+        now[1] += share * (now[0] - now[1])
         p[i] = now[1]
     return tuple((round(float(a), 6), round(float(b), 3)) for a, b in zip(t, p, strict=True))
 
@@ -292,7 +293,7 @@ def slider() -> Specimen:
 def _beats(period: float, *peaks: float) -> tuple[tuple[float, float], ...]:
     """Pressure that comes and goes, to each peak once a period [s]."""
     stops = [(0.06 + period * (i + on / 2), (1 - on) * p) for i, p in enumerate(peaks) for on in (0, 1)]
-    return _pulses(1.0, *stops, lag=SLOWLY)
+    return _pulses(1.0, *stops, lag=WALKING_LAG)
 
 
 def _walks() -> tuple[Trial, ...]:
