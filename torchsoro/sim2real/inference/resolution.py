@@ -25,7 +25,7 @@ def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
     factor = math.sqrt(1 + sum(g for g, _ in s.prony) / 2)
     steep = math.sqrt(max(a.steep for a in twin.grid.axes))
-    steps = s.duration * steep * speed * factor / (2 * safety(twin.grid))
+    steps = s.duration * steep * speed * factor / (2 * safety(twin))
     return twin.count * steps * trials * simulations / SPEED / CORES
 
 
@@ -43,8 +43,9 @@ def choose_twin(setup: Setup, trials: int, budget: float, *, walls: int = WALLS)
     """
     thin, long = min(setup.size), max(setup.size)
     chambers = bool(setup.chambers)
-    edges = [long / 12, long / 8] if chambers else [thin / 3, thin / 2]
-    twins = [Twin(setup, edge=edge, walls=walls, across=n) for edge, n in zip(edges, (3, 2), strict=True)]
+    # Where a body lands hangs on its cells more than how it bends.
+    edges = [long / 12, long / 8] if chambers else [thin / n for n in ((4, 3, 2) if setup.planes else (3, 2))]
+    twins = [Twin(setup, edge=edge, walls=walls, across=2 if edge is edges[-1] else 3) for edge in edges]
     for twin in twins:
         if cost(twin, trials) <= budget / (SLOW_WITH_PLANES if setup.planes else SLOW):
             return twin

@@ -241,4 +241,4 @@ def _plane(plane: PlaneTable) -> Plane:
     point, normal = (torch.tensor(v, dtype=torch.float64) for v in (plane.point, plane.normal))
     zero = torch.zeros((), dtype=torch.float64)
     friction = plane.friction if isinstance(plane.friction, str) else zero + plane.friction
-    return Plane.through(point, normal=normal, friction=friction, adhesion=zero, reach=zero, landing="elastic")
+    return Plane.through(point, normal=normal, friction=friction, adhesion=zero, reach=zero, landing="inelastic")
