@@ -10,7 +10,9 @@ import pytest
 from ringing import bar, effect
 
 from torchsoro.sim2real.data.schema import PlaneTable
-from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
+from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.hypotheses.outer_effects import Friction, WallOffset
+from torchsoro.sim2real.inference import likelihood
 from torchsoro.sim2real.inference.candidates import (
     GAPS,
     at_mode,
@@ -136,7 +138,8 @@ def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are
     assert len(model.numerics.draws) == len(GAPS) + 1  # and that of the cells
 
 
-def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_a_plane):
+def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_a_plane, monkeypatch):
+    monkeypatch.setattr(likelihood, "SECANT", likelihood.STEP)  # the same difference quotients for both
     problem = on_a_plane
     known = measure(problem.experiment, problem.twin, problem.fine)
     assert len(known.touching) == len(GAPS)
@@ -201,7 +204,7 @@ def test_a_fit_at_a_mode_has_its_numbers_and_deviations_in_si_units(weighed):
     moved = at_mode(problem, fit, found.mode)
     scales = problem.scales(fit.effects)
     assert moved.values[0] == pytest.approx(found.mode.at[1:2] * scales[1])
-    assert moved.ln_factors == pytest.approx(found.mode.at[:1] * scales[0])
+    assert moved.ln_factors == pytest.approx({"ln_modulus": found.mode.at[0] * scales[0]})
     assert moved.covariances[0][0, 0] == pytest.approx(found.mode.covariance[1, 1] * scales[1] ** 2)
     assert moved.errors == pytest.approx(found.mode.at[2:])
 
@@ -211,3 +214,54 @@ def test_a_twin_between_two_has_cells_between_theirs(weighed):
     middle = between(problem.twin, problem.fine)
     assert problem.fine.edge < middle.edge < problem.twin.edge
     assert problem.twin.count < middle.count < problem.fine.count
+
+
+@pytest.fixture
+def sliding(made):
+    """A bar that slides on a floor whose coefficient of friction is 5 % above what is stated."""
+    twin, record = made
+    floor = PlaneTable(point=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction=0.5)
+    free = {"clamps": (), "gravity": (0.0, 0.0, -9.81), "velocity": (0.6, 0.0, 0.0), "planes": (floor,)}
+    there = dataclasses.replace(twin, setup=dataclasses.replace(twin.setup, **free))
+    slippery = floor.model_copy(update={"friction": 0.525})
+    experiment = record(None, by=there, **free | {"planes": (slippery,)})
+    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(floor,))) for t in experiment.trials]
+    fine = dataclasses.replace(there, edge=0.6 * there.edge, across=4)
+    return FitProblem(dataclasses.replace(experiment, trials=tuple(trials)), there, fine=fine)
+
+
+def test_a_coefficient_of_friction_within_its_tolerance_is_a_belief(sliding):
+    (fit,) = sliding.fit([((), None)], rounds=8)
+    assert fit is not None
+    assert list(fit.ln_factors) == ["ln_modulus", "ln_friction"]
+    assert fit.ln_factors["ln_friction"] == pytest.approx(math.log(1.05), abs=0.01)
+    friction = next(e for e in library() if isinstance(e, Friction))
+    assert model_of(sliding, (friction,)).released == (1,)  # beside the modulus; the belief is held
+
+
+def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(sliding):
+    (fit,) = sliding.fit([((), None)], rounds=4)
+    assert fit is not None
+    (model,) = near(sliding, [fit], closely=True)
+    assert model is not None
+    own = model.numerics.draws[-2:]  # of two trials
+    assert len(model.numerics.draws) == len(GAPS) + 1 + 2
+    for k, draw in enumerate(own):
+        sizes = [np.sqrt(np.nanmean(d**2)) for d in draw]
+        assert sizes[k] > 2 * sliding.noise  # what the belief and measurement errors do not take up of it
+        assert sizes[k] > 0.5 * sizes[1 - k]
+
+
+def test_cells_that_are_as_good_count_where_bodies_touch(on_a_plane):
+    known = measure(on_a_plane.experiment, on_a_plane.twin, on_a_plane.fine)
+    assert set(known.between) == {t.name for t in on_a_plane.trials}
+    (fit,) = on_a_plane.fit([((), None)], rounds=0)
+    assert fit is not None
+    (one,), (other,) = (
+        near(on_a_plane.only(on_a_plane.trials, discretization=known.replace(between=b)), [fit])
+        for b in ({}, known.between)
+    )
+    assert one is not None
+    assert other is not None
+    assert len(other.numerics.draws) == len(one.numerics.draws) + 1
+    assert other.numerics.size > one.numerics.size

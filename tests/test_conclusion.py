@@ -73,6 +73,15 @@ def test_what_grows_with_the_shift_of_planes_is_no_error():
         assert r == pytest.approx(n, abs=1e-12, nan_ok=True)
 
 
+def test_errors_of_other_twins_add_up():
+    data, nothing, _ = recorded(0.0, 2)
+    one, other = draws(data, 2, 0.05, 3)
+    priced = by_spread(data, nothing, [nothing.residuals] * 7, SHIFTS, others=(one, other))
+    left = [size_of(cleared(data, nothing, o)) for o in (one, other)]
+    assert priced.numerics.size == pytest.approx(float(np.hypot(*left)), rel=1e-6)
+    assert priced.numerics.modes[0].shape[-1] == 7 + 2
+
+
 def test_two_twins_have_no_spread_and_shifts_are_theirs():
     data, nothing, _ = recorded(0.0, 2)
     with pytest.raises(ValueError, match="variants: 2, wanted three or more"):

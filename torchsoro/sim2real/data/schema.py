@@ -306,6 +306,7 @@ class ModelTable(Table):
         across: Cells across a body without a chamber, at least.
         ln_modulus: Logarithm of the modulus over what is believed.
         ln_pressure: The same of the pressure.
+        ln_friction: The same of coefficients of friction.
     """
 
     edge: Annotated[Number, Interval(gt=0.0, le=LENGTH[1])] = Field(description="a positive length in metres")
@@ -313,6 +314,7 @@ class ModelTable(Table):
     across: Annotated[StrictInt, Interval(ge=1, le=100)] = Field(description="1 to 100 cells")
     ln_modulus: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(description="a number from -5 to 5")
     ln_pressure: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(description="a number from -5 to 5")
+    ln_friction: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(default=0.0, description="a number from -5 to 5")
 
 
 class EffectTable(BaseModel):

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from torchsoro.sim2real.hypotheses.outer_effects import Friction
 from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
 from torchsoro.sim2real.inference.discretization import GAPS, shifted
@@ -20,7 +21,6 @@ from torchsoro.sim2real.inference.evidence import (
     infer,
 )
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.laplace import Mode
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
@@ -31,6 +31,9 @@ from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing
+# Of ln of a coefficient of friction, from trial to trial: with one, a soft block slides 0 to 5 % farther than
+# a rigid one, as it sticks here and there, in cells of 6.5 to 2.6 mm and in another code.
+SLIDING = 0.03
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
 
 Moved = Mapping[Fit, Sequence[Motions]]  # residuals by the finer twin with planes moved; none where one breaks down
@@ -118,7 +121,7 @@ def near(
     finer = problem.finer_twin
     bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
-    steps = [np.where(f.point + STEP > coarse.bounds(f.effects)[1], -STEP, STEP) for f in fits]
+    steps = [problem.steps(f.effects, f.point) for f in fits]
     beside = coarse.simulate(
         [(f.effects, np.concatenate([f.point[None], f.point + np.diag(h)])) for f, h in zip(fits, steps, strict=True)]
     )
@@ -138,7 +141,13 @@ def near(
                 numerics=TwinError(amplitude=np.sqrt(stated)),
             )
         )
-    return models if finer is None else _corrected(problem, coarse, fits, models, finer, closely, moved or {})
+    if finer is None:
+        return models
+    others = [
+        [] if m is None else [*_by_other_cells(problem, [x.alone(0) for x in motions], f), *_by_sliding(problem, f, m)]
+        for f, motions, m in zip(fits, beside, models, strict=True)
+    ]
+    return _corrected(problem, coarse, fits, models, others, finer, closely, moved or {})
 
 
 def _corrected(
@@ -146,6 +155,7 @@ def _corrected(
     coarse: FitProblem,
     fits: Sequence[Fit],
     models: Sequence[Linearised | None],
+    others: Sequence[Sequence[Motions]],
     fine: Twin,
     closely: bool,
     moved: Moved,
@@ -157,23 +167,27 @@ def _corrected(
     if problem.rough and closely:
         fresh = [f for f in fits if f not in moved]
         moved = {**moved, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
-        return [_spread(data, model, moved[f], edges) for f, model in zip(fits, models, strict=True)]
+        return [_spread(data, model, moved[f], edges, own) for f, model, own in zip(fits, models, others, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
     if problem.many_valleys:
         # What a plane's place changes, by the twin in use: it is of that order in the finer one.
         found: list[Linearised | None] = []
-        for model, finer, variants in zip(models, sharp, _touching(problem, coarse, fits), strict=True):
+        touching = _touching(problem, coarse, fits)
+        for model, own, finer, variants in zip(models, others, sharp, touching, strict=True):
             finest = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
-            found.append(_spread(data, model, finest, edges))
+            found.append(_spread(data, model, finest, edges, own))
         return found
     if problem.touches:
         # Chance is about the same at all points, as long as nothing is looked at closely: that at the setup as stated.
         touching = [
             _with_planes_moved(problem, f, m) if finer else [] for f, m, finer in zip(fits, motions, sharp, strict=True)
         ]
-        return [_spread(data, model, variants, edges) for model, variants in zip(models, touching, strict=True)]
+        return [
+            _spread(data, model, variants, edges, own)
+            for model, own, variants in zip(models, others, touching, strict=True)
+        ]
     middle = between(problem.twin, fine)
     by_middle = problem.by(middle)
     dull = [_residuals(problem, f, motions) for f, motions in zip(fits, by_middle.simulate(ask), strict=True)]
@@ -186,9 +200,13 @@ def _corrected(
     ]
 
 
-def _spread(data: Data, model: Linearised | None, variants: Sequence[Motions], edges: float) -> Linearised | None:
+def _spread(
+    data: Data, model: Linearised | None, variants: Sequence[Motions], edges: float, others: Sequence[Motions]
+) -> Linearised | None:
     """A model by equally good twins, with the ratio of edges of cells; none where a simulation broke down."""
-    return None if model is None or not variants else by_spread(data, model, variants, GAPS, model.residuals, edges)
+    if model is None or not variants:
+        return None
+    return by_spread(data, model, variants, GAPS, model.residuals, edges, others)
 
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:
@@ -205,6 +223,33 @@ def _with_planes_moved(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTr
         for by in problem.discretization.touching
     ]
     return [_left(problem, variant, fit.errors) for variant in moved]
+
+
+def _by_other_cells(problem: Likelihood, motions: Sequence[MarkerTrajectory], fit: Fit) -> list[Motions]:
+    """What cells between those of the twins change in residuals, by what they change in the setup as stated."""
+    known = problem.discretization.between
+    if not known:
+        return []
+    moved = [m.plus(known[t.name]) for m, t in zip(motions, problem.trials, strict=True)]
+    with_them, without = (_left(problem, m, fit.errors) for m in (moved, motions))
+    return [tuple(a - b for a, b in zip(with_them, without, strict=True))]
+
+
+def _by_sliding(problem: Likelihood, fit: Fit, model: Linearised) -> list[Motions]:
+    """What a coefficient of friction that differs from trial to trial changes, in each trial by itself."""
+    everything = [*(e for e, _ in problem.common), *fit.effects]
+    known = [e for e in everything if isinstance(e, Friction)]
+    if not known:
+        return []
+    # Where friction is an effect the belief is held, so that it is the last of its kind that moves.
+    starts = np.cumsum([0, *(1 for _ in problem.common), *(len(e.quantities) + 3 * e.local for e in fit.effects)])
+    at = int(starts[everything.index(known[-1])])
+    column = int((~held_of(problem, fit.effects))[:at].sum())
+    size = SLIDING / float(problem.scales(fit.effects)[at])
+    return [
+        tuple(size * (i == k) * slopes[..., column] for i, slopes in enumerate(model.slopes))
+        for k in range(len(model.slopes))
+    ]
 
 
 def _residuals(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTrajectory]) -> list[Motions]:
@@ -323,7 +368,7 @@ def at_mode(problem: Likelihood, fit: Fit, mode: Mode) -> Fit:
         fit,
         values=tuple(values),
         covariances=tuple(covariances),
-        ln_factors=(point * scales)[:known],
+        ln_factors=problem.ln_factors(point),
         errors=mode.at[count:],
         point=point,
     )

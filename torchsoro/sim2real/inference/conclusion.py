@@ -344,6 +344,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         remedies: By what, and with which factor, the limit would come to what matters.
     """
     data, null = weighing.data, weighing.null
+    limit = max(limit, null.near.numerics.size)  # what the twin may err by is not told
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
@@ -357,7 +358,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         # An extension that moves as what it extends adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
         plain = [d for d in plain if apart(c.best, d.best) < least]
-        if c.size < least:
+        if c.size < max(least, c.best.near.numerics.size):
             told[NOTHING] += c.probability
         elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
             told[UNKNOWN] += c.probability

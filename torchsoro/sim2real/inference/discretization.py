@@ -12,11 +12,11 @@ from scipy.interpolate import Akima1DInterpolator
 from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.gauss_newton import STEP
-from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, Likelihood, Request, added
+from torchsoro.sim2real.inference.likelihood import BREAKS, STEP, WITHIN, Likelihood, Request, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.observed import Motions
 from torchsoro.sim2real.inference.remaining_error import chance_in
+from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
@@ -56,15 +56,18 @@ def measure(
     common = {"noise": 1e-4, "report": report, "threads": threads}
     there = FitProblem(experiment, fine, trials=everything, **common)
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
+    cells: Mapping[str, MarkerTrajectory] = {}
     chance = math.inf
     if there.touches and not any(t.simulated for t in trials):
         believed, touching, chance = _chance(there, len(trials))
+        middle = _believed(FitProblem(experiment, between(twin, fine), trials=trials, **common))
+        cells = added(trials, believed[: len(trials)], middle)
     else:
         believed = _believed(there)
     other = [_as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
     here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
-    shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors)
+    shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors.values())
     known = DiscretizationError(shift=shift)
     own = _believed(FitProblem(experiment, twin, trials=everything, discretization=known, **common))
     correction = added(everything, own, other)
@@ -89,6 +92,7 @@ def measure(
         shift=shift,
         correction=correction,
         touching=touching,
+        between=cells,
         chance=chance,
         edges=(twin.edge, fine.edge),
         walls=thinnest,

@@ -28,7 +28,7 @@ class Fit:
         effects: Fitted effects; none for the null model.
         values: Of each, in SI units; the place [m] of a local one follows its parameters.
         covariances: Of each effect's values.
-        ln_factors: ln of the factors on modulus, and on pressure where there is one.
+        ln_factors: By what modulus, pressure and friction are off, see :meth:`Likelihood.ln_factors`.
         errors: Measurement errors, as ``ObservationModel.names``.
         chi2: Whitened sum of squares over recordings, measurement errors and prior residuals.
         samples: Number of samples.
@@ -42,7 +42,7 @@ class Fit:
     effects: Effects
     values: tuple[np.ndarray, ...]
     covariances: tuple[np.ndarray, ...]
-    ln_factors: np.ndarray
+    ln_factors: dict[str, float]
     errors: np.ndarray
     chi2: float
     samples: int
@@ -177,7 +177,7 @@ class FitProblem(Likelihood):
             effects=effects,
             values=tuple(values),
             covariances=tuple(covariances),
-            ln_factors=(point.at * scales)[: len(self.common)],
+            ln_factors=self.ln_factors(point.at),
             errors=point.errors,
             chi2=point.chi2,
             samples=self.samples,

@@ -16,7 +16,6 @@ import numpy as np
 from torchsoro.sim2real.inference.likelihood import Effects, Likelihood, Request
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
-STEP = 0.05  # of an unknown, in its scale, for difference quotients
 LONGEST_STEP = 0.5  # of a search, over the unknown's size plus four scales
 LONGEST_MOVE = 1.5  # of a place in a step, in tenths of the body's size
 DAMPING = 1e-2  # of the first step (Levenberg and Marquardt), times the diagonal of the normal matrix
@@ -157,7 +156,7 @@ class GaussNewton:
 
         Beside it whether the next may have derivatives, too, as where there is room for them.
         """
-        steps = np.where(at + STEP > self.bounds[1], -STEP, STEP)
+        steps = self.likelihood.steps(self.effects, at)
         answer = yield self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
         return self._point(at, errors, moving, steps, answer.motions), answer.eager
 

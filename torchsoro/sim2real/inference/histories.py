@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.gauss_newton import STEP
-from torchsoro.sim2real.inference.likelihood import Effects
+from torchsoro.sim2real.inference.likelihood import STEP, Effects
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows

@@ -16,6 +16,7 @@ import torch
 from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.hypotheses.outer_effects import Friction
 from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noise
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel, Priors
@@ -26,6 +27,8 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
+STEP = 0.05  # of an unknown, in its scale, for difference quotients
+SECANT = 1.0  # the same where chance in touching is more than noise: a noticeable change, so that it is not drowned
 CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
 VALLEYS = 2.0  # times the noise: chance of sliding blocks, whose searches end where they should, is up to 1.3
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
@@ -37,16 +40,24 @@ def _silent(line: str) -> None:
     """Report nothing."""
 
 
+# What is fitted always, as files and reports call it.
+STATED: dict[type[Hypothesis], str] = {Modulus: "ln_modulus", PressureGain: "ln_pressure", Friction: "ln_friction"}
+
 Effects = tuple[Hypothesis, ...]
 Request = tuple[Effects, np.ndarray]  # effects, and points to simulate them at [B, K]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tolerances:
-    """Tolerances of ln of the stated modulus and of the stated pressure."""
+    """Tolerances of ln of the stated modulus, of the stated pressure, and of stated coefficients of friction.
+
+    Repeated pulls on one floor differ by a tenth. Besides, a soft body that slides sticks here and there, which
+    lengthens its way by up to 5 % as fine cells, and another code's floor, have it.
+    """
 
     modulus: float = 0.1
     pressure: float = 0.05
+    friction: float = 0.1
 
 
 @dataclass
@@ -69,7 +80,7 @@ class Likelihood:
         twin: Its body.
         trials: To fit, with a recording each; those of the experiment if none are given.
         discretization: The twin's own error.
-        tolerances: Of modulus and pressure.
+        tolerances: Of modulus, pressure and friction.
         priors: Of measurement errors.
         noise: [m]; that of the setup, or estimated, if 0 is given.
         lasting: Share of the noise's variance that lasts from sample to sample; 0 for white noise.
@@ -155,15 +166,22 @@ class Likelihood:
 
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:
-        """What is fitted always, modulus and where there is one pressure, with its tolerance."""
-        modulus = (Modulus(), self.tolerances.modulus)
-        if not self.experiment.setup.chambers:
-            return (modulus,)
-        return modulus, (PressureGain(), self.tolerances.pressure)
+        """What is fitted always, with its tolerance: modulus, and where there are such pressure and friction."""
+        known: list[tuple[Hypothesis, float]] = [(Modulus(), self.tolerances.modulus)]
+        if self.experiment.setup.chambers:
+            known.append((PressureGain(), self.tolerances.pressure))
+        if any(p.friction != "stick" for t in self.experiment.trials for p in t.setup.planes):
+            known.append((Friction(), self.tolerances.friction))
+        return tuple(known)
+
+    def ln_factors(self, point: np.ndarray) -> dict[str, float]:
+        """By what the stated numbers are off at a point [K] in scales, as logarithms by name."""
+        scales = self.scales(())
+        return {STATED[type(e)]: float(point[k] * scales[k]) for k, (e, _) in enumerate(self.common)}
 
     @cached_property
     def shift(self) -> np.ndarray:
-        """Of ln of modulus and pressure, with which the twin moves as a finer one does."""
+        """Of ln of the stated numbers, with which the twin moves as a finer one does."""
         return np.array(self.discretization.shift or [0.0] * len(self.common))
 
     def only(self, trials: Sequence[Trial], **changes: Any) -> Self:
@@ -175,7 +193,7 @@ class Likelihood:
         return self.only(self.trials, twin=twin, discretization=DiscretizationError())
 
     def corrected(self, at: np.ndarray) -> Self:
-        """The same, corrected by the finer twin where one is now: at modulus and pressure [K], in scales.
+        """The same, corrected by the finer twin where one is now: at the stated numbers [K], in scales.
 
         A simulation of one's own is of what is believed, and stays what it is.
         """
@@ -254,6 +272,13 @@ class Likelihood:
                 low += [10 * o / z for o, z in zip(s.origin, s.size, strict=True)]
                 high += [10 * o / z + 10 for o, z in zip(s.origin, s.size, strict=True)]
         return np.array(low), np.array(high)
+
+    def steps(self, effects: Effects, at: np.ndarray) -> np.ndarray:
+        """Of the unknowns at a point [K], in scales, for difference quotients: to the side where there is room."""
+        low, high = self.bounds(effects)
+        step = SECANT if self.rough and math.isfinite(self.chance) else STEP
+        up, down = np.minimum(step, high - at), np.minimum(step, at - low)
+        return np.where(up >= down, up, -down)
 
     def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:
         """A scenario at points [B, K], in scales."""
@@ -339,7 +364,7 @@ class Likelihood:
         return best
 
     def prior_residual(self, at: np.ndarray, held: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals of modulus and pressure by their priors at a point, and their slopes; zero where ``held``.
+        """Residuals of the stated numbers by their priors at a point, and their slopes; zero where ``held``.
 
         The prior is nearly flat within the tolerance and falls steeply beyond.
         """

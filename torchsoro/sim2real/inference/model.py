@@ -15,11 +15,10 @@ import torch
 from torchsoro.sim2real.data.experiment import Setup, Trial, read_trial, setup_of
 from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.data.schema import ModelFile, read_tables, validated
-from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference.fit import Fit
+from torchsoro.sim2real.inference.likelihood import STATED
 from torchsoro.sim2real.twin.batch import THREADS, simulate
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
@@ -40,6 +39,7 @@ class Model:
         across: Of them across a body without a chamber, at least.
         ln_modulus: What the modulus is off.
         ln_pressure: What the pressure is off.
+        ln_friction: What coefficients of friction are off.
         effects: What was missing, with its values [K], places included.
     """
 
@@ -50,14 +50,15 @@ class Model:
     across: int
     ln_modulus: float
     ln_pressure: float
+    ln_friction: float
     effects: tuple[tuple[Hypothesis, np.ndarray], ...]
 
     def apply(self, scenario: Scenario, twin: Twin) -> Scenario:
         """A scenario with all that was found."""
-        values = torch.tensor([[self.ln_modulus, self.ln_pressure]], dtype=torch.float64)
-        scenario = Modulus()(scenario, values[:, :1], twin)
-        if scenario.pressure is not None:
-            scenario = PressureGain()(scenario, values[:, 1:], twin)
+        for stated, name in STATED.items():
+            effect, value = stated(), torch.tensor([[getattr(self, name)]], dtype=torch.float64)
+            if effect.applies(scenario, twin):
+                scenario = effect(scenario, value, twin)
         for effect, found in self.effects:
             scenario = effect(scenario, torch.from_numpy(found)[None], twin)
         return scenario
@@ -72,7 +73,6 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         fit: What was found.
         twin: To predict with; one as fine as that which corrected the fit's.
     """
-    prior_residual = [*fit.ln_factors.tolist(), 0.0][:2]
     lines = [
         _HEAD,
         setup.read_text(encoding="utf-8-sig").rstrip(),
@@ -82,7 +82,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         f"walls = {twin.walls}",
         f"across = {twin.across}",
     ]
-    lines += [f"ln_modulus = {prior_residual[0]!r}", f"ln_pressure = {prior_residual[1]!r}"]
+    lines += [f"{name} = {fit.ln_factors.get(name, 0.0)!r}" for name in STATED.values()]
     for effect, values in zip(fit.effects, fit.values, strict=True):
         lines += ["", "[[effect]]", f"name = {json.dumps(effect.name)}"]
         count = len(effect.quantities)

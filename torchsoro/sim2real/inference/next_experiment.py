@@ -11,9 +11,8 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import ForceTable, Marker, Setup, Trial, Vector
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.isolability import errors_of, moved_by, prior_residual_of, shortened, whitened
-from torchsoro.sim2real.inference.likelihood import Effects
+from torchsoro.sim2real.inference.likelihood import STEP, Effects
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
@@ -192,9 +191,8 @@ def far_marker(twin: Twin) -> Marker:
 def _around(problem: FitProblem, effects: Effects, at: np.ndarray) -> np.ndarray:
     """The point where a fit ended, and one for a step of each of its unknowns [1 + K, K']; beliefs as they are."""
     n = len(problem.common)
-    _, high = problem.bounds(effects)
     middle = np.concatenate([np.zeros(n), at[n:]])
-    steps = np.where(middle + STEP > high, -STEP, STEP)
+    steps = problem.steps(effects, middle)
     return np.concatenate([middle[None], middle + (np.eye(len(at)) * steps)[n:]])
 
 

@@ -12,8 +12,8 @@ from scipy.signal import savgol_filter
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.gauss_newton import STEP
 from torchsoro.sim2real.inference.heldout import Prediction
+from torchsoro.sim2real.inference.likelihood import STEP
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SHORT = 0.02  # of a trial: no phase is shorter

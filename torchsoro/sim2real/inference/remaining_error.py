@@ -12,7 +12,9 @@ where planes are is stated. Beside that line, their mean at no shift predicts be
 
     S = (1 + 1/R) 1/(R - 2) sum_r d_r d_r',    d_r = y_r - mean - g_r sum_q g_q y_q / sum_q g_q^2,    sum_q g_q = 0,
 
-to which the error of the cells is added, of order one where bodies touch.
+to which that of other cells is added, which are as good. The whole difference to larger cells, the error of the finer
+ones at order one, is a direction in which these may be off, but no measure of how far: of them, one is as wide as a
+wall.
 
 In both, only that counts which beliefs and measurement errors cannot take up.
 """
@@ -60,7 +62,7 @@ def by_richardson(data: Data, near: Linearised, coarser: Motions, ratio: float) 
         raise ValueError(f"ratio = {ratio:g}, wanted one above 1: the other twin has larger cells")
     share = 1 / (ratio**ORDER - 1)
     error = cleared(data, near, tuple(share * (b - a) for a, b in zip(near.residuals, coarser, strict=True)))
-    return dataclasses.replace(near, numerics=_process(data, (error,)))
+    return dataclasses.replace(near, numerics=_process(data, (error,), (error,)))
 
 
 def by_spread(
@@ -70,6 +72,7 @@ def by_spread(
     shifts: np.ndarray,
     coarser: Motions | None = None,
     ratio: float = math.inf,
+    others: Sequence[Motions] = (),
 ) -> Linearised:
     """The mean of equally good twins, with the error that this has, in each trial by itself.
 
@@ -84,6 +87,7 @@ def by_spread(
         shifts: Of their planes [R], which sum to zero.
         coarser: Residuals by a twin with larger cells.
         ratio: Edge of its cells over that of the variants'.
+        others: Errors of other kinds: what other cells that are as good, or another coefficient of friction, change.
 
     Raises:
         ValueError: for fewer than three variants, shifts that are not theirs or do not sum to zero, or a ratio that is
@@ -100,13 +104,15 @@ def by_spread(
     factor = math.sqrt(1 + 1 / count)
     draws = [cleared(data, near, tuple(factor * d for d in one)) for one in chance]
     modes = [tuple(d / math.sqrt(count) for d in draw) for draw in draws]
+    whole = []
     if coarser is not None:
         share = 1 / (ratio**TOUCHING - 1)
-        modes.append(cleared(data, near, tuple(share * (b - m) for b, m in zip(coarser, mean, strict=True))))
-        draws.append(modes[-1])
-    process = _process(data, draws)
-    together = tuple(np.stack(same, -1) for same in zip(*modes, strict=True))
-    return dataclasses.replace(near, residuals=mean, numerics=dataclasses.replace(process, modes=together))
+        whole = [cleared(data, near, tuple(share * (b - m) for b, m in zip(coarser, mean, strict=True)))]
+    apart = [cleared(data, near, other) for other in others]
+    process = _process(data, [*draws, *apart], [*modes, *apart])
+    together = tuple(np.stack(same, -1) for same in zip(*modes, *whole, *apart, strict=True))
+    numerics = dataclasses.replace(process, draws=(*draws, *whole, *apart), modes=together)
+    return dataclasses.replace(near, residuals=mean, numerics=numerics)
 
 
 def beside_line(variants: Sequence[Motions], shifts: np.ndarray) -> tuple[Motions, list[Motions]]:
@@ -149,12 +155,9 @@ def cleared(data: Data, near: Linearised, difference: Motions) -> Motions:
     return still.left(posterior(total(grams(data, still, Discrepancy())), still.at, model.priors).at)
 
 
-def _process(data: Data, draws: Sequence[Motions]) -> TwinError:
-    """The process that errors are draws of: its size by axis and marker, and its correlation time."""
-    squares = [np.nanmean(d**2, 0).T for draw in draws for d in draw]
-    own = np.mean(squares, 0)
-    # A few draws tell an average better than each of its parts.
-    amplitude = np.sqrt((own + own.mean()) / 2)
+def _process(data: Data, draws: Sequence[Motions], modes: Sequence[Motions]) -> TwinError:
+    """The process that errors are draws of: its correlation time, and its size by axis and marker, of all modes."""
+    amplitude = _amplitude(draws)
     if not amplitude.any():
         return TwinError(amplitude=amplitude, draws=tuple(draws))
     quiet = dataclasses.replace(data, noise=FAINT * float(amplitude.mean()))
@@ -174,4 +177,12 @@ def _process(data: Data, draws: Sequence[Motions]) -> TwinError:
         options={"maxfev": 60, "xatol": 0.02, "fatol": 0.1},
     )
     # The size is that of the differences: of smooth ones, likelihood by itself would make it up.
-    return TwinError(amplitude=amplitude, time=math.exp(float(found.x[1])), draws=tuple(draws))
+    size = math.sqrt(len(modes)) * _amplitude(modes)
+    return TwinError(amplitude=size, time=math.exp(float(found.x[1])), draws=tuple(draws))
+
+
+def _amplitude(draws: Sequence[Motions]) -> np.ndarray:
+    """Root mean square of some draws, by axis and marker [A, M] m."""
+    own = np.mean([np.nanmean(d**2, 0).T for draw in draws for d in draw], 0)
+    # A few draws tell an average better than each of its parts.
+    return np.asarray(np.sqrt((own + own.mean()) / 2))

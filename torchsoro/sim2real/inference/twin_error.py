@@ -27,6 +27,7 @@ class DiscretizationError:
         own: By effects, the same with them, where it is known.
         touching: What the finer twin adds where planes are a little elsewhere, by trial, for each of some shifts; none
             without planes, or if they were not moved.
+        between: What a twin with cells between those of the two adds to the finer one, by trial; none without planes.
         chance: Root mean square of what of that is not in proportion to the shift, so that which node touches when
             decides it [m]; not finite if it was not measured.
         edges: Of the cells of the twins that were compared [m], the one in use first.
@@ -38,6 +39,7 @@ class DiscretizationError:
     correction: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
     own: Mapping[tuple[Hypothesis, ...], Mapping[str, MarkerTrajectory]] = field(default_factory=dict)
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
+    between: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
     chance: float = math.inf
     edges: tuple[float, ...] = ()
     walls: tuple[int, ...] = ()

@@ -142,7 +142,7 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *ends])
+    known = weigh(problem, [null_model, *strained, *_as_beliefs(problem, null_model, ends), *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.best
     leading = at_mode(problem, _fit_of(known, best), best.mode)
@@ -193,6 +193,18 @@ def weighed(
     )
     ahead = predictions(problem, verdict.best, heldout, _folds(verdict, data, weighing.kappa) if not heldout else ())
     return dataclasses.replace(verdict, before=ahead.before, after=ahead.after, heldout=ahead.left_out)
+
+
+def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:
+    """Fits without an effect, where effects are that are a stated number within its tolerance."""
+    found = []
+    for fit in ends:
+        for k, (stated, tolerance) in enumerate(problem.common):
+            off = fit.values[0][0] / tolerance if fit.effects else np.inf
+            if len(fit.effects) == 1 and isinstance(fit.effects[0], type(stated)) and abs(off) <= 1:
+                point = np.where(np.arange(len(problem.common)) == k, off, fit.point[: len(problem.common)])
+                found.append(dataclasses.replace(null_model, point=point, errors=fit.errors))
+    return found
 
 
 def _far(weighing: Weighing, behind: float) -> list[Posterior]:

@@ -209,8 +209,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
             "cells_through_thinnest_wall": list(e.discretization.walls),
         },
         "nuisance": {
-            "ln_modulus": float(e.best.ln_factors[0]),
-            **({"ln_pressure": float(e.best.ln_factors[1])} if len(e.best.ln_factors) > 1 else {}),
+            **e.best.ln_factors,
             **dict(zip(problem.observation.names, map(float, e.best.errors), strict=True)),
         },
         "error_before": errors(e.before),

@@ -277,7 +277,7 @@ def write_isolability(page: Document, found: Isolability) -> None:
             for name, (quantity, unit), value in zip(found.effects, found.quantities, found.detectable, strict=True)
         ],
         f"By times, markers and noise alone: the strength at which an effect is detectable (gain in chi-squared of "
-        f"{SCORE:g}) beside measurement errors, modulus and pressure, and the effects that can imitate "
+        f"{SCORE:g}) beside measurement errors, modulus, pressure and friction, and the effects that can imitate "
         f"{100 * SAME:.0f} % of its change.",
         folded="Which effects this experiment can detect, and which it cannot tell apart",
     )
@@ -295,9 +295,9 @@ def _accuracy(page: Document, e: Explanation, data: Mapping[str, Any]) -> None:
         f"the simulation's own error {millimetres(noise['simulation_m'])}, which is what its correction by finer cells "
         f"leaves. Cells of {edges} mm, {' and '.join(map(str, cells.walls))} of them through the thinnest wall."
     )
-    names, common = e.problem.observation.names, [tolerance for _, tolerance in e.problem.common]
-    deviations = dict(zip(["ln_modulus", "ln_pressure"], common, strict=False))
-    deviations |= dict(zip(names, e.problem.observation.deviations, strict=True))
+    tolerances = [tolerance for _, tolerance in e.problem.common]
+    deviations = dict(zip(e.best.ln_factors, tolerances, strict=True))
+    deviations |= dict(zip(e.problem.observation.names, e.problem.observation.deviations, strict=True))
     rows = []
     for name, value in data["nuisance"].items():
         words, unit = error_words(name)
@@ -305,7 +305,7 @@ def _accuracy(page: Document, e: Explanation, data: Mapping[str, Any]) -> None:
         rows.append({"fitted always": words, "value": error_number(value, unit), "prior ±": prior})
     page.table(
         rows,
-        "Measurement errors, and what the setup's modulus and pressure are off, with their priors.",
+        "Measurement errors, and what the setup's modulus, pressure and friction are off, with their priors.",
         folded="Measurement errors",
     )
     page.text(f"{e.problem.tally.simulations} simulations, {e.seconds:.0f} s, torchsoro {data['version']}.")

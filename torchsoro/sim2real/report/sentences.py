@@ -23,8 +23,8 @@ def verdict_sentence(e: Explanation) -> str:
     v = e.verdict
     if v.kind == "nothing_missing":
         return (
-            "Nothing is missing from the setup: measurement errors, modulus and pressure within their tolerances, and "
-            "the error of the simulation itself explain the difference."
+            "Nothing is missing from the setup: measurement errors, modulus, pressure and friction within their "
+            "tolerances, and the error of the simulation itself explain the difference."
         )
     if v.kind == "unknown_physics":
         return "Something is missing from the setup that is none of the known effects."

@@ -164,8 +164,14 @@ def interval(value: float, low: float, high: float, unit: str, name: str = "") -
 
 def error_words(name: str) -> tuple[str, str]:
     """A measurement error, or a number of the setup that is fitted always: as a phrase, and its unit."""
-    if name in ("ln_modulus", "ln_pressure", "ln_scale"):
-        return {"ln_modulus": "Young's modulus", "ln_pressure": "pressure", "ln_scale": "scale of lengths"}[name], "%"
+    relative = {
+        "ln_modulus": "Young's modulus",
+        "ln_pressure": "pressure",
+        "ln_friction": "coefficient of friction",
+        "ln_scale": "scale of lengths",
+    }
+    if name in relative:
+        return relative[name], "%"
     if name == "clock_rate":
         return "rate of the clock", "%"
     if name.startswith("clock_"):
