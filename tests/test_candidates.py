@@ -239,8 +239,11 @@ def test_a_coefficient_of_friction_within_its_tolerance_is_a_belief(sliding):
     assert model_of(sliding, (friction,)).released == (1,)  # beside the modulus; the belief is held
 
 
-def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(sliding):
-    (fit,) = sliding.fit([((), None)], rounds=4)
+@pytest.mark.parametrize("named", [False, True])
+def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(sliding, named):
+    """Whether friction is a belief or an effect, beside which the belief is held."""
+    effects = tuple(e for e in library() if named and isinstance(e, Friction))
+    (fit,) = sliding.fit([(effects, None)], rounds=4)
     assert fit is not None
     (model,) = near(sliding, [fit], closely=True)
     assert model is not None
@@ -248,7 +251,7 @@ def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(slidi
     assert len(model.numerics.draws) == len(GAPS) + 1 + 2
     for k, draw in enumerate(own):
         sizes = [np.sqrt(np.nanmean(d**2)) for d in draw]
-        assert sizes[k] > 2 * sliding.noise  # what the belief and measurement errors do not take up of it
+        assert sizes[k] > 2 * sliding.noise  # what friction in all trials and measurement errors do not take up of it
         assert sizes[k] > 0.5 * sizes[1 - k]
 
 
