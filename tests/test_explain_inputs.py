@@ -17,9 +17,11 @@ from setups import CLAMP, marker, material
 
 from torchsoro.sim2real import pipeline
 from torchsoro.sim2real.data.recording import read_table
+from torchsoro.sim2real.inference.model import read_model
 from torchsoro.sim2real.inputs import chosen, read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
+from torchsoro.sim2real.twin.twin import Twin
 
 SETUP = f"""title = "finger"
 duration = 0.5
@@ -358,6 +360,17 @@ def test_a_file_that_is_no_model_is_refused(folder, monkeypatch, old, new, messa
         with pytest.raises(ValueError, match=rf"{name}: .*wanted"):
             pipeline.predict_markers(dataclasses.replace(options, predict=folder / name))
     assert not options.out.exists()
+
+
+@pytest.mark.parametrize(("line", "coefficient"), [("", 0.3), ("ln_friction = 0.1\n", 0.3 * math.exp(0.1))])
+def test_a_model_knows_by_what_stated_friction_is_off(folder, line, coefficient):
+    text = (folder / "model.toml").read_text()
+    write(folder, "model.toml", text.replace("[[effect]]", f"{line}[[effect]]"))
+    model = read_model(folder / "model.toml")
+    twin = Twin(model.setup, edge=model.edge, walls=model.walls, across=model.across)
+    trial = read_inputs(Options(experiment=folder, out=folder.parent / "out")).trials[0]
+    (plane,) = model.apply(twin.scenario(trial), twin).planes
+    assert plane.friction.item() == pytest.approx(coefficient)
 
 
 def test_a_trial_to_predict_must_be_named_and_there(folder):
