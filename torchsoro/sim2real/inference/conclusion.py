@@ -344,7 +344,6 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         remedies: By what, and with which factor, the limit would come to what matters.
     """
     data, null = weighing.data, weighing.null
-    limit = max(limit, null.near.numerics.size)  # what the twin may err by is not told
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)

@@ -28,7 +28,7 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
 STEP = 0.05  # of an unknown, in its scale, for difference quotients
-SECANT = 1.0  # the same where chance in touching is more than noise: a noticeable change, so that it is not drowned
+SECANT = 1.0  # the same of rough motions: a noticeable change, so that it is not drowned by chance in touching
 CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
 VALLEYS = 2.0  # times the noise: chance of sliding blocks, whose searches end where they should, is up to 1.3
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another

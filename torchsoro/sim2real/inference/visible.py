@@ -51,7 +51,8 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
     if not seen.any():
         return math.inf
     needed = 2 * kappa * (math.log(CREDIBLE / (1 - CREDIBLE)) + math.log(names + 1))
-    return float(np.median(size[seen] * np.sqrt(needed / information[seen])))
+    # What the twin may err by is not told, however well it is seen.
+    return max(float(np.median(size[seen] * np.sqrt(needed / information[seen]))), near.numerics.size)
 
 
 def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, names: int) -> dict[str, float]:

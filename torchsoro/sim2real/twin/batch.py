@@ -29,8 +29,8 @@ from torchsoro.simulation.trajectory import Start, Trajectory
 
 SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
 SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars were stable up to 1.6
-CUT = 0.7  # the same where cells are filled in part, whose nodes may have little mass; walking robots bear up to 0.9
-MESHED = 1.0  # the same of a mesh in whole cells, as of a trunk on legs, which bears up to 1.25
+CUT = 0.7  # the same where cells are filled in part, whose nodes may have little mass; robots on legs bear up to 0.9
+MESHED = 1.0  # the same of a mesh in whole cells; robots on legs bear up to 1.25
 SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 HALVINGS = 30  # of the error of ln dt, where the stiffness depends on the step
 THREADS = os.cpu_count() or 1
@@ -46,7 +46,9 @@ Amounts = Callable[[Scenario], Tensor]
 
 def safety(twin: Twin) -> float:
     """Step in use over the bound of a stable step near rest."""
-    return CUT if twin.grid.cut else SAFETY if twin.setup.surface is None else MESHED
+    if twin.setup.surface is None:
+        return SAFETY
+    return CUT if twin.grid.cut else MESHED
 
 
 def simulate(
