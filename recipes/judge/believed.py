@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import functools
+import hashlib
+import os
+from pathlib import Path
 
 import numpy as np
 from march import March, case_of
@@ -12,12 +15,32 @@ from world import World
 
 
 @functools.cache
-def believed_motion(name: str, number: int, world: World, finer: float) -> CubicSpline:
-    """Stated markers over time in one trial, had the experimenter been right in all but ``world``."""
+def believed_motion(name: str, number: int, world: World, finer: float, kept: Path | None = None) -> CubicSpline:
+    """Stated markers over time in one trial, had the experimenter been right in all but ``world``.
+
+    Args:
+        name: Of the specimen.
+        number: Of its trial.
+        world: What is not as stated.
+        finer: Divides the elements' edge.
+        kept: Folder of motions that processes share; each is simulated once.
+    """
     specimen = SPECIMENS[name]()
     trial = specimen.trials[number]
+    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
+    path = None
+    if kept is not None:
+        path = kept / f"{name}-{number}-{finer:g}-{hashlib.sha256(repr(world).encode()).hexdigest()[:16]}.npy"
+        if path.exists():
+            return CubicSpline(t, np.load(path, allow_pickle=False))
     mesh = mesh_for(name, finer)
     case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
-    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
     points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-    return CubicSpline(t, March(case, world).run(t, *mesh.interpolation(points)))
+    moved = March(case, world).run(t, *mesh.interpolation(points))
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}")
+        with part.open("wb") as file:
+            np.save(file, moved)
+        part.rename(path)
+    return CubicSpline(t, moved)
