@@ -293,6 +293,33 @@ def test_two_effects_that_move_alike_are_not_told_apart():
     assert (found.kind, set(found.chosen)) == ("cannot_distinguish", {"drag", "leak"})
 
 
+@pytest.mark.parametrize(("left", "priced", "kind"), [
+    (0.1, 1.0, "explained"), (1.0, 1.0, "cannot_distinguish"), (1.0, 0.1, "explained"),
+])  # fmt: skip
+def test_names_are_told_apart_no_better_than_the_twin_can(left, priced, kind):
+    data, nothing, drag = recorded(0.0, 7, effect=0.3)
+    time = data.trials[0].time
+    bent = tuple(J * (1 + 0.2 * np.sin(9 * time))[:, None, None, None] for J in drag.slopes)
+    leak = dataclasses.replace(drag, model=dataclasses.replace(drag.model, effects=("leak",)), slopes=bent)
+    far = apart(*(modes[0] for modes in weighed(data, nothing, drag, leak).groups.values()))
+    # The twin errs by something that neither takes up.
+    error = left * far * np.sqrt(2) * np.sin(60 * time)[:, None, None]
+    numerics = TwinError(amplitude=np.full_like(data.amplitudes[0], priced * far))
+    models = [
+        dataclasses.replace(m, residuals=tuple(r + error for r in m.residuals), numerics=numerics)
+        for m in (nothing, drag, leak)
+    ]
+    weighing = weighed(data, *models)
+    found = conclude(weighing, limit=0.0)
+    assert (found.kind, found.chosen[0]) == (kind, "drag")
+    if kind != "explained":
+        size = min(remainder(data, weighing.best, priced=False), priced * far)
+        assert size == pytest.approx(far, rel=0.2)
+        d = apart(*(modes[0] for modes in weighing.groups.values()))
+        odds = found.probabilities["leak"] / found.probabilities["drag"]
+        assert odds == pytest.approx(np.exp(-0.5 * (d / size) ** 2), rel=1e-3)
+
+
 def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
     data, nothing, drag = recorded(0.0, 8, effect=0.3)
     spring = tuple(np.concatenate([J, 0.01 * J**2], -1) for J in drag.slopes)

@@ -15,6 +15,9 @@ how well that discrepancy happens to fit its covariance. Then its size decides: 
 not known, of root mean square r, left by a model with K numbers of its own, have the likelihood (Schwarz 1978)
 
     ln p = -N ln r - K/2 ln N.
+
+Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
+this is priced at, and all of it, s, may lie along their difference D: the odds are exp(|D|^2 / (2 s^2)) at most.
 """
 
 from __future__ import annotations
@@ -222,6 +225,23 @@ class Weighing:
         pair = math.log(self.names) if len(model.effects) > 1 else 0.0
         return math.log(MISSING / (self.names + 1)) - pair
 
+    def _bounded(self, probabilities: dict[str, float], ln_prior: dict[str, float]) -> dict[str, float]:
+        """Probabilities of names that add up to as much, no farther apart than the twin's error allows."""
+        first = max(probabilities, key=lambda name: probabilities[name])
+        best = self.groups[first][0]
+        priced = best.near.numerics.size
+        error = min(remainder(self.data, best, priced=False), priced)
+        if not probabilities[first] or not error:
+            return probabilities
+        ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
+        for name, (mode, *_) in self.groups.items():
+            # What moves the body by no more than the twin may err is no name for the difference.
+            if size_of(self.change(mode)) > priced:
+                odds = ln_prior[name] - ln_prior[first] - 0.5 * (apart(mode, best) / error) ** 2
+                ln_p[name] = max(ln_p[name], math.log(probabilities[first]) + odds)
+        whole = sum(probabilities.values())
+        return {name: whole * p for name, p in normalised(ln_p).items()}
+
     def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
         """Posterior probabilities of all names, and what has an effect, most probable first."""
         kappa = self.kappa
@@ -246,6 +266,8 @@ class Weighing:
                 size = math.hypot(left[name], self.data.noise)
                 rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
+        if groups:
+            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior)
         found = [
             Candidate(
                 modes=tuple(modes),
@@ -328,10 +350,18 @@ def apart(one: Posterior, other: Posterior) -> float:
     return size_of(tuple(a - b for a, b in zip(one.left, other.left, strict=True)))
 
 
-def remainder(data: Data, found: Posterior) -> float:
-    """Root mean square of the least that a model leaves, beyond noise and what there is of the twin's own error [m]."""
+def remainder(data: Data, found: Posterior, *, priced: bool = True) -> float:
+    """Root mean square of the least that a model leaves, beyond noise and what there is of the twin's own error [m].
+
+    Args:
+        data: Recordings.
+        found: The model.
+        priced: Whether what there is of the twin's own error is taken off.
+    """
     near = found.near
-    known = data.noise**2 + float(((found.discrepancy.twin * near.numerics.amplitude) ** 2).mean())
+    known = data.noise**2
+    if priced:
+        known += float(((found.discrepancy.twin * near.numerics.amplitude) ** 2).mean())
     return math.sqrt(max(size_of(near.left(closest(data, near).at)) ** 2 - known, 0.0))
 
 
@@ -354,9 +384,9 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
     faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
-        # An extension that moves as what it extends adds nothing.
+        # An extension that moves as what it extends, as far as the twin tells, adds nothing.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
-        plain = [d for d in plain if apart(c.best, d.best) < least]
+        plain = [d for d in plain if apart(c.best, d.best) < max(least, c.best.near.numerics.size)]
         if c.size < max(least, c.best.near.numerics.size):
             told[NOTHING] += c.probability
         elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
