@@ -402,3 +402,41 @@ def test_intervals_are_those_of_clopper_and_pearson(judge):
     low, high = judge.score.Rate(hits=18, of=30).interval
     assert (round(low, 2), round(high, 2)) == (0.41, 0.77)
     assert judge.score.Rate(hits=0, of=10).interval == (0.0, pytest.approx(0.3085, abs=1e-4))
+
+
+def test_probabilities_are_compared_with_how_often_they_are_right(judge):
+    def told(k, truth, likely, probability, **more):
+        common = {"case": f"case-{k}", "specimen": "bar", "kind": "effect" if truth else "null", "length": 0.1}
+        return judge.answers.Scored(
+            **common, strength=3.0, truth=truth, verdict="explained", likely=likely, probability=probability, **more
+        )
+
+    rows = judge.score.table(
+        [
+            told(0, ("drag",), "drag", 0.9),
+            told(1, ("drag",), "leak", 0.9),
+            told(2, ("leak",), "leak", 0.5),
+            told(3, (), "nothing", 1.0, priced_ratio=1.5),
+        ],
+        1.0,
+    )
+    assert rows["names told with 0.8 to 1, right"].endswith("1/2")
+    # In the fifth from 0.8 to 1 two of three are right where 2.8 were told, in that around 0.5 one where 0.5 was.
+    error = rows["  expected calibration error of the most probable"]
+    assert error == f"{(0.8 + 0.5) / 4:.2f} (4)"
+    assert rows["own error, as told / real, nothing missing"].startswith("1.5 ")
+
+
+def test_the_error_that_is_told_is_compared_with_that_of_the_sealed_trial(judge, tmp_path):
+    folder, sealed = tmp_path / "answers" / "case-000", tmp_path / "sealed" / "case-000"
+    time, place = np.linspace(0.0, 1.0, 5), np.zeros((5, 1, 3))
+    clean = judge.experiment.Recording(time=time, value=place, names=("m1",), axes="xyz")
+    for where, value in ((folder / "predicted.csv", place + 2e-4), (sealed / "clean.csv", place)):
+        where.parent.mkdir(parents=True)
+        judge.experiment.Recording(time=time, value=value, names=clean.names, axes="xyz").write(where)
+    answer = {"verdict": "nothing_missing", "effects": [], "noise": {"simulation_m": 3e-4}}
+    (folder / "explanation.json").write_text(json.dumps(answer))
+    truth = {"case": "case-000", "specimen": "bar", "kind": "null", "strength": 0.0, "body_length_m": 0.1}
+    found = judge.answers.match({**truth, "effects": [], "believed_heldout_rms_mm": 0.4}, folder.parent, tmp_path, {})
+    assert found.priced_ratio == pytest.approx(1.5)
+    assert found.sealed_ratio == pytest.approx(0.5)

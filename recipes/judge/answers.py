@@ -19,6 +19,7 @@ class Scored:
 
     Attributes:
         case: Name.
+        specimen: Its body.
         kind: "effect", "null", "decoy", "pair" or "outside".
         strength: Of the effect over the noise.
         length: Of the body [m].
@@ -35,10 +36,13 @@ class Scored:
         probability: Of that.
         told_ratio: Held-out error after over before, as the answer states it.
         sealed_ratio: The same for the sealed trial, if the answer predicted it.
+        priced_ratio: Error that the answer ascribes to its simulation over that of the sealed trial as predicted, where
+            nothing is missing.
         seconds: That the answer took.
     """
 
     case: str
+    specimen: str
     kind: str
     strength: float
     length: float
@@ -55,6 +59,7 @@ class Scored:
     probability: float = 0.0
     told_ratio: float | None = None
     sealed_ratio: float | None = None
+    priced_ratio: float | None = None
     seconds: float = 0.0
 
 
@@ -80,6 +85,7 @@ def _told(answer: Mapping[str, Any]) -> float | None:
 
 
 def _sealed(truth: Mapping[str, Any], folder: Path, batch: Path) -> float | None:
+    """Root mean square distance of the sealed trial as it was predicted [m]."""
     path = folder / "predicted.csv"
     if not path.exists():
         return None
@@ -92,7 +98,7 @@ def _sealed(truth: Mapping[str, Any], folder: Path, batch: Path) -> float | None
     flat = guess.value.reshape(len(guess.time), -1)
     at = np.stack([np.interp(clean.time[inside], guess.time, column) for column in flat.T], 1)
     gap = at - clean.value[inside][..., chosen].reshape(len(at), -1)
-    return float(1e3 * np.sqrt(np.mean(gap**2)) / truth["believed_heldout_rms_mm"])
+    return float(np.sqrt(np.mean(gap**2)))
 
 
 def parameter_error(name: str, value: float, truth: float) -> float:
@@ -114,6 +120,7 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
     put = tuple(e["name"] for e in truth["effects"])
     common: dict[str, Any] = {
         "case": truth["case"],
+        "specimen": truth["specimen"],
         "kind": truth["kind"],
         "strength": truth["strength"],
         "length": truth["body_length_m"],
@@ -157,6 +164,8 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
     cost = answer.get("cost") or {}
     probabilities = answer.get("probabilities") or {"": 0.0}
     likely = max(probabilities, key=lambda name: probabilities[name])
+    sealed = _sealed(truth, folder / truth["case"], batch)
+    priced = (answer.get("noise") or {}).get("simulation_m")
     return Scored(
         **common,
         verdict=verdict,
@@ -170,6 +179,7 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
         likely=ours(likely),
         probability=float(probabilities[likely]),
         told_ratio=_told(answer),
-        sealed_ratio=_sealed(truth, folder / truth["case"], batch),
+        sealed_ratio=None if sealed is None else 1e3 * sealed / truth["believed_heldout_rms_mm"],
+        priced_ratio=priced / sealed if priced and sealed and not put else None,
         seconds=float(answer.get("judge_seconds", cost.get("seconds", 0.0)) or 0.0),
     )

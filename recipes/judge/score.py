@@ -89,6 +89,7 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
     sealed = [c.sealed_ratio for c in strong if c.verdict in SETS and c.sealed_ratio is not None]
     sizes = [len(c.set) for c in spoke]
     sure = [c for c in cases if c.likely]
+    certain = [c for c in sure if c.likely not in ("nothing", "unknown") and c.probability >= 0.8]
 
     def alarm(c: Scored) -> bool:
         return c.verdict not in SILENT
@@ -122,9 +123,21 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
         "cannot tell": str(rate(cases, lambda c: c.verdict == "cannot_tell")),
         "most probable, as told, is the truth": str(rate(sure, lambda c: c.likely in truths(c))),
         "  mean probability that is told of it": f"{np.mean([c.probability for c in sure]):.2f}" if sure else "no case",
+        "names told with 0.8 to 1, right": str(rate(certain, lambda c: c.likely in truths(c))),
+        "  expected calibration error of the most probable": _calibration(sure),
+        "own error, as told / real, nothing missing": _median([c.priced_ratio for c in quiet if c.priced_ratio]),
         "failed to answer": str(rate(cases, lambda c: c.verdict in MUTE)),
         "seconds for an answer": _median([c.seconds for c in cases if c.seconds]),
     }
+
+
+def _calibration(cases: Sequence[Scored]) -> str:
+    """Mean distance of the probability that is told from the share that is right, over fifths, by their cases."""
+    fifths: dict[int, list[Scored]] = {}
+    for c in cases:
+        fifths.setdefault(min(int(5 * c.probability), 4), []).append(c)
+    off = [abs(sum(c.probability - (c.likely in truths(c)) for c in same)) for same in fifths.values()]
+    return f"{sum(off) / len(cases):.2f} ({len(cases)})" if cases else "no case"
 
 
 def truths(c: Scored) -> tuple[str, ...]:
@@ -215,7 +228,7 @@ def write_cases(path: Path, truth: Sequence[dict[str, Any]], cases: Sequence[Sco
 
 def score(
     batch: Path, /, *, answers: tuple[str, ...], threshold: float = 1.0, rename: Path | None = None,
-    asked: bool = False, out: Path | None = None, cases: Path | None = None,
+    asked: bool = False, bodies: tuple[str, ...] = (), out: Path | None = None, cases: Path | None = None,
 ) -> dict[str, dict[str, str]]:  # fmt: skip
     """Print the tables.
 
@@ -225,6 +238,7 @@ def score(
         threshold: Strength at which an effect can just be seen.
         rename: JSON {"effects": {theirs: ours}, "parameters": {"effect": {theirs: ours}}} for other vocabularies.
         asked: Leave out what no answer was written for, as of a tool that was not asked for all.
+        bodies: Kinds of body that count; all if none is given.
         out: JSON file for the tables and every case.
         cases: CSV file for every case of the first folder of answers.
 
@@ -236,9 +250,12 @@ def score(
     found: dict[str, list[Scored]] = {}
     for item in answers:
         label, _, folder = item.rpartition("=")
-        every = [match(t, Path(folder), batch, words) for t in truth["cases"]]
+        counted = [t for t in truth["cases"] if not bodies or t["specimen"] in bodies]
+        every = [match(t, Path(folder), batch, words) for t in counted]
         found[label or Path(folder).name] = [c for c in every if not asked or c.verdict != "missing"]
     tables = {label: table(every, threshold) for label, every in found.items()}
+    if not any(found.values()):
+        raise ValueError(f"bodies = {bodies}: no case of the batch, wanted names of specimens")
     rows = next(iter(tables.values()))
     width = max(map(len, rows))
     columns = [max(len(label), *(len(v) for v in rows.values())) for label, rows in tables.items()]
