@@ -10,7 +10,15 @@ from swings import EXACT, recorded
 
 from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude, remainder
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, Model, TwinError, infer, told
+from torchsoro.sim2real.inference.evidence import (
+    Discrepancy,
+    Linearised,
+    Model,
+    TwinError,
+    infer,
+    ln_prior_left,
+    told,
+)
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
@@ -315,9 +323,29 @@ def test_names_are_told_apart_no_better_than_the_twin_can(left, priced, kind):
     if kind != "explained":
         size = min(remainder(data, weighing.best, priced=False), priced * far)
         assert size == pytest.approx(far, rel=0.2)
-        d = apart(*(modes[0] for modes in weighing.groups.values()))
+        one, other = (weighing.groups[name][0] for name in ("drag", "leak"))
         odds = found.probabilities["leak"] / found.probabilities["drag"]
-        assert odds == pytest.approx(np.exp(-0.5 * (d / size) ** 2), rel=1e-3)
+        by_priors = ln_prior_left(other, weighing.kappa) - ln_prior_left(one, weighing.kappa)
+        assert abs(by_priors) < 0.5
+        assert odds == pytest.approx(np.exp(by_priors - 0.5 * (apart(one, other) / size) ** 2), rel=1e-3)
+
+
+def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_moves_the_body():
+    data, nothing, drag = recorded(0.0, 7, effect=0.3)
+    moved = size_of(tuple(0.3 * J[..., 0] for J in drag.slopes))
+    numerics = TwinError(amplitude=np.full_like(data.amplitudes[0], 0.3 * moved))
+    error = 0.3 * moved * np.sqrt(2) * np.sin(60 * data.trials[0].time)[:, None, None]
+    # What drag does a belief does as well, at eight deviations of its own.
+    belief = Model(effects=("leak",), priors=(Prior(0.3 / 8), Prior(1.0)), own=(1,), beliefs=1)
+    other = tuple(np.concatenate([J, 1e-3 * np.ones_like(J)], -1) for J in drag.slopes)
+    leak = Linearised(model=belief, at=np.zeros(2), residuals=drag.residuals, slopes=other, numerics=numerics)
+    models = [
+        dataclasses.replace(m, residuals=tuple(r + error for r in m.residuals), numerics=numerics)
+        for m in (nothing, drag, leak)
+    ]
+    found = conclude(weighed(data, *models), limit=0.0)
+    assert found.chosen == ("drag",)
+    assert found.probabilities["leak"] < 0.02
 
 
 def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():

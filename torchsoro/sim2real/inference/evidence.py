@@ -325,6 +325,21 @@ def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
     return min(0.0, ln_prior + volume)
 
 
+def ln_prior_left(found: Posterior, kappa: float) -> float:
+    """Ln of what priors leave of a model at its mode, whatever its likelihood is.
+
+    Density of beliefs and measurement errors over that where all are as stated, and the share of the effects' prior.
+
+    Args:
+        found: With the likelihood as it is.
+        kappa: Of whose inverse the likelihood is taken to the power.
+    """
+    model, at = found.near.model, found.mode.at
+    stated = [(p, x) for k, (p, x) in enumerate(zip(model.priors, at, strict=True)) if k not in model.own]
+    off = sum(p.ln_density(x) - p.ln_density(0.0) for p, x in stated)
+    return off + _ln_own_occam(model, found.mode, kappa)
+
+
 def mode_of(data: Data, near: Linearised, discrepancy: Discrepancy, kappa: float = 1.0) -> Mode:
     """Of the unknowns, with a discrepancy."""
     return posterior(tempered(total(grams(data, near, discrepancy)), kappa), near.at, near.model.priors)
