@@ -17,8 +17,8 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
     ln p = -N ln r - K/2 ln N.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
-this is priced at, and all of it, s, may lie along their difference D: likelihoods differ by exp(|D|^2 / (2 s^2)) at
-most, and priors as they do.
+this is priced at, and all of it may lie along their difference. With an error of that size, all samples count as one
+number, and by this likelihood, with the priors as they are, another name is as probable as it is at least.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from torchsoro.sim2real.inference.evidence import (
     adjusted,
     closest,
     leave_one_out,
-    ln_prior_left,
+    ln_evidence_within,
     mode_of,
     products,
 )
@@ -236,12 +236,13 @@ class Weighing:
         if not probabilities[first] or not error:
             return probabilities
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
-        ahead = ln_p[first] - ln_prior[first] - ln_prior_left(best, self.kappa)
+        within = {
+            name: ln_prior[name] + ln_evidence_within(self.data, p.near, error) for name, (p, *_) in self.groups.items()
+        }
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err is no name for the difference.
             if size_of(self.change(mode)) > priced:
-                least = ahead - 0.5 * (apart(mode, best) / error) ** 2
-                ln_p[name] = max(ln_p[name], least + ln_prior[name] + ln_prior_left(mode, self.kappa))
+                ln_p[name] = max(ln_p[name], math.log(probabilities[first]) + within[name] - within[first])
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 

@@ -325,21 +325,6 @@ def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
     return min(0.0, ln_prior + volume)
 
 
-def ln_prior_left(found: Posterior, kappa: float) -> float:
-    """Ln of what priors leave of a model at its mode, whatever its likelihood is.
-
-    Density of beliefs and measurement errors over that where all are as stated, and the share of the effects' prior.
-
-    Args:
-        found: With the likelihood as it is.
-        kappa: Of whose inverse the likelihood is taken to the power.
-    """
-    model, at = found.near.model, found.mode.at
-    stated = [(p, x) for k, (p, x) in enumerate(zip(model.priors, at, strict=True)) if k not in model.own]
-    off = sum(p.ln_density(x) - p.ln_density(0.0) for p, x in stated)
-    return off + _ln_own_occam(model, found.mode, kappa)
-
-
 def mode_of(data: Data, near: Linearised, discrepancy: Discrepancy, kappa: float = 1.0) -> Mode:
     """Of the unknowns, with a discrepancy."""
     return posterior(tempered(total(grams(data, near, discrepancy)), kappa), near.at, near.model.priors)
@@ -492,3 +477,16 @@ def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
         mode = posterior(tempered(whole, max(whole.count / independent(left), 1.0)), near.at, near.model.priors)
         at = mode.at
     return mode
+
+
+def ln_evidence_within(data: Data, near: Linearised, error: float) -> float:
+    """Ln of the evidence of a model where an error may lie along any change of the motion: samples count as one number.
+
+    Args:
+        data: Recordings.
+        near: A model near a point.
+        error: Its size, root mean square [m].
+    """
+    exact = dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+    whole = total(grams(dataclasses.replace(data, noise=error), exact, Discrepancy()))
+    return posterior(tempered(whole, whole.count), near.at, near.model.priors).ln_evidence
