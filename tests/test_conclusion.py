@@ -16,6 +16,7 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     TwinError,
     infer,
+    ln_evidence_within,
     told,
 )
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
@@ -326,6 +327,20 @@ def test_names_are_told_apart_no_better_than_the_twin_can(left, priced, kind):
         odds = found.probabilities["leak"] / found.probabilities["drag"]
         apart_by = 0.5 * (apart(one, other) / size) ** 2
         assert odds == pytest.approx(np.exp(-apart_by), rel=0.3)
+
+
+def test_samples_that_count_as_few_numbers_tell_no_more_than_all_of_them():
+    data, nothing, drag = recorded(0.0, 7, effect=0.05)
+    samples = sum(np.isfinite(r).sum() for r in drag.residuals)
+
+    def told_by(error, count):
+        return ln_evidence_within(data, drag, error, count) - ln_evidence_within(data, nothing, error, count)
+
+    every = told_by(0.0, samples)
+    assert every > 10
+    gained = [told_by(0.0, 20), told_by(0.2 * data.noise, 20), told_by(data.noise, 20), told_by(data.noise, 1)]
+    assert gained[0] == pytest.approx(every, rel=1e-2)  # of 20 means of all samples none is lost
+    assert every > gained[1] > gained[2] > gained[3]
 
 
 def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_moves_the_body():

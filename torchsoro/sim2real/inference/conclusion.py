@@ -17,8 +17,9 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
     ln p = -N ln r - K/2 ln N.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
-this is priced at, and all of it may lie along their difference. With an error of that size, all samples count as one
-number, and by this likelihood, with the priors as they are, another name is as probable as it is at least.
+this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
+as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
+name is as probable as it is at least, and at most as the first.
 """
 
 from __future__ import annotations
@@ -227,7 +228,9 @@ class Weighing:
         pair = math.log(self.names) if len(model.effects) > 1 else 0.0
         return math.log(MISSING / (self.names + 1)) - pair
 
-    def _bounded(self, probabilities: dict[str, float], ln_prior: dict[str, float]) -> dict[str, float]:
+    def _bounded(
+        self, probabilities: dict[str, float], ln_prior: dict[str, float], left: dict[str, float]
+    ) -> dict[str, float]:
         """Probabilities of names that add up to as much, no farther apart than the twin's error allows."""
         first = max(probabilities, key=lambda name: probabilities[name])
         best = self.groups[first][0]
@@ -236,13 +239,15 @@ class Weighing:
         if not probabilities[first] or not error:
             return probabilities
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
+        count = min((independent(draw) for draw in best.near.numerics.draws), default=1.0)
         within = {
-            name: ln_prior[name] + ln_evidence_within(self.data, p.near, error) for name, (p, *_) in self.groups.items()
+            name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
+            for name, (p, *_) in self.groups.items()
         }
         for name, (mode, *_) in self.groups.items():
-            # What moves the body by no more than the twin may err is no name for the difference.
-            if size_of(self.change(mode)) > priced:
-                ln_p[name] = max(ln_p[name], math.log(probabilities[first]) + within[name] - within[first])
+            # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
+            if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
+                ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], 0.0))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 
@@ -271,7 +276,7 @@ class Weighing:
                 rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         if groups:
-            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior)
+            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior, left)
         found = [
             Candidate(
                 modes=tuple(modes),

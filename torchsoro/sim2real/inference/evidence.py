@@ -479,14 +479,17 @@ def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
     return mode
 
 
-def ln_evidence_within(data: Data, near: Linearised, error: float) -> float:
-    """Ln of the evidence of a model where an error may lie along any change of the motion: samples count as one number.
+def ln_evidence_within(data: Data, near: Linearised, error: float, count: float) -> float:
+    """Ln of the evidence of a model where an error may lie along any change of the motion.
 
     Args:
         data: Recordings.
         near: A model near a point.
         error: Its size, root mean square [m].
+        count: Independent numbers that all samples amount to, each the mean of so many with their noise.
     """
     exact = dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
-    whole = total(grams(dataclasses.replace(data, noise=error), exact, Discrepancy()))
-    return posterior(tempered(whole, whole.count), near.at, near.model.priors).ln_evidence
+    samples = sum(int(np.isfinite(r).sum()) for r in near.residuals)
+    each = max(samples / count, 1.0)
+    known = dataclasses.replace(data, noise=math.hypot(error, data.noise / math.sqrt(each)))
+    return posterior(tempered(total(grams(known, exact, Discrepancy())), each), near.at, near.model.priors).ln_evidence
