@@ -247,15 +247,15 @@ def score(
     """
     truth = check(batch)
     words = json.loads(rename.read_text()) if rename else {}
+    counted = [t for t in truth["cases"] if not bodies or t["specimen"] in bodies]
+    if not counted:
+        raise ValueError(f"bodies = {bodies}: no case of the batch, wanted names of specimens")
     found: dict[str, list[Scored]] = {}
     for item in answers:
         label, _, folder = item.rpartition("=")
-        counted = [t for t in truth["cases"] if not bodies or t["specimen"] in bodies]
         every = [match(t, Path(folder), batch, words) for t in counted]
         found[label or Path(folder).name] = [c for c in every if not asked or c.verdict != "missing"]
     tables = {label: table(every, threshold) for label, every in found.items()}
-    if not any(found.values()):
-        raise ValueError(f"bodies = {bodies}: no case of the batch, wanted names of specimens")
     rows = next(iter(tables.values()))
     width = max(map(len, rows))
     columns = [max(len(label), *(len(v) for v in rows.values())) for label, rows in tables.items()]

@@ -456,6 +456,11 @@ def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = Non
     return posterior(total(parts), near.at, near.model.priors)
 
 
+def _exact(near: Linearised) -> Linearised:
+    """The same by a twin without an error."""
+    return dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+
+
 def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
     """The mode by least squares: errors of all samples are alike, and as large as what is left.
 
@@ -467,7 +472,7 @@ def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
         near: A model near a point.
         but: Number of a trial that is left out.
     """
-    exact = dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+    exact = _exact(near)
     kept = [i for i in range(len(data.trials)) if i != but]
     at = near.at
     for _ in range(SETTLED):
@@ -488,7 +493,7 @@ def ln_evidence_within(data: Data, near: Linearised, error: float, count: float)
         error: Its size, root mean square [m].
         count: Independent numbers that all samples amount to, each the mean of so many with their noise.
     """
-    exact = dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+    exact = _exact(near)
     samples = sum(int(np.isfinite(r).sum()) for r in near.residuals)
     each = max(samples / count, 1.0)
     known = dataclasses.replace(data, noise=math.hypot(error, data.noise / math.sqrt(each)))
