@@ -16,9 +16,8 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     TwinError,
     infer,
-    ln_evidence_within,
-    told,
 )
+from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared

@@ -19,6 +19,8 @@ from torchsoro.sim2real.inference import evidence
 from torchsoro.sim2real.inference.decision import MATTERS
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
+    Model,
+    adjusted,
     errors,
     grams,
     infer,
@@ -339,3 +341,14 @@ def test_the_range_that_residuals_leave_next_to_a_steep_bound_has_a_probability(
     mass = quad(lambda x: math.exp(-1e6 * x**3), 0, 0.1)[0]
     found = evidence._ln_occam(None, None, None, np.zeros(3), low, high)
     assert found == pytest.approx(math.log(mass / 5.0), abs=3)
+
+
+def test_a_measurement_error_far_off_costs_its_prior_however_little_the_samples_count():
+    data, nothing, effects = recorded(0.0, 3, effect=0.5)
+    prior = Prior(0.01, freedom=4.0)
+    fault = dataclasses.replace(effects, model=Model(effects=(), priors=(prior,)))
+    found, bare = infer(data, fault), infer(data, nothing)
+    assert found.mode.at[0] == pytest.approx(0.5, abs=0.05)  # 50 deviations
+    hardly, without = (adjusted(data, p, 1e9).none.mode.ln_evidence for p in (found, bare))
+    lost = prior.ln_density(float(found.none.mode.at[0])) - prior.ln_density(0.0)
+    assert lost < -15 and hardly - without == pytest.approx(lost, abs=1e-3)

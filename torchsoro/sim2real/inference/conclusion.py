@@ -37,12 +37,11 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
-    closest,
     leave_one_out,
-    ln_evidence_within,
     mode_of,
     products,
 )
+from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
 

@@ -24,7 +24,7 @@ from scipy.optimize import minimize
 
 from torchsoro.sim2real.inference.decision import COMMON, LASTING
 from torchsoro.sim2real.inference.laplace import Mode, posterior
-from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
+from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, integrated, tempered, total
 
@@ -34,7 +34,6 @@ FIRST, AGAIN = 0.5, 0.1  # steps in ln s, ln tau and ln c with which their searc
 APART = 0.15  # of ln s, ln tau and ln c, for second differences
 LEAST_PRICE = 0.1  # of the price of the twin's error, that it has; the noise is above what is less
 ALTERNATIONS = 3  # between the mode and the discrepancy that its residual tells
-SETTLED = 5  # rounds in which the size of what is left and its weight agree to a percent
 
 Map = Callable[..., Iterable]  # of a function and its arguments, as the builtin
 
@@ -292,7 +291,9 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
 
     Beliefs and measurement errors are integrated out first, with the likelihood as it is: where markers sit is told by
     samples that no effect moves. So ln Z = ln L + ln O, L the likelihood of the effects' own numbers at their mode and
-    O the share of their prior that is left there, becomes ln L / kappa + ln O with the covariance of now.
+    O the share of their prior that is left there, becomes ln L / kappa + ln O with the covariance of now. L without the
+    prior of beliefs and measurement errors where they are, which counts in full: however uncertain sums over samples
+    are, a marker that sits off by ten tolerances is as improbable as before.
 
     Args:
         data: Recordings.
@@ -303,13 +304,20 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     def again(branch: Branch) -> Branch:
         mode, model = branch.mode, found.near.model
         before, after = (_ln_own_occam(model, mode, k) for k in (1.0, kappa))
-        ln_evidence = (mode.ln_evidence - before) / kappa + after
+        strained = _ln_strained(model, mode)
+        ln_evidence = (mode.ln_evidence - before - strained) / kappa + after + strained
         wider = mode_of(data, found.near, branch.discrepancy, kappa)
         return dataclasses.replace(branch, mode=dataclasses.replace(wider, ln_evidence=ln_evidence))
 
     if kappa == 1.0:
         return found
     return dataclasses.replace(found, some=again(found.some), none=again(found.none))
+
+
+def _ln_strained(model: Model, mode: Mode) -> float:
+    """Ln of the prior density of beliefs and measurement errors at a mode, over that at their most probable values."""
+    others = (k for k in range(len(model.priors)) if k not in model.own)
+    return sum(model.priors[k].ln_density(float(mode.at[k])) - model.priors[k].ln_density(0.0) for k in others)
 
 
 def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
@@ -433,68 +441,3 @@ def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarra
         return posterior(total(of), near.at, near.model.priors).ln_evidence if of else 0.0
 
     return np.array([ln_z(parts) - ln_z(parts[:i] + parts[i + 1 :]) for i in range(len(parts))])
-
-
-def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = None) -> Mode:
-    """The numbers of a model that are told and predicted with; s, tau and c are those of all trials.
-
-    They are the most probable ones. But where a discrepancy matters, these leave to it what they might explain: then
-    they are those of :func:`closest`, which predict better.
-
-    Args:
-        data: Recordings.
-        found: A model after all of them.
-        kappa: See :func:`adjusted`.
-        but: Number of a trial that is left out.
-    """
-    near = found.near
-    if found.matters:
-        return dataclasses.replace(found.mode, at=closest(data, near, but).at)
-    if but is None:
-        return found.mode
-    parts = [tempered(g, kappa) for i, g in enumerate(grams(data, near, found.discrepancy)) if i != but]
-    return posterior(total(parts), near.at, near.model.priors)
-
-
-def _exact(near: Linearised) -> Linearised:
-    """The same by a twin without an error."""
-    return dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
-
-
-def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
-    """The mode by least squares: errors of all samples are alike, and as large as what is left.
-
-    They count as the independent values that they amount to, so that beliefs and measurement errors stay what they may
-    be where what is left is large and lasts.
-
-    Args:
-        data: Recordings.
-        near: A model near a point.
-        but: Number of a trial that is left out.
-    """
-    exact = _exact(near)
-    kept = [i for i in range(len(data.trials)) if i != but]
-    at = near.at
-    for _ in range(SETTLED):
-        left = tuple(r for i, r in enumerate(near.left(at)) if i in kept)
-        parts = grams(dataclasses.replace(data, noise=max(size_of(left), data.noise)), exact, Discrepancy())
-        whole = total([parts[i] for i in kept])
-        mode = posterior(tempered(whole, max(whole.count / independent(left), 1.0)), near.at, near.model.priors)
-        at = mode.at
-    return mode
-
-
-def ln_evidence_within(data: Data, near: Linearised, error: float, count: float) -> float:
-    """Ln of the evidence of a model where an error may lie along any change of the motion.
-
-    Args:
-        data: Recordings.
-        near: A model near a point.
-        error: Its size, root mean square [m].
-        count: Independent numbers that all samples amount to, each the mean of so many with their noise.
-    """
-    exact = _exact(near)
-    samples = sum(int(np.isfinite(r).sum()) for r in near.residuals)
-    each = max(samples / count, 1.0)
-    known = dataclasses.replace(data, noise=math.hypot(error, data.noise / math.sqrt(each)))
-    return posterior(tempered(total(grams(known, exact, Discrepancy())), each), near.at, near.model.priors).ln_evidence

@@ -66,7 +66,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    by_finer = problem.rough and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
+    by_finer = problem.touches and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
     begun = MOST_VALLEYS if problem.many_valleys and not by_finer else MOST
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, begun))
     carried: list[Task] = []
