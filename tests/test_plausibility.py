@@ -187,6 +187,34 @@ def test_three_markers_named_in_a_circle_are_put_right(folder):
     np.testing.assert_allclose(places(mended.trials[0]), swing().position, atol=1e-8)
 
 
+def thrown(seed: int, late: float) -> Recording:
+    """A bar that flies and turns, by a clock that is late."""
+    time = np.arange(0.0, 0.5, 0.005)
+    true, middle = time + late, np.array([0.04, 0.01, 0.012])
+    turned = Rotation.from_rotvec(np.outer(true, (0.0, 0.0, 10.0))).as_matrix() @ (np.array(PLACES) - middle).T
+    fallen = np.outer(true, (1.5, -0.5, 0.0)) - 0.5 * np.outer(true**2, (0.0, 0.0, 9.81))
+    wrong = 4e-4 * np.random.default_rng(seed).normal(size=(4, 3))
+    return Recording(time=time, position=turned.transpose(0, 2, 1) + middle + fallen[:, None] + wrong)
+
+
+@hypothesis.settings(max_examples=10, deadline=None)
+@hypothesis.given(
+    seed=st.integers(0, 10**6),
+    late=st.floats(-0.015, 0.015),
+    pair=st.sampled_from([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]),
+)
+def test_exchanged_markers_of_a_body_that_is_thrown_are_put_right(tmp_path_factory, seed, late, pair):
+    place, order = tmp_path_factory.mktemp("thrown"), np.arange(4)
+    start = "[start]\nvelocity = [1.5, -0.5, 0.0]\nangular_velocity = [0.0, 0.0, 10.0]\n"
+    (place / "setup.toml").write_text(SETUP.replace(CLAMP.replace("0.021, 0.021", "0.021, 0.025"), start))
+    right = write(place, a=thrown(seed, late))
+    assert not plausible(right)[1]
+    order[list(pair)] = order[list(pair[::-1])]
+    mended, (found,) = plausible(write(place, a=changed(thrown(seed, late), lambda x: x[:, order])))
+    assert f"columns of {NAMES[pair[0]]} and {NAMES[pair[1]]} exchanged" in str(found) and "put right" in str(found)
+    np.testing.assert_array_equal(places(mended.trials[0]), places(right.trials[0]))
+
+
 def test_a_shifted_origin_is_told_with_its_shift(folder):
     (told,) = findings(folder, changed(swing(), lambda x: x + np.array([0.02, 0.0, -0.01])))
     assert "origin shifted by (2" in told and "frame of setup.toml" in told

@@ -285,12 +285,15 @@ def read_otherwise(recording: Recording, setup: Setup) -> tuple[float, list[Read
     first = recording.position[earliest, np.arange(len(setup.markers))]
     first[~seen.any(0)] = np.nan
     low, size = np.array(setup.origin), np.array(setup.size)
-    late = float(np.abs(recording.time[earliest]).max()) + CLOCK
-    speed = math.hypot(*setup.velocity) + math.hypot(*setup.angular_velocity) * max(setup.size) / 2
+    when = recording.time[earliest]
+    late = float(np.abs(when).max()) + CLOCK
     stated = np.array([m.at for m in setup.markers])
     scale = (SCALE if setup.kind == "video" else TURN) * float(np.abs(stated).max())
-    tolerance = math.hypot(PLACE, scale, speed * late, math.hypot(*setup.gravity) * late**2 / 2, setup.noise or 0.0)
-    return misreadings(first, stated, axes=setup.axes, box=(low, low + size), tolerance=tolerance)
+    tolerance = math.hypot(PLACE, scale, math.hypot(*setup.gravity) * late**2 / 2, setup.noise or 0.0)
+    drift = np.array(setup.velocity) + np.cross(setup.angular_velocity, stated - (low + size / 2))
+    there = stated + drift * when[:, None]
+    box = low, low + size
+    return misreadings(first, there, axes=setup.axes, box=box, tolerance=tolerance, drift=drift, late=CLOCK)
 
 
 def _folders(parent: Path) -> list[Path]:

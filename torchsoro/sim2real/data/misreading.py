@@ -128,6 +128,8 @@ def misreadings(
     axes: Sequence[int],
     box: tuple[np.ndarray, np.ndarray],
     tolerance: float,
+    drift: np.ndarray | None = None,
+    late: float = 0.0,
 ) -> tuple[float, list[Reading]]:
     """Ways to read a recording that fit where its markers begin, where the recording as it stands does not.
 
@@ -137,6 +139,8 @@ def misreadings(
         axes: Recorded axes [A].
         box: Lower and upper corner of the undeformed body [m].
         tolerance: Standard deviation of a coordinate about the stated one, where nothing was misread [m].
+        drift: Velocity of each marker at release [M, 3] m/s; at rest if None.
+        late: Standard deviation of the time at which all were seen [s].
 
     Returns:
         Root mean square distance from the stated places as it stands [m], and the readings: the best, and those that
@@ -146,8 +150,11 @@ def misreadings(
     if not len(seen):
         return 0.0, []
     there, known = first[seen], stated[seen]
+    moving = np.zeros_like(known) if drift is None else drift[seen]
     plain = _Option(axes=tuple(axes), signs=(1,) * len(axes), factor=1.0, shift="none", ordered=True)
-    judge = _Judge(there=there, known=known, axes=tuple(axes), box=np.array(box), tolerance=tolerance)
+    judge = _Judge(
+        there=there, known=known, drift=moving, late=late, axes=tuple(axes), box=np.array(box), tolerance=tolerance
+    )
     asis, level = judge.reading(plain)
     if asis.away <= FITS * tolerance:
         return asis.away, []
@@ -175,10 +182,12 @@ class _Option:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Judge:
-    """Places at release [M, A] and as stated [M, 3], and how probable an option is by them."""
+    """Places at release [M, A], and places [M, 3] and velocities as stated, and how probable an option is by them."""
 
     there: np.ndarray
     known: np.ndarray
+    drift: np.ndarray
+    late: float
     axes: tuple[int, ...]
     box: np.ndarray
     tolerance: float
@@ -221,7 +230,11 @@ class _Judge:
         order = np.arange(len(there))
         if not option.ordered:
             _, order = linear_sum_assignment(((there[:, None] - known) ** 2).sum(-1))
-        off = float(((there - known[order]) ** 2).sum())
+        gap, way = there - known[order], (self.drift[:, axes] * signs)[order]
+        # All were seen at one time, by which what moves is farther along its way.
+        after = float((gap * way).sum() / ((way**2).sum() + (self.tolerance / self.late) ** 2)) if self.late else 0.0
+        apart = float(((gap - after * way) ** 2).sum())
+        off = apart + (self.tolerance * after / self.late) ** 2 if self.late else apart
         if shift is not None and np.abs(shift).max() > ROOM * self.reach:
             off = math.inf
         n, nu = there.size, FREEDOM
@@ -234,7 +247,7 @@ class _Judge:
             shift=shift,
             opposite=option.shift == "opposite",
             order=order,
-            away=math.sqrt(off / n),
+            away=math.sqrt(apart / n),
             ln_odds=0.0,
         )
         return reading, ln + self._prior(option, order)
