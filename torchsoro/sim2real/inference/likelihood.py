@@ -164,6 +164,11 @@ class Likelihood:
         """Whether it is so rough that searches end in valleys nearby."""
         return self.chance > VALLEYS
 
+    @property
+    def walks(self) -> bool:
+        """Whether a body with chambers meets planes and a finer twin searches it, however noisy its recording is."""
+        return self.touches and bool(self.experiment.setup.chambers) and self.finer_twin is not None
+
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:
         """What is fitted always, with its tolerance: modulus, and where there are such pressure and friction."""

@@ -66,8 +66,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    by_finer = problem.touches and bool(problem.experiment.setup.chambers) and problem.finer_twin is not None
-    begun = MOST_VALLEYS if problem.many_valleys and not by_finer else MOST
+    begun = MOST_VALLEYS if problem.many_valleys and not problem.walks else MOST
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, begun))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
@@ -91,7 +90,7 @@ def search(
                 else f"{effect.name}: breaks down"
             )
         tasks = _likely(probe_points, null_model, most)
-    if problem.many_valleys and not by_finer:
+    if problem.many_valleys and not problem.walks:
         tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
     unconstrained = _unconstrained(problem, effects, null_model)
@@ -116,7 +115,7 @@ def search(
     ends = distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)], ENDS)
     ends = running(problem, ends)
     valleys = _other_valleys(problem, null_model, ends)
-    if not by_finer:
+    if not problem.walks:
         return problem, null_model, [*valleys, *ends]
     # What two searches find in turn, so that neither crowds out the other.
     nothing, finer = _by_finer(problem, effects, null_model, report)
