@@ -290,10 +290,16 @@ def read_otherwise(recording: Recording, setup: Setup) -> tuple[float, list[Read
     stated = np.array([m.at for m in setup.markers])
     scale = (SCALE if setup.kind == "video" else TURN) * float(np.abs(stated).max())
     tolerance = math.hypot(PLACE, scale, math.hypot(*setup.gravity) * late**2 / 2, setup.noise or 0.0)
-    drift = np.array(setup.velocity) + np.cross(setup.angular_velocity, stated - (low + size / 2))
-    there = stated + drift * when[:, None]
-    box = low, low + size
-    return misreadings(first, there, axes=setup.axes, box=box, tolerance=tolerance, drift=drift, late=CLOCK)
+    velocity = np.array(setup.velocity) + np.cross(setup.angular_velocity, stated - (low + size / 2))
+    return misreadings(
+        first,
+        stated + velocity * when[:, None],
+        velocity=velocity,
+        clock=CLOCK,
+        axes=setup.axes,
+        box=(low, low + size),
+        tolerance=tolerance,
+    )
 
 
 def _folders(parent: Path) -> list[Path]:

@@ -125,22 +125,22 @@ def misreadings(
     first: np.ndarray,
     stated: np.ndarray,
     *,
+    velocity: np.ndarray,
+    clock: float,
     axes: Sequence[int],
     box: tuple[np.ndarray, np.ndarray],
     tolerance: float,
-    drift: np.ndarray | None = None,
-    late: float = 0.0,
 ) -> tuple[float, list[Reading]]:
     """Ways to read a recording that fit where its markers begin, where the recording as it stands does not.
 
     Args:
         first: Places at release [M, A] m; not a number where a marker was not seen.
-        stated: In the undeformed body [M, 3] m.
+        stated: Where they are by the setup when they are first seen [M, 3] m.
+        velocity: Of each marker, as stated [M, 3] m/s.
+        clock: Standard deviation of the offset of the recording's clock [s].
         axes: Recorded axes [A].
         box: Lower and upper corner of the undeformed body [m].
         tolerance: Standard deviation of a coordinate about the stated one, where nothing was misread [m].
-        drift: Velocity of each marker at release [M, 3] m/s; at rest if None.
-        late: Standard deviation of the time at which all were seen [s].
 
     Returns:
         Root mean square distance from the stated places as it stands [m], and the readings: the best, and those that
@@ -150,10 +150,15 @@ def misreadings(
     if not len(seen):
         return 0.0, []
     there, known = first[seen], stated[seen]
-    moving = np.zeros_like(known) if drift is None else drift[seen]
     plain = _Option(axes=tuple(axes), signs=(1,) * len(axes), factor=1.0, shift="none", ordered=True)
     judge = _Judge(
-        there=there, known=known, drift=moving, late=late, axes=tuple(axes), box=np.array(box), tolerance=tolerance
+        there=there,
+        known=known,
+        velocity=velocity[seen],
+        clock=clock,
+        axes=tuple(axes),
+        box=np.array(box),
+        tolerance=tolerance,
     )
     asis, level = judge.reading(plain)
     if asis.away <= FITS * tolerance:
@@ -186,8 +191,8 @@ class _Judge:
 
     there: np.ndarray
     known: np.ndarray
-    drift: np.ndarray
-    late: float
+    velocity: np.ndarray
+    clock: float
     axes: tuple[int, ...]
     box: np.ndarray
     tolerance: float
@@ -230,11 +235,12 @@ class _Judge:
         order = np.arange(len(there))
         if not option.ordered:
             _, order = linear_sum_assignment(((there[:, None] - known) ** 2).sum(-1))
-        gap, way = there - known[order], (self.drift[:, axes] * signs)[order]
-        # All were seen at one time, by which what moves is farther along its way.
-        after = float((gap * way).sum() / ((way**2).sum() + (self.tolerance / self.late) ** 2)) if self.late else 0.0
-        apart = float(((gap - after * way) ** 2).sum())
-        off = apart + (self.tolerance * after / self.late) ** 2 if self.late else apart
+        gap, velocity = there - known[order], (self.velocity[:, axes] * signs)[order]
+        # One offset of the clock moves all markers along their velocities: the most probable one, and what it costs.
+        weight = (self.tolerance / self.clock) ** 2
+        offset = float((gap * velocity).sum() / ((velocity**2).sum() + weight))
+        apart = float(((gap - offset * velocity) ** 2).sum())
+        off = apart + weight * offset**2
         if shift is not None and np.abs(shift).max() > ROOM * self.reach:
             off = math.inf
         n, nu = there.size, FREEDOM

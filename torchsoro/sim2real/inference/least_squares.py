@@ -28,7 +28,7 @@ def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = Non
     Args:
         data: Recordings.
         found: A model after all of them.
-        kappa: See :func:`adjusted`.
+        kappa: See :func:`~torchsoro.sim2real.inference.evidence.adjusted`.
         but: Number of a trial that is left out.
     """
     near = found.near
