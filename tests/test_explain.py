@@ -188,7 +188,7 @@ def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
     name, values = leak.simpler(np.array([0.0, 0.02]))
     assert name == "pressure_lag" and values == pytest.approx([0.02])
     name, values = leak.simpler(np.array([0.1, 0.0]))
-    told = effect("pressure_loss").reported(values, None)
+    told = effect("pressure_loss").reported(values, None, None)
     assert name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
 
 

@@ -24,7 +24,7 @@ class Modulus(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.1, -12.0, 12.0),)
     starts = ((1.0,), (-1.0,), (2.5,), (-2.5,), (5.0,), (-5.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -44,7 +44,7 @@ class Viscoelastic(Hypothesis):
     )
     starts = tuple((g, tau) for g in (1.0, 4.0) for tau in (-6.5, -5.0, -3.5, -1.5))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The element, and its viscosity."""
         g, tau = float(values[0]), math.exp(values[1])
         nu = float(scenario.poisson_ratio.reshape(-1)[0])
@@ -98,7 +98,7 @@ class Density(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -115,10 +115,10 @@ class SoftSide(Hypothesis):
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The slopes, and what a soft half lacks that moves nearly the same: 1 - exp(-2/3 of the slope)."""
         lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
-        return {**super().reported(values, scenario), "fraction": (lost, "1")}
+        return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
 
     def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
         """Middle of the soft half."""

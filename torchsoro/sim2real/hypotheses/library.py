@@ -22,7 +22,7 @@ from torchsoro.sim2real.hypotheses.outer_effects import (
     GravityTilt,
     InitialMotion,
     InitialPose,
-    InitialSpin,
+    InitialRigidMotion,
     InitialTilt,
     Sliding,
     WallOffset,
@@ -43,6 +43,16 @@ def library() -> tuple[Hypothesis, ...]:
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag),
         *(PressureLag, PressureGain, Leak, OrificeLeak, AirStiffness, AirTwice),
-        *(Sliding, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt, InitialPose),
+        *(
+            Sliding,
+            Friction,
+            Adhesion,
+            WallOffset,
+            GravityTilt,
+            InitialMotion,
+            InitialRigidMotion,
+            InitialTilt,
+            InitialPose,
+        ),
     )
     return tuple(kind() for kind in kinds)
