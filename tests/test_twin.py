@@ -304,6 +304,17 @@ def test_speed_of_an_initial_motion_is_that_of_the_fastest_corner(trial):
     assert told["speed_m_s"][0] == pytest.approx(math.hypot(0.3, 2.0 * math.hypot(length, width) / 2))
 
 
+def test_a_soft_half_lacks_the_fraction_that_is_told(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    effect, scenario = next(e for e in library() if type(e).__name__ == "SoftHalf"), twin.scenario(trial)
+    values = np.array([0.0, 0.5, 0.0])
+    modulus = effect(scenario, torch.from_numpy(values)[None], twin).youngs_modulus[0].numpy()
+    side = (twin.positions.numpy() - trial.setup.center)[:, 1] / trial.setup.size[1]
+    ratio = modulus[side < -0.2].mean() / modulus[side > 0.2].mean()
+    assert 1 - ratio == pytest.approx(effect.reported(values, scenario, twin)["fraction"][0], rel=0.03)
+    assert effect.place(values, twin)[1] == pytest.approx(trial.setup.origin[1] + 0.25 * trial.setup.size[1])
+
+
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
 def test_sliding_distance_on_a_slope_matches_coulomb_friction(trial, tilt):
     """On a plane, level or not, which is the same to the block if gravity is as steep to it."""

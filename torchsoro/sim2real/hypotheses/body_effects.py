@@ -15,6 +15,8 @@ from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
+EDGE = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
+
 
 class Modulus(Hypothesis):
     """The solid is stiffer or softer than believed."""
@@ -136,6 +138,38 @@ class SoftSide(Hypothesis):
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
         xi = (twin.positions - low) / size - 0.5
         return scenario.replace(youngs_modulus=scenario.youngs_modulus * (values @ xi.T).exp())
+
+
+class SoftHalf(Hypothesis):
+    """Young's modulus is lower on one half of the body, along x, y and z."""
+
+    name, affected_quantity, model_form_deviation = "soft_side", "Young's modulus over the body", LAW
+    nonnegative = frozenset({"fraction"})
+    quantities = tuple(Quantity(f"contrast_{axis}", "between halves", 0.2, -10.0, 10.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """The contrasts, and what the soft half lacks of the other."""
+        lost = 1 - math.exp(-float(np.abs(values).max()))
+        return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
+
+    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
+        """Middle of the soft half."""
+        most = int(np.abs(values[:3]).argmax())
+        middle = np.array(twin.setup.center)
+        middle[most] -= np.sign(values[most]) * 0.25 * twin.setup.size[most]
+        return middle
+
+    def varies(self, values: np.ndarray) -> float:
+        """At the stiffest corner."""
+        return 0.5 * float(np.abs(values[:3]).sum())
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """E exp(a . tanh(xi / EDGE) / 2), xi from -1/2 to 1/2 over the body's box."""
+        low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
+        xi = (twin.positions - low) / size - 0.5
+        factor = (values @ (torch.tanh(xi / EDGE) / 2).T).exp()
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * factor)
 
 
 class PrintOffset(Hypothesis):

@@ -9,6 +9,7 @@ from torchsoro.sim2real.hypotheses.body_effects import (
     Modulus,
     PrintOffset,
     Softening,
+    SoftHalf,
     SoftSide,
     Stiffening,
     Tether,
@@ -40,7 +41,7 @@ from torchsoro.sim2real.hypotheses.supply_effects import (
 def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
-        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftHalf, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag),
         *(PressureLag, PressureGain, Leak, OrificeLeak, AirStiffness, AirTwice),
         *(
