@@ -36,8 +36,8 @@ class Sliding(Hypothesis):
 
     name, affected_quantity = "friction", "friction of the planes"
     ratios = frozenset({"coefficient"})
-    quantities = (Quantity("inverse_coefficient", "1", 1.0, 0.0, 50.0),)
-    starts = ((1.0,), (2.0,), (4.0,), (8.0,))
+    quantities = (Quantity("inverse_coefficient", "1", 0.1, 0.0, 500.0),)
+    starts = ((10.0,), (20.0,), (40.0,), (80.0,))
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The coefficient."""
