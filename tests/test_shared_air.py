@@ -1,4 +1,4 @@
-"""Solids of which a share is air of a chamber: gradients, both engines, and what is gas altogether as a special case."""
+"""Solids of which a share is air of a chamber: gradients, both engines, and gas as a special case."""
 
 from __future__ import annotations
 
