@@ -49,7 +49,7 @@ def fill_blended(
 
     Args:
         domain: Lattice.
-        gamma: Density of every particle [..., N], walls included and air excluded; differentiable.
+        gamma: Density of every particle [..., N], walls included; differentiable. Air ignores its own.
         membership: Shares of design, wall and air.
         solid: The printed material.
         gas: The chambers' gas.
@@ -67,7 +67,8 @@ def fill_blended(
     def number(value: Number) -> Tensor:
         return torch.as_tensor(value, **like)
 
-    void = void_share(gamma, *void_range)
+    # As of the regions, a density that is given for air does not count.
+    void = void_share(member.wall + member.design * member.designed(gamma), *void_range)
     matter = domain.volume * number(solid.density) * scale
     light = torch.as_tensor(gas.density, dtype=torch.float64).clamp(max=AIR).to(**like) * domain.volume
     laws = torch.stack([number(solid.linear_stiffening), number(solid.quadratic_stiffening)])

@@ -22,8 +22,10 @@ def chambers_of(s: Settings, center: tuple[float, float, float]) -> tuple[Chambe
     the air of the one, and their box is longer by two walls for each that is added. The lattice checks their places.
 
     Raises:
-        ValueError: for several chambers of a surface.
+        ValueError: for several chambers of a surface, and for chambers that are designed or whose place is given
+            together with what excludes that.
     """
+    _check(s)
     if s.chamber_mesh is not None:
         if s.chambers > 1:
             raise ValueError(f"chambers = {s.chambers}: wanted 1 with a chamber_mesh, which is a single chamber")
@@ -39,6 +41,23 @@ def chambers_of(s: Settings, center: tuple[float, float, float]) -> tuple[Chambe
         place = tuple(c + shift * (a == axis) for a, c in enumerate(center))
         made.append(Chamber(name=f"chamber {k + 1}", center=_triple(place), size=_triple(size), wall=s.wall))
     return _given(s, tuple(made))
+
+
+def _check(s: Settings) -> None:
+    """Refuse box chambers that are given beside a surface, and designed ones with what knows their place before."""
+    for name in ("chamber_centers", "chamber_sizes"):
+        if s.chamber_mesh is not None and getattr(s, name):
+            raise ValueError(f"{name} = {getattr(s, name)} with chamber_mesh = {s.chamber_mesh}: wanted one of them")
+    if not s.chamber_design:
+        return
+    designed = f"chamber_design = {s.chamber_design}"
+    for name, wanted in (("chamber_mesh", None), ("body_mesh", None), ("feature", 0.0), ("scenarios", 0)):
+        if (value := getattr(s, name)) != wanted:
+            raise ValueError(f"{designed} with {name} = {value}: wanted one of them left out")
+    if s.formulation != "total":
+        raise ValueError(
+            f"{designed} with formulation = {s.formulation!r}: wanted 'total', whose particles may be partly air"
+        )
 
 
 def _given(s: Settings, chambers: tuple[Chamber, ...]) -> tuple[Chamber, ...]:

@@ -310,29 +310,10 @@ class Settings:
                 raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers")
         for name in ("chamber_centers", "chamber_sizes"):
             values = getattr(self, name)
-            if values and (len(values) != self.chambers or self.chamber_mesh is not None):
-                raise ValueError(
-                    f"{name} = {values}: wanted one for each of the {self.chambers} chambers (chambers), and none with "
-                    "a chamber_mesh"
-                )
-        if self.chamber_design:
-            self._check_chamber_design()
+            if values and len(values) != self.chambers:
+                raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers (chambers)")
         if "phase" in self.timing and self.chambers == 1:
             raise ValueError(f"timing = {self.timing}: wanted no phase for a single chamber, which would only wait")
-
-    def _check_chamber_design(self) -> None:
-        """Refuse designed chambers with what has to know their place before."""
-        designed = f"chamber_design = {self.chamber_design}"
-        for name, wanted in (("chamber_mesh", None), ("body_mesh", None), ("feature", 0.0), ("scenarios", 0)):
-            if (value := getattr(self, name)) != wanted:
-                raise ValueError(f"{designed} with {name} = {value}: wanted one of them left out")
-        if self.formulation != "total":
-            raise ValueError(
-                f"{designed} with formulation = {self.formulation!r}: wanted 'total', whose particles may be partly air"
-            )
-        least, most = self.chamber_edges
-        if most and most < least:
-            raise ValueError(f"chamber_edges = {self.chamber_edges} m: wanted the least edge first, or 0 for no limit")
 
     def _check_units(self) -> None:
         """Refuse what is far from any elastomer and any slope that is walked on."""
