@@ -28,6 +28,7 @@ Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
 LARGEST_C = 0.25  # of any design
 WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
 KEPT = 8  # designs to step back to
+BESIDE = ("supply", "placement")  # what may be designed beside the field
 MOST_LOST = 9  # iterations in a row whose gradients are not finite
 
 
@@ -67,8 +68,8 @@ def simulate(
         with torch.no_grad():
             back = 0.5 if left > 1 else 1.0
             robot.field.phi.lerp_(good["phi"].to(robot.field.phi), back)
-            for part, module in beside(robot).items():
-                module.blend_(good[part], back)
+            for part in good.keys() & set(BESIDE):
+                getattr(robot, part).blend_(good[part], back)
         if left == 1:
             robot.field.beta = good["beta"]
     raise AssertionError
@@ -84,8 +85,8 @@ def design_of(robot: Robot) -> dict[str, Any]:
 
 def beside(robot: Robot) -> dict[str, Supply | Placement]:
     """What is designed beside the field, by name."""
-    found: dict[str, Supply | Placement] = {"supply": robot.supply} if robot.supply.designed() else {}
-    return found | ({} if robot.placement is None else {"placement": robot.placement})
+    modules: dict[str, Supply | Placement | None] = {part: getattr(robot, part) for part in BESIDE}
+    return {part: module for part, module in modules.items() if module is not None and module.designed()}
 
 
 def take_(robot: Robot, design: dict[str, Any]) -> None:
