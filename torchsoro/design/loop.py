@@ -85,8 +85,8 @@ def design_of(robot: Robot) -> dict[str, Any]:
 
 def beside(robot: Robot) -> dict[str, Supply | Placement]:
     """What is designed beside the field, by name."""
-    modules: dict[str, Supply | Placement | None] = {part: getattr(robot, part) for part in BESIDE}
-    return {part: module for part, module in modules.items() if module is not None and module.designed()}
+    found: dict[str, Supply | Placement] = {"supply": robot.supply} if robot.supply.designed() else {}
+    return found | ({} if robot.placement is None else {"placement": robot.placement})
 
 
 def take_(robot: Robot, design: dict[str, Any]) -> None:
@@ -148,6 +148,32 @@ def arc(robot: Robot, angle: torch.Tensor) -> torch.Tensor:
 def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Tensor:
     """What the feet lack of the share of the travel that they make of a robot that walks, with a margin [m]."""
     return torch.relu(margin * WALKS * travel - feet)
+
+
+def settle(robot: Robot, placement: Placement, gravity_scale: float) -> dict[str, float]:
+    """Round the chambers of a design to lattice planes for good, and simulate it before and after.
+
+    Args:
+        robot: The robot.
+        placement: Its chambers; changed.
+        gravity_scale: Share of gravity.
+
+    Returns:
+        Travel [m] and what is maximised (see :func:`worth_of`) before and after, by their tags; nothing if the
+        simulation breaks down.
+    """
+    found: dict[str, float] = {}
+    try:
+        for when in ("unrounded", "rounded"):
+            if when == "rounded":
+                placement.settle_()
+            with torch.no_grad():
+                outcome = robot(robot.density(), gravity_scale=gravity_scale)
+            found |= {f"chamber/L_{when}": float(outcome.travel), f"chamber/objective_{when}": worth_of(robot, outcome)}
+    except SimulationDiverged:
+        placement.settle_()
+        return {}
+    return found
 
 
 def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: Lagrangian) -> bool:
@@ -284,15 +310,14 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     """
     s, field, supply, others = robot.settings, robot.field, robot.supply, beside(robot)
     timing, placement = supply.designed(), robot.placement
-    placing = [] if placement is None else placement.designed()
-    spacing = robot.domain.spacing
+    spacing, chambers = robot.domain.spacing, [] if placement is None else placement.designed()
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
     def new_adam() -> torch.optim.Adam:
         groups: list[dict[str, Any]] = [{"params": list(field.parameters()), "lr": s.learning_rate}]
         groups += [{"params": timing, "lr": s.timing_rate}] if timing else []
-        return torch.optim.Adam(groups + ([{"params": placing, "lr": s.chamber_rate * spacing}] if placing else []))
+        return torch.optim.Adam(groups + ([{"params": chambers, "lr": s.chamber_rate * spacing}] if chambers else []))
 
     adam = new_adam()
     lagrangian = _schedule(s)
@@ -306,8 +331,16 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     with folder as run:
         if state := run.load():
             stopped, best, good = restore(state, robot, adam, lagrangian, run.path)
+        until = s.chamber_until or math.inf  # from where on the chambers stay
+        if placement is not None and run.start > until:
+            placement.settle_()
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
+            told = {}
+            if placement is not None and k == until:
+                told = settle(robot, placement, s.gravity_scale(k))
+                best = None  # earlier designs would change as they are rounded
+            placing = [] if placement is None else placement.designed()
             # Steps shrink as the projection sharpens, so that they change the density as before.
             field.beta = s.sharpness(k)
             if isinstance(lagrangian, ExactPenalty):
@@ -361,7 +394,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             timed |= {"grad_norm/supply": timing_norm} if timing else {}
             if placement is not None:
                 timed |= {f"chamber/{name}": value for name, value in placement.numbers().items()}
-                timed["grad_norm/chamber"] = placing_norm
+                timed |= {"grad_norm/chamber": placing_norm, **told}
             adam.step()
             field.clamp_()
             for module in others.values():
@@ -369,7 +402,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
-            stopped = lost > MOST_LOST or (event is not None and event.stop and s.gravity_scale(k) == 1.0)
+            whole = s.gravity_scale(k) == 1.0 and (until == math.inf or k >= until)
+            stopped = lost > MOST_LOST or (event is not None and event.stop and whole)
             center = outcome.center.detach()
             run.log(
                 k,

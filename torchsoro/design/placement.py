@@ -20,6 +20,7 @@ from torchsoro.design.domain import Chamber, Domain
 # of zero, as all particles are half a spacing from its faces; with two, a wall of one spacing is nowhere solid.
 TRANSITION = 1.5
 LEAST_CAVITY = 1.0  # edge of a cavity, in particle spacings: the layer of air that a lattice needs
+SETTLED = 0.5  # the same, in particle spacings, of chambers on lattice planes: any below 1 leaves shares of 0 and 1
 DESIGNED = ("place", "size")
 _AXES = ("x", "y", "z")
 _ROUNDING = 1e-9  # of a place in spacings, within which it lies half-way between two planes, or a size at its bound
@@ -276,6 +277,19 @@ class Placement(nn.Module):
             made.append(Chamber(name=one.name, center=(x, y, z), size=(a, b, c), wall=one.wall))
         return tuple(made)
 
+    @torch.no_grad()
+    def settle_(self) -> Placement:
+        """Round the chambers to lattice planes, in place and for good; return self.
+
+        Nothing is designed from then on, and the shares of the particles are those of the regions, 0 and 1.
+        """
+        chambers = self.rounded()
+        for name in ("center", "size"):
+            getattr(self, name).copy_(torch.tensor([getattr(one, name) for one in chambers], dtype=torch.float64))
+        self.width, self.fixed_volume = min(self.width, SETTLED * self.domain.spacing), False
+        self.requires_grad_(False)
+        return self
+
     def numbers(self) -> dict[str, float]:
         """Centre and outer edges of each chamber [m] as ``center_x_1``, ``size_x_1``, ...; ``volume`` of all [m3]."""
         with torch.no_grad():
@@ -286,7 +300,8 @@ class Placement(nn.Module):
     def blend_(self, other: Mapping[str, Tensor], share: float) -> None:
         """Move in place towards another state by a share of the way."""
         for name, one in self.named_parameters():
-            one.lerp_(other[name].to(one), share)
+            if one.requires_grad:
+                one.lerp_(other[name].to(one), share)
         self.clamp_()  # between two shapes of a volume that is fixed lies another volume
 
     def extra_repr(self) -> str:

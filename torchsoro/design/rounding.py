@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -12,7 +13,7 @@ from torchsoro.design.chambers import chamber_settings, with_chambers
 from torchsoro.design.loop import worth_of
 from torchsoro.design.placement import numbered
 from torchsoro.design.reading import CHAMBERS
-from torchsoro.design.robot import Outcome, Robot, build
+from torchsoro.design.robot import Robot, build
 from torchsoro.storage import atomic_write
 
 
@@ -46,33 +47,34 @@ def save_chambers(folder: Path, robot: Robot) -> None:
 
 
 @torch.no_grad()
-def changes(robot: Robot, sharp: Robot) -> dict[str, float]:
+def changes(robot: Robot, sharp: Robot, history: Mapping[str, Sequence[float]]) -> dict[str, float]:
     """Where the chambers of a design have ended, and what rounding them has changed.
 
     Args:
         robot: With the chambers as they were designed.
         sharp: See :func:`rounded`.
+        history: Metrics of the run, in which chambers may have been rounded on the way.
 
     Returns:
-        Centre and outer edges of each chamber [m] as ``center_x_1``, ``size_x_1``, ...; volume of all cavities before
-        and after [m3]; travel [m] before; what was maximised, in cells, before and after (see
-        :func:`torchsoro.design.loop.worth_of`).
+        Centre and outer edges of each chamber [m] as ``center_x_1``, ``size_x_1``, ..., and volume of all cavities
+        [m3]; travel [m] and what was maximised, in cells (see :func:`torchsoro.design.loop.worth_of`), before and after
+        they were rounded.
 
     Raises:
         SimulationDiverged: if the simulation of one of them breaks down.
     """
     assert robot.placement is not None
-    before: Outcome = robot(robot.density())
-    after: Outcome = sharp(sharp.density())
     chambers = sharp.domain.chambers
-    return {
+    found = {
         **numbered([one.center for one in chambers], [one.size for one in chambers]),
         "volume": sharp.domain.volume * float(sharp.domain.gas.sum()),
-        "volume_unrounded": float(robot.placement.volume().sum()),
-        "L_unrounded": float(before.travel),
-        "objective_unrounded": worth_of(robot, before),
-        "objective_rounded": worth_of(sharp, after),
     }
+    names = [f"{name}_{when}" for name in ("L", "objective") for when in ("unrounded", "rounded")]
+    if f"chamber/{names[0]}" in history:
+        return found | {name: [v for v in history[f"chamber/{name}"] if not math.isnan(v)][-1] for name in names}
+    before, after = robot(robot.density()), sharp(sharp.density())
+    values = float(before.travel), float(after.travel), worth_of(robot, before), worth_of(sharp, after)
+    return found | dict(zip(names, values, strict=True))
 
 
 def rounding_line(found: Mapping[str, float]) -> str:
@@ -85,8 +87,8 @@ def rounding_line(found: Mapping[str, float]) -> str:
     )
     return (
         f"chamber {', '.join(places)}, rounded to lattice planes: travel {1e3 * found['L_unrounded']:.2f} mm before, "
-        f"{1e3 * found['L']:.2f} mm now, objective {found['objective_unrounded']:.3f} cells before, "
-        f"{found['objective_rounded']:.3f} now\n"
+        f"{1e3 * found['L_rounded']:.2f} mm after, objective {found['objective_unrounded']:.3f} cells before, "
+        f"{found['objective_rounded']:.3f} after\n"
     )
 
 

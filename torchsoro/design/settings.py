@@ -90,6 +90,8 @@ class Settings:
     """Least and most outer edge of a designed chamber [m]; 0 for a layer of air in its wall, and for the body."""
     chamber_volume: Literal["free", "fixed"] = "free"
     """Whether designed chambers keep the volume of their air, all together."""
+    chamber_until: CountOrZero = 0
+    """Iteration from which designed chambers stay, on lattice planes, and the body goes on; 0: rounded at the end."""
     chamber_rate: Positive = 0.05
     """Learning rate of a designed chamber, in particle spacings."""
     body_mesh: Path | None = None

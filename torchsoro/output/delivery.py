@@ -93,7 +93,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         gamma = sharp.density().detach()
         save_chambers(s.out, sharp)
         save_design(s.out / "design.npz", sharp.domain, gamma, designed_supply(sharp))
-        more |= changes(robot, sharp)
+        more |= changes(robot, sharp, history)
         robot = sharp
     found = deliver(s.out, robot, gamma, history, name=name, chosen=optimized.iteration, more=more)
     print(report(found, s))
