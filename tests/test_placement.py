@@ -206,6 +206,21 @@ def test_faces_are_rounded_to_the_nearest_planes_and_half_way_inward():
     assert [s / H for s in found.size] == pytest.approx([6.0, 4.0, 4.0])
 
 
+def test_rounding_keeps_a_volume_that_is_fixed_as_nearly_as_planes_allow():
+    domain = body(((5, 4, 4), (6, 6, 6)))
+    placement = Placement(domain, symmetry=("y",), fixed_volume=True)
+    with torch.no_grad():
+        placement.center[0, 0] = 4.9 * H
+        placement.size.copy_(torch.tensor([[6.65, 5.75, 5.67]]) * H)
+    placement.clamp_()
+    (found,) = placement.rounded()
+    assert [s / H for s in found.size] == pytest.approx([6.0, 6.0, 6.0])  # the nearest planes would be 7, 6, 6
+    assert found.center[1] == pytest.approx(4 * H)
+    pair = moved(PAIR, 4, far=1.5, symmetry=("y",), axis="y", fixed_volume=True)
+    one, other = pair.rounded()
+    assert one.size == pytest.approx(other.size) and one.center[1] + other.center[1] == pytest.approx(8 * H)
+
+
 def test_what_a_placement_cannot_do_is_refused():
     with pytest.raises(ValueError, match=r"designed: got form, want some of place, size"):
         Placement(ONE, designed=("form",))

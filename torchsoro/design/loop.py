@@ -332,8 +332,6 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
         if state := run.load():
             stopped, best, good = restore(state, robot, adam, lagrangian, run.path)
         until = s.chamber_until or math.inf  # from where on the chambers stay
-        if placement is not None and run.start > until:
-            placement.settle_()
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             told = {}

@@ -7,6 +7,7 @@ narrow transition, the shares are 0 and 1: the regions of :class:`torchsoro.desi
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -128,6 +129,10 @@ class Placement(nn.Module):
         self.register_parameter("size", nn.Parameter(size, requires_grad="size" in designed))
         self.center: nn.Parameter
         self.size: nn.Parameter
+        # Whether the chambers stay on lattice planes; part of a checkpoint.
+        self.register_buffer("settled", torch.tensor(False))
+        self.settled: Tensor
+        self.register_load_state_dict_post_hook(_stay)
         self.volume_wanted = float((size - 2 * self.walls).prod(-1).sum())
 
     def _bounds(self, least: float | None, most: float | None, size: Tensor) -> tuple[Tensor, Tensor]:
@@ -168,7 +173,7 @@ class Placement(nn.Module):
     def boxes(self) -> tuple[Tensor, Tensor]:
         """Centres and outer edges [chambers, 3] m: the parameters, made symmetric and of a volume that is fixed."""
         center, size = self._symmetric(self.center, self.size)
-        if self.fixed_volume:
+        if self.fixed_volume and not self.settled:
             cavity = size - 2 * self.walls
             size = cavity * (self.volume_wanted / cavity.prod(-1).sum()) ** (1 / 3) + 2 * self.walls
         return center, size
@@ -190,10 +195,10 @@ class Placement(nn.Module):
 
     def _inside(self, center: Tensor, half: Tensor) -> Tensor:
         """Smooth indicator of boxes of these half edges [chambers, N]."""
-        along = []
+        along, width = [], min(self.width, SETTLED * self.domain.spacing) if self.settled else self.width
         for a, (first, n) in enumerate(zip(self.domain.origin, self.domain.shape, strict=True)):
             off = first + (torch.arange(n, dtype=torch.float64) + 0.5) * self.domain.spacing - center[:, a : a + 1]
-            steps = [_step((half[:, a : a + 1] + side * off) / self.width + 0.5) for side in (-1, 1)]
+            steps = [_step((half[:, a : a + 1] + side * off) / width + 0.5) for side in (-1, 1)]
             along.append(steps[0] * steps[1])
         return torch.einsum("ci,cj,ck->cijk", *along).flatten(1)
 
@@ -262,20 +267,56 @@ class Placement(nn.Module):
 
     @torch.no_grad()
     def rounded(self) -> tuple[Chamber, ...]:
-        """The chambers with every face on the nearest lattice plane; half-way, on the inner one if that leaves air."""
+        """The chambers with every face on the nearest lattice plane; half-way, on the inner one if that leaves air.
+
+        Where the volume is fixed, some faces go to the next plane inward instead, if that brings a cavity nearer to its
+        volume.
+        """
         h, origin = self.domain.spacing, torch.tensor(self.domain.origin, dtype=torch.float64)
         center, size = self.boxes()
         low, high = (center - size / 2 - origin) / h, (center + size / 2 - origin) / h
-        inner = torch.floor(low + 0.5 + _ROUNDING), torch.ceil(high - 0.5 - _ROUNDING)
-        hollow = inner[1] - inner[0] > 2 * self.walls / h + LEAST_CAVITY / 2
-        low, high = torch.where(hollow, inner[0], torch.floor(low)), torch.where(hollow, inner[1], torch.ceil(high))
+        first, last = torch.floor(low + 0.5 + _ROUNDING), torch.ceil(high - 0.5 - _ROUNDING)
+        hollow = last - first > 2 * self.walls / h + LEAST_CAVITY / 2
+        first, last = torch.where(hollow, first, torch.floor(low)), torch.where(hollow, last, torch.ceil(high))
+        planes, wanted = torch.stack([first, last], -1), torch.stack([low, high], -1)
+        if self.fixed_volume and not self.settled:
+            self._near_volume_(planes, wanted)
         made = []
-        for one, first, last in zip(self.domain.chambers, low, high, strict=True):
-            middle = origin + h * (first + last) / 2
-            x, y, z = middle.tolist()
-            a, b, c = (h * (last - first)).tolist()
+        for one, faces in zip(self.domain.chambers, planes, strict=True):
+            x, y, z = (origin + h * faces.mean(-1)).tolist()
+            a, b, c = (h * (faces[:, 1] - faces[:, 0])).tolist()
             made.append(Chamber(name=one.name, center=(x, y, z), size=(a, b, c), wall=one.wall))
         return tuple(made)
+
+    def _near_volume_(self, planes: Tensor, wanted: Tensor) -> None:
+        """Bring cavities nearer to their volumes by faces that go inward, in place; images stay images.
+
+        Args:
+            planes: Of the faces, in spacings [chambers, 3, 2].
+            wanted: The same of the chambers before they are rounded.
+        """
+        inward = torch.stack([torch.ceil(wanted[..., 0] - _ROUNDING), torch.floor(wanted[..., 1] + _ROUNDING)], -1)
+        walls = torch.round(2 * self.walls / self.domain.spacing)
+        volume = (wanted[..., 1] - wanted[..., 0] - walls).prod(-1)
+        for k, nearest in enumerate(planes.clone()):
+            other = next(((axis, images[k]) for axis, images in self.images if images[k] < k), None)
+            if other is not None:
+                axis, image = other
+                planes[k] = planes[image]
+                planes[k, axis] = self.domain.shape[axis] - planes[image, axis].flip(0)
+                continue
+            tied = [axis for axis, images in self.images if images[k] == k]
+            best = (math.inf, math.inf)
+            for chosen in itertools.product((False, True), repeat=6):
+                goes = torch.tensor(chosen).view(3, 2)
+                found = torch.where(goes, inward[k], nearest)
+                cavity = found[:, 1] - found[:, 0] - walls[k]
+                if bool((goes[tied, 0] != goes[tied, 1]).any()) or bool((cavity < LEAST_CAVITY).any()):
+                    continue
+                off = abs(float(cavity.prod() / volume[k]) - 1)
+                rank = (round(off, 9), float((found - wanted[k]).square().sum()))
+                if rank < best:
+                    best, planes[k] = rank, found
 
     @torch.no_grad()
     def settle_(self) -> Placement:
@@ -286,7 +327,7 @@ class Placement(nn.Module):
         chambers = self.rounded()
         for name in ("center", "size"):
             getattr(self, name).copy_(torch.tensor([getattr(one, name) for one in chambers], dtype=torch.float64))
-        self.width, self.fixed_volume = min(self.width, SETTLED * self.domain.spacing), False
+        self.settled.fill_(True)
         self.requires_grad_(False)
         return self
 
@@ -307,6 +348,12 @@ class Placement(nn.Module):
     def extra_repr(self) -> str:
         """Present values for ``print(placement)``."""
         return ", ".join(f"{name}={one.tolist()} m" for name, one in self.named_parameters())
+
+
+def _stay(placement: nn.Module, _: object) -> None:
+    """Chambers that have settled are not designed, either, once their state has been read."""
+    if placement.settled:
+        placement.requires_grad_(False)
 
 
 def numbered(center: Sequence[Sequence[float]], size: Sequence[Sequence[float]]) -> dict[str, float]:
