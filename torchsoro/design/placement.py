@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torchsoro.design.domain import Chamber, Domain
 
 # Width of the transition at a face, in particle spacings. With one or less, a chamber on lattice planes has a gradient
-# of zero, as all particles are half a spacing from its faces; with two, a wall of one spacing is nowhere solid.
+# of zero, as all particles are half a spacing from its faces; with two, walls of one spacing would take 7 % of one from
+# the air at each face, instead of 2 %.
 TRANSITION = 1.5
 LEAST_CAVITY = 1.0  # edge of a cavity, in particle spacings: the layer of air that a lattice needs
 SETTLED = 0.5  # the same, in particle spacings, of chambers on lattice planes: any below 1 leaves shares of 0 and 1
