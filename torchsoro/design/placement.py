@@ -21,8 +21,8 @@ from torchsoro.design.domain import Chamber, Domain
 # of zero, as all particles are half a spacing from its faces; with two, walls of one spacing would take 7 % of one from
 # the air at each face, instead of 2 %.
 TRANSITION = 1.5
+SETTLED = 0.5  # the same of chambers that stay on lattice planes: any up to 1 gives shares of 0 and 1
 LEAST_CAVITY = 1.0  # edge of a cavity, in particle spacings: the layer of air that a lattice needs
-SETTLED = 0.5  # the same, in particle spacings, of chambers on lattice planes: any below 1 leaves shares of 0 and 1
 DESIGNED = ("place", "size")
 _AXES = ("x", "y", "z")
 _ROUNDING = 1e-9  # of a place in spacings, within which it lies half-way between two planes, or a size at its bound
