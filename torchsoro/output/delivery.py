@@ -20,6 +20,7 @@ from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import intermediate_density, mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
 from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.rounding import changes, rounded, rounding_line, save_chambers
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
@@ -44,7 +45,9 @@ def design(robot: Robot, name: str) -> dict[str, float]:
 
     Returns:
         The final metrics (see :func:`show`), the iteration of the design, the number of iterations, and their time
-        [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
+        [s]: median of forward and backward, and in all; of chambers that are designed, which are then rounded to
+        lattice planes, what :func:`torchsoro.design.rounding.changes` says. Also written to ``result.json``, with null
+        for NaN.
 
     Raises:
         ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, if
@@ -84,7 +87,15 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         "seconds": sum(history["time/iteration"]),
         **(robot.supply.numbers() if designed_supply(robot) is not None else {}),
     }
-    found = deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration, more=more)
+    gamma = optimized.gamma
+    if robot.placement is not None:
+        sharp = rounded(robot)
+        gamma = sharp.density().detach()
+        save_chambers(s.out, sharp)
+        save_design(s.out / "design.npz", sharp.domain, gamma, designed_supply(sharp))
+        more |= changes(robot, sharp, history)
+        robot = sharp
+    found = deliver(s.out, robot, gamma, history, name=name, chosen=optimized.iteration, more=more)
     print(report(found, s))
     return found
 
@@ -93,7 +104,8 @@ def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -
     """Show the shape in TensorBoard, and keep the design, as often as the settings say."""
     if iteration % robot.settings.picture_every == 0:
         show_shape(run, robot, gamma, iteration)
-    if iteration % robot.settings.shape_every == 0:
+    # Other checks would take designs with other chambers than the delivered ones for bodies without walls.
+    if iteration % robot.settings.shape_every == 0 and robot.placement is None:
         save_design(run.path / "shapes" / f"{iteration:05d}.npz", robot.domain, gamma)
 
 
@@ -107,6 +119,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
+        f"{rounding_line(result)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -136,10 +149,11 @@ def numbers(found: Mapping[str, Any]) -> str:
 def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
     """Put the present shape into TensorBoard, as a picture and as a mesh."""
     density = gamma.detach().cpu().numpy()
-    vertices, faces = surface(robot.domain, density)
+    domain = robot.rounded_domain
+    vertices, faces = surface(domain, density)
     run.log_mesh("shape/mesh", vertices, faces, None, iteration)
     title = f"iteration {iteration}"
-    picture = shape_image(domain=robot.domain, gamma=density, planes=drawn_planes(robot), title=title)
+    picture = shape_image(domain=domain, gamma=density, planes=drawn_planes(robot), title=title)
     run.log_image("shape/picture", picture, iteration)
 
 

@@ -51,6 +51,7 @@ def _features(scene: Scene) -> int:
         layout.PUSHED_NODES: scene.node_share is not None,
         layout.HOLLOW: scene.lattice.walls is not None,
         layout.RECORDED: scene.only_markers and scene.markers is not None,
+        layout.SHARED_AIR: scene.shared,
     }
     return sum(feature for feature, on in there.items() if on)
 
