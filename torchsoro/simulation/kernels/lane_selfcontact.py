@@ -28,7 +28,7 @@ class SelfContact(NamedTuple):
         weight: Of these nodes.
         reference: Places of the points in the undeformed body, component by component for each.
         stiffness: Of each body, point and lane [N/m].
-        watched: 1 at the places of a component whose nodes move a point, else 0.
+        watched: By what share the way of the node at each place of a component counts, 0 where it moves no point.
         reach: Squared distance from which on nothing acts [m2].
         slack: Squared way [m2] that nodes may go before pairs are listed again.
         listed: Displacements of the nodes when they were listed.
@@ -201,7 +201,8 @@ def strayed(mesh, contact, g, i, d):
     """Whether nodes that move surface points have gone so far that pairs are to be listed again."""
     o = vector(contact.listed, 3 * g * mesh.component + i, mesh.component)
     way = d[0] - o[0], d[1] - o[1], d[2] - o[2]
-    return any_lane((load(contact.watched, i) > 0) & (dot(way, way) > contact.slack))
+    share = load(contact.watched, i)
+    return any_lane(share * share * dot(way, way) > contact.slack)
 
 
 @fast
@@ -212,95 +213,98 @@ def place_points(mesh, contact, states, g, state):
 
 
 @law
-def cell_of(contact, point, lane, width):
-    """Cell of the list in which a point is, and whether it is anywhere, and solid, in that lane."""
-    at = 48 * point + lane
-    x, y, z = contact.places[at] / width, contact.places[at + 16] / width, contact.places[at + 32] / width
-    there = abs(x) < FAR and abs(y) < FAR and abs(z) < FAR and contact.stiffness[16 * point + lane] > 0
-    if there:
-        return True, int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    return False, 0, 0, 0
-
-
-@law
 def bucket(x, y, z, size):
-    """Of so many, a power of two, the one of a cell."""
+    """Of so many buckets, a power of two, the one of a cell."""
     return (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
 
 
+@law
+def cell_of(here, at, width):
+    """Cell of a list in which a place is."""
+    return int(np.floor(here[at] / width)), int(np.floor(here[at + 1] / width)), int(np.floor(here[at + 2] / width))
+
+
 @fast
-def find_pairs(contact, g, lanes, width, apart, head, after, row):
-    """List the pairs of a body that are nearer than ``width`` [m] in one of so many lanes, by a cell list of each.
+def sort_points(contact, g, lane, width, size, begin, order, of, here):
+    """Sort the points of a body in one lane into buckets by their cell; those void, or that have diverged, into none.
 
     Args:
         contact: Whose ``places`` are those of all points.
         g: Number of the body.
-        lanes: That differ from each other.
-        width: Distance up to which pairs are listed, and edge of the cells [m].
+        lane: Number of the lane.
+        width: Edge of the cells [m].
+        size: Number of buckets, a power of two.
+        begin: Becomes where each bucket begins in ``order``, and the end of the last [size + 1].
+        order: Becomes the points, bucket by bucket in their order [count].
+        of: Room for the bucket of each point [count].
+        here: Becomes the places in this order, three numbers each.
+    """
+    begin[:] = 0
+    for p in range(contact.count):
+        at = g * contact.count + p
+        there = contact.stiffness[16 * at + lane] > 0
+        for c in range(3):
+            here[c] = contact.places[48 * at + 16 * c + lane]
+            there = there and abs(here[c]) < FAR * width
+        of[p] = -1
+        if there:
+            x, y, z = cell_of(here, 0, width)
+            of[p] = bucket(x, y, z, size)
+            begin[of[p]] += 1
+    for h in range(size):
+        begin[h + 1] += begin[h]
+    for back in range(contact.count):
+        p = contact.count - 1 - back
+        if of[p] >= 0:
+            begin[of[p]] -= 1
+            order[begin[of[p]]] = p
+    for s in range(begin[size]):
+        for c in range(3):
+            here[3 * s + c] = contact.places[48 * (g * contact.count + order[s]) + 16 * c + lane]
+
+
+@law
+def pairs_in(contact, s, first, last, square, apart, order, here, keys, n):
+    """Write down which of some sorted points are near one, and how many are written down then, or would be."""
+    i = order[s]
+    for q in range(first, last):
+        a, b, c = here[3 * s] - here[3 * q], here[3 * s + 1] - here[3 * q + 1], here[3 * s + 2] - here[3 * q + 2]
+        if a * a + b * b + c * c < square:
+            j, rest = order[q], 0.0
+            for k in range(3):
+                gap = contact.reference[3 * i + k] - contact.reference[3 * j + k]
+                rest += gap * gap
+            if rest > apart:
+                if n < len(keys):
+                    keys[n] = min(i, j) * contact.count + max(i, j)
+                n += 1
+    return n
+
+
+@fast
+def find_pairs(contact, width, apart, size, begin, order, here, keys):
+    """Find the pairs of sorted points that are nearer than the width of the cells.
+
+    Args:
+        contact: Whose points.
+        width: Of the cells [m].
         apart: Squared distance in the undeformed body above which two points may meet [m2].
-        head: Room for the first point in each bucket, a power of two for each lane.
-        after: Room for the next point of its bucket, by lane and point.
-        row: Room for two numbers by point.
+        size: Number of buckets.
+        begin: As of :func:`sort_points`.
+        order: Likewise.
+        here: Likewise.
+        keys: Becomes the pairs, first point times count plus second point; some may be there twice.
 
     Returns:
-        The number of pairs, which are listed if they are no more than ``capacity``.
+        The number of pairs, which are not all there if it is more than the length of ``keys``.
     """
-    count, size, total = contact.count, len(head) // 16, 0
-    base, begin = g * count, g * (count + 1)
-    head[:] = -1
-    seen, found = row[:count], row[count:]
-    for lane in range(lanes):
-        for back in range(count):
-            p = count - 1 - back
-            there, x, y, z = cell_of(contact, base + p, lane, width)
-            if there:
-                h = lane * size + bucket(x, y, z, size)
-                after[lane * count + p] = head[h]
-                head[h] = p
-    seen[:] = -1
-    for i in range(count):
-        contact.first[begin + i] = total
-        n = 0
-        for lane in range(lanes):
-            there, x, y, z = cell_of(contact, base + i, lane, width)
-            if there:
-                at = 48 * (base + i) + lane
-                for k in range(27):
-                    h = bucket(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1, size)
-                    j = head[lane * size + h]
-                    while j >= 0:
-                        if j > i and seen[j] != i:
-                            o = 48 * (base + j) + lane
-                            near, rest = 0.0, 0.0
-                            for c in range(3):
-                                way = contact.places[at + 16 * c] - contact.places[o + 16 * c]
-                                gap = contact.reference[3 * i + c] - contact.reference[3 * j + c]
-                                near, rest = near + way * way, rest + gap * gap
-                            if near < width * width and rest > apart:
-                                seen[j] = i
-                                found[n] = j
-                                n += 1
-                        j = after[lane * count + j]
-        if total + n <= contact.capacity:
-            into = g * contact.capacity + total
-            for k in range(n):  # into their order
-                at = into + k
-                while at > into and contact.other[at - 1] > found[k]:
-                    contact.other[at] = contact.other[at - 1]
-                    at -= 1
-                contact.other[at] = found[k]
-        total += n
-    contact.first[begin + count] = total
-    if total <= contact.capacity:
-        seen[:] = 0
-        for i in range(count):
-            for e in range(contact.first[begin + i], contact.first[begin + i + 1]):
-                seen[i] = 1
-                seen[contact.other[g * contact.capacity + e]] = 1
-        n = 0
-        for i in range(count):
-            if seen[i]:
-                contact.active[base + n] = i
-                n += 1
-        contact.actives[g] = n
-    return total
+    n, square = 0, width * width
+    for s in range(begin[size]):
+        x, y, z = cell_of(here, 3 * s, width)
+        own = bucket(x, y, z, size)
+        n = pairs_in(contact, s, s + 1, begin[own + 1], square, apart, order, here, keys, n)
+        for k in range(14, 27):  # those neighbours of the cell that do not have this one among theirs
+            h = bucket(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1, size)
+            if h != own:
+                n = pairs_in(contact, s, begin[h], begin[h + 1], square, apart, order, here, keys, n)
+    return n
