@@ -314,9 +314,8 @@ def check_self_contact(wanted: bool, formulation: Formulation) -> None:
         )
     if formulation.lattice is not None:
         raise ValueError("self_contact = True: beside Total(lattice=...), wanted particles on a uniform lattice")
-    if formulation.device is not None or not formulation.lanes:
-        given = "lanes=False" if formulation.device is None else f"device={formulation.device!r}"
-        raise ValueError(f"self_contact = True: beside Total({given}), wanted the lanes of a CPU")
+    if formulation.device is not None:
+        raise ValueError(f"self_contact = True: beside Total(device={formulation.device!r}), wanted it with the body")
 
 
 def _check_transfer(transfer: str) -> None:

@@ -68,8 +68,8 @@ class Simulator(nn.Module):
         safety: Share of the largest stable step that dt = "auto" takes.
         self_contact: Whether parts of a body repel each other, without friction, where they come nearer than one and a
             half particle spacings although they were more than three apart in the undeformed body. Stiffness is
-            Young's modulus times spacing, of the weaker of two particles; void has none. Of the total formulation, on a
-            CPU; parts of one body meet on the grid of the updated one without it.
+            Young's modulus times spacing, of the weaker of two particles; void has none. Of the total formulation; in the
+            updated one parts of a body meet on the grid.
 
     Raises:
         ValueError: for numbers that are not finite and positive, an empty box, an unknown formulation or transfer, or
@@ -186,8 +186,6 @@ class Simulator(nn.Module):
             self._check_inside(x)
         dt = self.step(body, prony, duration=duration, sample_every=sample_every, loads=loads)
         steps, every = _steps(duration, sample_every, dt)
-        if self.self_contact and not self.formulation.in_lanes(x):
-            raise ValueError(f"self_contact = True: a body on {x.device}, wanted one on the CPU")
         attached = attach(body, loads)
         self.formulation.check_loads(attached)
         body = attached.body

@@ -16,7 +16,6 @@ from torchsoro.simulation.kernels.lanes import any_lane, fast, law, load, part, 
 from torchsoro.simulation.kernels.laws_lanes import laws
 
 repulsion, repulsion_adjoint = laws.repulsion, laws.repulsion_adjoint
-FAR = 2.0**40  # cells of the list from the origin; what is farther has diverged
 
 
 class SelfContact(NamedTuple):
@@ -210,101 +209,3 @@ def place_points(mesh, contact, states, g, state):
     """Find where all points of a body are."""
     for p in range(contact.count):
         put_place(mesh, contact, g, p, states, state)
-
-
-@law
-def bucket(x, y, z, size):
-    """Of so many buckets, a power of two, the one of a cell."""
-    return (x * 73856093 ^ y * 19349663 ^ z * 83492791) & (size - 1)
-
-
-@law
-def cell_of(here, at, width):
-    """Cell of a list in which a place is."""
-    return int(np.floor(here[at] / width)), int(np.floor(here[at + 1] / width)), int(np.floor(here[at + 2] / width))
-
-
-@fast
-def sort_points(contact, g, lane, width, size, begin, order, of, here):
-    """Sort the points of a body in one lane into buckets by their cell; those void, or that have diverged, into none.
-
-    Args:
-        contact: Whose ``places`` are those of all points.
-        g: Number of the body.
-        lane: Number of the lane.
-        width: Edge of the cells [m].
-        size: Number of buckets, a power of two.
-        begin: Becomes where each bucket begins in ``order``, and the end of the last [size + 1].
-        order: Becomes the points, bucket by bucket in their order [count].
-        of: Room for the bucket of each point [count].
-        here: Becomes the places in this order, three numbers each.
-    """
-    begin[:] = 0
-    for p in range(contact.count):
-        at = g * contact.count + p
-        there = contact.stiffness[16 * at + lane] > 0
-        for c in range(3):
-            here[c] = contact.places[48 * at + 16 * c + lane]
-            there = there and abs(here[c]) < FAR * width
-        of[p] = -1
-        if there:
-            x, y, z = cell_of(here, 0, width)
-            of[p] = bucket(x, y, z, size)
-            begin[of[p]] += 1
-    for h in range(size):
-        begin[h + 1] += begin[h]
-    for back in range(contact.count):
-        p = contact.count - 1 - back
-        if of[p] >= 0:
-            begin[of[p]] -= 1
-            order[begin[of[p]]] = p
-    for s in range(begin[size]):
-        for c in range(3):
-            here[3 * s + c] = contact.places[48 * (g * contact.count + order[s]) + 16 * c + lane]
-
-
-@law
-def pairs_in(contact, s, first, last, square, apart, order, here, keys, n):
-    """Write down which of some sorted points are near one, and how many are written down then, or would be."""
-    i = order[s]
-    for q in range(first, last):
-        a, b, c = here[3 * s] - here[3 * q], here[3 * s + 1] - here[3 * q + 1], here[3 * s + 2] - here[3 * q + 2]
-        if a * a + b * b + c * c < square:
-            j, rest = order[q], 0.0
-            for k in range(3):
-                gap = contact.reference[3 * i + k] - contact.reference[3 * j + k]
-                rest += gap * gap
-            if rest > apart:
-                if n < len(keys):
-                    keys[n] = min(i, j) * contact.count + max(i, j)
-                n += 1
-    return n
-
-
-@fast
-def find_pairs(contact, width, apart, size, begin, order, here, keys):
-    """Find the pairs of sorted points that are nearer than the width of the cells.
-
-    Args:
-        contact: Whose points.
-        width: Of the cells [m].
-        apart: Squared distance in the undeformed body above which two points may meet [m2].
-        size: Number of buckets.
-        begin: As of :func:`sort_points`.
-        order: Likewise.
-        here: Likewise.
-        keys: Becomes the pairs, first point times count plus second point; some may be there twice.
-
-    Returns:
-        The number of pairs, which are not all there if it is more than the length of ``keys``.
-    """
-    n, square = 0, width * width
-    for s in range(begin[size]):
-        x, y, z = cell_of(here, 3 * s, width)
-        own = bucket(x, y, z, size)
-        n = pairs_in(contact, s, s + 1, begin[own + 1], square, apart, order, here, keys, n)
-        for k in range(14, 27):  # those neighbours of the cell that do not have this one among theirs
-            h = bucket(x + k // 9 - 1, y + k // 3 % 3 - 1, z + k % 3 - 1, size)
-            if h != own:
-                n = pairs_in(contact, s, begin[h], begin[h + 1], square, apart, order, here, keys, n)
-    return n

@@ -30,11 +30,12 @@ from torchsoro.simulation.ops.lane_gradients import (
     node_shares,
     signs,
 )
+from torchsoro.simulation.ops.lane_selfcontact import fresh_contact, list_pairs, surface_contact
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
-from torchsoro.simulation.ops.selfcontact import Surface, fresh_contact, list_pairs, surface_contact
+from torchsoro.simulation.ops.selfcontact import Surface
 from torchsoro.simulation.threads import thread_count
 
 _ROOM = 2**22  # numbers of samples that are observed at a time
@@ -283,7 +284,9 @@ class LaneIntegrator:
 
     def _listed(self, work: Work, state: int) -> Work:
         """With the pairs in contact in a state that begins at a place."""
-        return work._replace(contact=list_pairs(work.contact, self.lanes, self.scene.cell / 2, work.states, state))
+        spacing = self.scene.cell / 2
+        contact = list_pairs(self.surface, work.contact, self.lanes, spacing, work.states, state)
+        return work._replace(contact=contact)
 
     def _check(self, step: int, state: Tensor) -> None:
         """Raise ``SimulationDiverged`` if a state is not finite or outside of the box."""

@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.kernels.lane_selfcontact import SelfContact, find_pairs, place_points, sort_points
-from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.kernels.pairs import find_pairs, sort_points
 from torchsoro.simulation.ops.axis_sums import PARTICLES
-from torchsoro.simulation.ops.lanes import Lanes
 from torchsoro.simulation.ops.scene import Scene
 
 # In spacings of the particles. Parts that just touch have their outermost particles one spacing apart, where a pressure
@@ -80,6 +78,36 @@ class Surface:
         found[:, layout.VOID_FRACTION, at] = -spacing * 9 * bulk * shear / whole * bar
         return found
 
+    def watched(self, spacing: float) -> tuple[np.ndarray, float]:
+        """By what share the way of each node counts for listing pairs anew, and the way that calls for it [m]."""
+        node, weight = self.nodes.numpy(), self.weights.numpy()
+        most = np.zeros(int(node.max(initial=-1)) + 1)
+        np.maximum.at(most, node, weight)
+        shares = most / np.maximum(most, LIGHT)
+        reserve = (weight / shares[node]).sum(1).max(initial=1.0)
+        return shares, _ROUNDING * SKIN / 2 / float(reserve) * spacing
+
+    def pairs(self, places: np.ndarray, solid: np.ndarray, spacing: float) -> np.ndarray:
+        """Which points are near each other in one simulation though they were apart in the undeformed body.
+
+        Args:
+            places: Of the points [P, 3] m.
+            solid: Which are not void, bool [P].
+            spacing: Of the particles [m].
+
+        Returns:
+            int64 [pairs], first point times P plus second point; in any order, some perhaps twice.
+        """
+        count, width = len(solid), (REACH + SKIN) * spacing
+        size = 2 ** math.ceil(math.log2(2 * count))
+        begin, order, of = (np.empty(n, np.int64) for n in (size + 1, count, count))
+        here, keys = np.empty(3 * count, places.dtype), np.empty(count, np.int64)
+        sort_points(places.reshape(-1), solid, width, begin, order, of, here)
+        flat, apart = self.places.numpy().reshape(-1), (APART * spacing) ** 2
+        while (found := find_pairs(flat, width, apart, begin, order, here, keys)) > len(keys):
+            keys = np.empty(found, np.int64)
+        return keys[:found]
+
     def _moduli(self, coefficients: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         rows = coefficients.detach()[:, :, self.points.to(coefficients.device)]
         return rows[:, layout.BULK], rows[:, layout.SHEAR], 1 - rows[:, layout.VOID_FRACTION]
@@ -88,100 +116,3 @@ class Surface:
 def _positive(x: Tensor) -> Tensor:
     """Where it is zero, one: of a point without moduli."""
     return torch.where(x > 0, x, torch.ones_like(x))
-
-
-def surface_contact(scene: Scene, coefficients: Tensor, lanes: Lanes) -> tuple[Surface | None, SelfContact]:
-    """What the lanes' kernels know of contact of a body with itself; no points where it is off."""
-    surface = Surface.of(scene, coefficients) if scene.self_contact else None
-    mesh, groups, spacing = lanes.mesh, lanes.groups, scene.cell / 2
-    real = {torch.float32: np.float32, torch.float64: np.float64}[coefficients.dtype]
-    count = 0 if surface is None else len(surface.points)
-    reserve = 1.0
-    stiffness, watched = np.zeros(LANES, real), np.zeros(LANES, real)
-    node, weight, places = np.zeros(0, np.int64), np.zeros(0, real), np.zeros(0, real)
-    if surface is not None:
-        node = lanes.nodes[surface.nodes].numpy().reshape(-1)
-        weight, places = (t.numpy().astype(real).reshape(-1) for t in (surface.weights, surface.places))
-        wide = lanes.from_batch(surface.stiffness(coefficients, spacing))
-        stiffness = np.zeros(max(wide.numel(), LANES), real)
-        stiffness[: wide.numel()] = wide.numpy().reshape(-1)
-        watched = np.zeros(mesh.component, real)
-        most = np.zeros(mesh.component)
-        np.maximum.at(most, node, weight)
-        shares = most / np.maximum(most, LIGHT)
-        for lane in range(mesh.unit):
-            watched[lane:] += shares[: mesh.component - lane]
-        if count:
-            reserve = float((weight / shares[node]).reshape(count, 27).sum(1).max())
-    return surface, SelfContact(
-        count=count,
-        node=node,
-        weight=weight,
-        reference=places,
-        stiffness=stiffness,
-        watched=watched,
-        reach=(REACH * spacing) ** 2,
-        slack=(_ROUNDING * SKIN / 2 / reserve * spacing) ** 2,
-        **_room(groups, 0, 0, real),
-        moved=np.zeros(0, np.int64),
-    )
-
-
-def _room(groups: int, count: int, component: int, real: type) -> dict[str, np.ndarray | int]:
-    """What kernels write to, and the pairs."""
-    wide = ("places", "pushes", "pulled")
-    return {
-        "listed": np.zeros(3 * groups * component, real),
-        "first": np.zeros(groups * (count + 1), np.int64),
-        "other": np.zeros(0, np.int64),
-        "capacity": 0,
-        "active": np.zeros(groups * count, np.int64),
-        "actives": np.zeros(groups, np.int64),
-        **{name: np.zeros(groups * count * 3 * LANES, real) for name in wide},
-        "nodal": np.zeros(3 * groups * component, real),
-        "stiffness_bar": np.zeros(groups * count * LANES, real),
-    }
-
-
-def fresh_contact(contact: SelfContact, lanes: Lanes, threads: int) -> SelfContact:
-    """The same points without pairs, for so many threads, with room of its own."""
-    room = _room(lanes.groups, contact.count, lanes.mesh.component if contact.count else 0, contact.weight.dtype.type)
-    return contact._replace(**room, moved=np.zeros(8 * threads, np.int64))
-
-
-def list_pairs(contact: SelfContact, lanes: Lanes, spacing: float, states: np.ndarray, begin: int) -> SelfContact:
-    """Find the pairs of all bodies, whose displacements begin at a place of the kernels' states."""
-    if not contact.count:
-        return contact
-    mesh, groups, count = lanes.mesh, lanes.groups, contact.count
-    moved = states[begin : begin + groups * 6 * mesh.component].reshape(groups, 6, mesh.component)
-    contact.listed[:] = moved[:, :3].reshape(-1)
-    contact.nodal[:] = 0
-    contact.moved[:] = 0
-    found = []
-    for g in range(groups):
-        place_points(mesh, contact, states, g, begin + g * 6 * mesh.component)
-        different = min(LANES, lanes.batch - LANES * g) if lanes.variations else 1
-        found.append(np.unique(np.concatenate([_pairs(contact, g, lane, spacing) for lane in range(different)])))
-    capacity = max(contact.capacity, *(len(keys) for keys in found))
-    other = np.zeros((groups, capacity), np.int64)
-    for g, keys in enumerate(found):
-        first, second = np.divmod(keys, count)
-        other[g, : len(keys)] = second
-        contact.first[g * (count + 1) : (g + 1) * (count + 1)] = np.searchsorted(first, np.arange(count + 1))
-        active = np.unique(np.concatenate([first, second]))
-        contact.active[g * count : g * count + len(active)] = active
-        contact.actives[g] = len(active)
-    return contact._replace(other=other.reshape(-1), capacity=capacity)
-
-
-def _pairs(contact: SelfContact, g: int, lane: int, spacing: float) -> np.ndarray:
-    """Pairs of a body in one lane, as numbers in any order."""
-    width, apart = (REACH + SKIN) * spacing, (APART * spacing) ** 2
-    size = 2 ** math.ceil(math.log2(2 * contact.count))
-    begin, order, of = (np.empty(n, np.int64) for n in (size + 1, contact.count, contact.count))
-    here, keys = np.empty(3 * contact.count, contact.weight.dtype), np.empty(contact.count, np.int64)
-    sort_points(contact, g, lane, width, size, begin, order, of, here)
-    while (count := find_pairs(contact, width, apart, size, begin, order, here, keys)) > len(keys):
-        keys = np.empty(count, np.int64)
-    return keys[:count]
