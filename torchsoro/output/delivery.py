@@ -16,6 +16,7 @@ import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
 from torchsoro.design.density import thickened
+from torchsoro.design.domain import Region
 from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import intermediate_density, mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
@@ -32,7 +33,12 @@ from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
+from torchsoro.simulation.selfcontact import overlapping
+from torchsoro.simulation.trajectory import Trajectory
 from torchsoro.storage import atomic_write
+
+HALF = 0.5  # density above which a particle counts as solid, as in the printed part
+FOLDS = 24  # samples of a motion that are searched for folds, a tenth of a second for each at the paper's size
 
 
 def design(robot: Robot, name: str) -> dict[str, float]:
@@ -107,6 +113,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
+        f"{folding_line(result, settings)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -245,9 +252,10 @@ def show(
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
-        whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
-        [rad], thinnest wall and gap of the part [m] (NaN if there is none), of one whose walls were to be mended what
-        :func:`told_of` says, ``more``; and the printable part. All but C are those of the part with its walls mended.
+        whether it is met, mass [kg], how many particles lie in another part of the body at the worst (``folded``), of a
+        turner its angles to the left, and to the right with the supply mirrored [rad], thinnest wall and gap of the
+        part [m] (NaN if there is none), of one whose walls were to be mended what :func:`told_of` says, ``more``; and
+        the printable part. All but C are those of the part with its walls mended.
 
     Raises:
         ValueError: if the design has no connected body to print; all but the part is written before.
@@ -271,6 +279,7 @@ def show(
         # Rounding differs between the run's device and this one.
         "C_within_limit": bool(intermediate <= s.c_max * (1 + 1e-4)),
         "mass": float(outcome.mass),
+        "folded": folded(robot, density, trajectory),
     }
     if s.robot == "turner":
         with progress_bar(f"simulating {name}, supply mirrored") as progress:
@@ -386,6 +395,31 @@ def told_of(part: Part, plain: Outcome) -> dict[str, float]:
         "mended_share": done.share,
         "L_before": float(plain.travel),
     }
+
+
+def folded(robot: Robot, density: np.ndarray, trajectory: Trajectory) -> int:
+    """How many solid particles of a motion lie in another part of the body, at the worst of up to 24 samples.
+
+    Args:
+        robot: The robot.
+        density: Of the design [N].
+        trajectory: Its motion, of all particles.
+    """
+    domain = robot.domain
+    solid = torch.from_numpy(density > HALF) & (domain.region != Region.GAS)
+    count = len(trajectory.time)
+    some = torch.linspace(0, count - 1, min(count, FOLDS)).round().long()
+    places = trajectory.position[some.to(trajectory.position.device)].cpu()
+    return int(overlapping(places, domain.positions.to(places), solid, spacing=domain.spacing).sum(-1).max())
+
+
+def folding_line(found: Mapping[str, Any], settings: Settings) -> str:
+    """That the body has folded into itself, in a line; empty where it has not."""
+    count = int(found.get("folded") or 0)
+    if not count:
+        return ""
+    remedy = "" if settings.self_contact else "; --self-contact keeps them apart"
+    return f"the body folds into itself: {count} particles lie in another part of it at the worst{remedy}\n"
 
 
 def mending_line(found: Mapping[str, Any]) -> str:

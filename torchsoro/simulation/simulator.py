@@ -68,8 +68,8 @@ class Simulator(nn.Module):
         safety: Share of the largest stable step that dt = "auto" takes.
         self_contact: Whether parts of a body repel each other, without friction, where they come nearer than one and a
             half particle spacings although they were more than three apart in the undeformed body. Stiffness is
-            Young's modulus times spacing, of the weaker of two particles; void has none. Of the total formulation; in the
-            updated one parts of a body meet on the grid.
+            Young's modulus times spacing, of the weaker of two particles; void has none. Of the total formulation; in
+            the updated one parts of a body meet on the grid.
 
     Raises:
         ValueError: for numbers that are not finite and positive, an empty box, an unknown formulation or transfer, or

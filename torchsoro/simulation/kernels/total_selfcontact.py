@@ -1,4 +1,4 @@
-"""Contact of a body with itself in the total-Lagrangian form: the counterpart of ``lane_selfcontact``, with the same law.
+"""Contact of a body with itself in the total-Lagrangian form: the counterpart of ``lane_selfcontact``, by the same law.
 
 Every point sums over the points near it, and every node over the points that it moves, each in a fixed order.
 """
@@ -81,7 +81,8 @@ def contact_forces(
         b, p = w // points, w % points
         if first[w] < first[w + 1]:
             at = (slot * batch + b) * length
-            store_vector(places, 3 * w, 1, load_vector(reference, 3 * p, 1) + of_point(node, weight, state, at, nodes, p))
+            x = load_vector(reference, 3 * p, 1) + of_point(node, weight, state, at, nodes, p)
+            store_vector(places, 3 * w, 1, x)
     for w in range(batch * points):
         b = w // points
         force = load_vector(places, 3 * w, 1) * 0
@@ -150,7 +151,8 @@ def contact_adjoint(
         b, p = w // points, w % points
         if first[w] < first[w + 1]:
             at = (slot * batch + b) * length
-            store_vector(places, 3 * w, 1, load_vector(reference, 3 * p, 1) + of_point(node, weight, state, at, nodes, p))
+            x = load_vector(reference, 3 * p, 1) + of_point(node, weight, state, at, nodes, p)
+            store_vector(places, 3 * w, 1, x)
             store_vector(pulled, 3 * w, 1, of_point(node, weight, back, 3 * b * nodes, nodes, p))
     for w in range(batch * points):
         b = w // points

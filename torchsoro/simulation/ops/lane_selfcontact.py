@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -49,7 +51,7 @@ def surface_contact(scene: Scene, coefficients: Tensor, lanes: Lanes) -> tuple[S
     )
 
 
-def _room(groups: int, count: int, component: int, real: type) -> dict[str, np.ndarray | int]:
+def _room(groups: int, count: int, component: int, real: type) -> dict[str, Any]:
     """What kernels write to, and the pairs."""
     wide = ("places", "pushes", "pulled")
     return {
@@ -91,10 +93,8 @@ def list_pairs(
     for g in range(groups):
         place_points(mesh, contact, states, g, begin + g * 6 * mesh.component)
         different = min(LANES, lanes.batch - LANES * g) if lanes.variations else 1
-        keys = [
-            surface.pairs(*(np.ascontiguousarray(a[g, ..., lane]) for a in (places, solid)), spacing)
-            for lane in range(different)
-        ]
+        rows = ((places[g, ..., lane], solid[g, ..., lane]) for lane in range(different))
+        keys = [surface.pairs(np.ascontiguousarray(x), np.ascontiguousarray(there), spacing) for x, there in rows]
         found.append(np.unique(np.concatenate(keys)))
     capacity = max(contact.capacity, *(len(keys) for keys in found))
     other = np.zeros((groups, capacity), np.int64)

@@ -15,16 +15,16 @@ from torchsoro.simulation.ops.axis_sums import PARTICLES
 from torchsoro.simulation.ops.scene import Scene
 
 # In spacings of the particles. Parts that just touch have their outermost particles one spacing apart, where a pressure
-# of a quarter of Young's modulus acts (``laws.repulsion``); it begins at REACH, beyond which particles of one surface,
-# whose squares have diagonals of 1.41, cannot slip between those of another. Nearer than APART in the undeformed body,
+# of a third of Young's modulus acts (``laws.repulsion``). It begins at REACH, so that particles of one surface do not
+# slip between those of another, whose squares have diagonals of 1.41. Nearer than APART in the undeformed body,
 # particles belong to one part, as in ``simulation.selfcontact``: compressed to half they do not meet.
 REACH, APART = 1.5, 3.0
-# Pairs are listed up to so many spacings beyond the reach: again as soon as a node has gone half of that, which is
-# every tenth of a second or so of a walker's gait. A larger one lists more pairs, a smaller one lists more often.
+# Pairs are listed up to so many spacings beyond the reach, and again as soon as a node has gone half of that. The time
+# for listing goes with (REACH + SKIN)^3 / SKIN, which is least at 0.75, and not a tenth more from 0.5 to 1.1.
 SKIN = 0.5
-# Largest weight of a node in any point below which its way counts in proportion: nodes that carry a corner of the matter
-# (weights of 3e-5 to 6e-3) swing by a spacing at a hundred times the speed of the body, and hardly move a point. That
-# all ways count for less costs the others a tenth of theirs, which is found point by point.
+# Weight below which the way of a node counts in proportion to its largest weight in any point: nodes that carry a
+# corner of the matter (3e-5 to 6e-3) swing by a spacing at a hundred times the speed of the body, and hardly move a
+# point. All may go less far for it, by what is found point by point: two thirds of SKIN / 2 in the archived walker.
 LIGHT = 0.05
 _ROUNDING = 0.99  # of the way that nodes may go, so that no pair is missed by a rounding
 
