@@ -54,9 +54,9 @@ class TotalSelfContact:
         self.watched, self.listed = watched.to(states), states.new_zeros(batch * 3 * nodes)
         self.places, self.pushes, self.pulled = (states.new_zeros(3 * batch * points + 3) for _ in range(3))
         self.stiffness_bar = states.new_zeros(batch * points)
-        self.strayed = integers(torch.ones(1))
+        self.strayed = integers(torch.zeros(1))
         self.scratch, self.offset, self.back = scratch, offset, back
-        self.pairs, self.capacity = 0, 0
+        self.pairs, self.capacity, self.known = 0, 0, False
         self._check = capture(
             *(kernels.stray, 0, batch, nodes, length, self.strayed),
             *(self.numbers[2], self.watched, self.listed, self.states.view(-1)),
@@ -67,9 +67,9 @@ class TotalSelfContact:
         if not self.sizes[3]:
             return
         slot = t % len(self.states)
-        if int(self.strayed) == 0:
+        if self.known:
             self._check(1, slot)
-        if int(self.strayed):
+        if not self.known or int(self.strayed):  # for which the host waits
             self._list(self.states[slot])
         if self.pairs:
             self._launch(1, slot)
@@ -80,10 +80,10 @@ class TotalSelfContact:
         d = state[:, : 3 * nodes]
         self.listed.copy_(d.reshape(-1))
         self.strayed.zero_()
-        if self.pairs or not self.capacity:
+        if self.pairs or not self.known:
             self.scratch[self.offset : self.offset + 3 * batch * nodes] = 0
         first, other = self._pairs(d.reshape(batch, 3, nodes).cpu())
-        self.pairs = len(other)
+        self.pairs, self.known = len(other), True
         self.first.copy_(torch.from_numpy(first))
         if self.pairs > self.capacity:
             self.capacity = 2 * self.pairs
