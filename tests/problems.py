@@ -172,7 +172,7 @@ def problem(
         kind[absent] = layout.ABSENT
     else:
         x = x + 0.05 * randn(*x.shape)
-    coefficients = rand(batch, layout.COEFFICIENTS, count) + 0.5
+    coefficients = torch.nn.functional.pad(rand(batch, layout.AIR_SHARE, count) + 0.5, (0, 0, 0, 2))
     coefficients[:, layout.VISCOSITY] *= 0.05
     coefficients[:, layout.VOLUME_VISCOSITY] *= 0.05
     coefficients[:, layout.ANCHOR : layout.ANCHOR + 3] = x.transpose(1, 2) + 0.1
@@ -229,6 +229,21 @@ def problem(
         lanes=lanes,
     )
     return Problem(scene=scene, tensors={name: t.to(dtype) for name, t in tensors.items()}, samples=samples)
+
+
+def with_shared_air(p: Problem) -> Problem:
+    """A problem of the total-Lagrangian form whose chambers are shares of solids, one of them zero; changed."""
+    g = torch.Generator().manual_seed(11)
+    kind = p.scene.kind
+    # The last of them has no air.
+    air, coefficients = torch.cat([(kind >= 0).nonzero(), (kind == -1).nonzero()[-1:]])[:, 0], p.tensors["coefficients"]
+    coefficients[:, layout.VOID_FRACTION, air[:3]] = torch.tensor([1.0, 0.4, 0.0]).to(coefficients)
+    share = 0.2 + 0.8 * torch.rand(len(coefficients), len(air), generator=g, dtype=torch.float64)
+    share[:, -1] = 0
+    coefficients[:, layout.AIR_SHARE, air] = share.to(coefficients)
+    coefficients[:, layout.AIR_STIFFNESS, air] = 1 - 0.5 * share.to(coefficients)
+    p.scene = replace(p.scene, kind=kind.index_copy(0, air, layout.ENCLOSES - kind[air].clamp(min=0)))
+    return p
 
 
 def walls_around(lattice: Lattice, low: tuple[int, int, int], high: tuple[int, int, int]) -> Walls:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from ringing import bar, effect
 
-from torchsoro.sim2real.data.schema import ChamberTable, PlaneTable
+from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.hypotheses.outer_effects import Friction, WallOffset
 from torchsoro.sim2real.inference import likelihood
@@ -114,17 +114,13 @@ def on_a_plane(made):
     return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
 
 
-def test_a_body_with_a_chamber_that_meets_a_plane_walks_however_noisy_its_recording(on_a_plane):
-    problem = on_a_plane
-    chamber = ChamberTable(name="c", box=((0.01, 0.0, 0.0), (0.02, 0.005, 0.005)))
-    setup = dataclasses.replace(problem.experiment.setup, chambers=(chamber,))
-    hollow = dataclasses.replace(problem, experiment=dataclasses.replace(problem.experiment, setup=setup))
-    known = DiscretizationError(chance=1e-5)
-    quiet, loud = (hollow.only(hollow.trials, discretization=known, noise=n) for n in (1e-6, 1e-3))
-    assert quiet.rough and not loud.rough and quiet.walks and loud.walks
-    assert not problem.walks and not hollow.only(hollow.trials, fine=None).walks
-    free = dataclasses.replace(setup, planes=())
-    assert not hollow.only([dataclasses.replace(t, setup=free) for t in hollow.trials]).walks
+def test_a_body_that_meets_a_plane_is_searched_by_the_finer_twin_however_noisy_its_recording(on_a_plane):
+    problem, known = on_a_plane, DiscretizationError(chance=1e-5)
+    quiet, loud = (problem.only(problem.trials, discretization=known, noise=n) for n in (1e-6, 1e-3))
+    assert quiet.rough and not loud.rough and quiet.searched_finely and loud.searched_finely
+    assert not problem.only(problem.trials, fine=None).searched_finely
+    free = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=())) for t in problem.trials]
+    assert not problem.only(free).searched_finely
 
 
 def with_planes_moved(problem, fit):

@@ -23,7 +23,8 @@ from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noi
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, finer
-from torchsoro.sim2real.inference.search import FIRST, _by_finer, _null_starts, _simpler, spread
+from torchsoro.sim2real.inference.search import _by_finer, _simpler
+from torchsoro.sim2real.inference.starts import FIRST, null_starts, spread
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
 from torchsoro.sim2real.report.words import digits
@@ -188,7 +189,7 @@ def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
     name, values = leak.simpler(np.array([0.0, 0.02]))
     assert name == "pressure_lag" and values == pytest.approx([0.02])
     name, values = leak.simpler(np.array([0.1, 0.0]))
-    told = effect("pressure_loss").reported(values, None)
+    told = effect("pressure_loss").reported(values, None, None)
     assert name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
 
 
@@ -314,7 +315,7 @@ def test_planes_of_one_trial_alone_are_touched(made):
 def test_the_null_model_of_a_body_on_a_plane_begins_where_what_is_stated_leaves_least(made):
     twin, record = made
     experiment = record("modulus", (-0.06,))
-    starts = _null_starts(FitProblem(experiment, twin, noise=5e-5))
+    starts = null_starts(FitProblem(experiment, twin, noise=5e-5))
     assert len(starts) == FIRST and all(not effects and np.abs(at).max() <= 1 for effects, at in starts)
     # Tolerance of ln of the modulus: 0.1. Of sixteen even places the two nearest are within an eighth of it.
     assert [float(at[0]) for _, at in starts] == pytest.approx([-0.6, -0.6], abs=0.13)
@@ -326,9 +327,20 @@ def test_the_finer_twin_finds_from_evenly_spread_points_what_its_own_recordings_
     problem = FitProblem(record("drag", (800.0,), by=fine), twin, fine=fine, noise=5e-5)
     (null_model,) = problem.fit([((), None)])
     assert null_model is not None
-    nothing, found = _by_finer(problem, [effect("drag")], null_model, lambda line: None)
+    nothing, found = _by_finer(problem, [effect("drag")], null_model, [], lambda line: None)
     assert found[0].name == "drag" and found[0].chi2 < 0.1 * min(f.chi2 for f in nothing)
     assert found[0].values[0] == pytest.approx([800.0], rel=0.1)
+
+
+def test_components_that_add_up_are_told_by_the_finer_twin_from_afar(made):
+    twin, record = made
+    fine = finer(twin, 1, 5.0)
+    tilt = (0.0, 12 * 0.03)  # twelve times what is noticeable, six times the farthest point that is screened
+    problem = FitProblem(record("gravity_tilt", tilt, by=fine), twin, fine=fine, noise=5e-5)
+    (null_model,) = problem.fit([((), None)])
+    assert null_model is not None
+    _, found = _by_finer(problem, [effect("gravity_tilt")], null_model, [], lambda line: None)
+    assert found[0].values[0] == pytest.approx(tilt, abs=0.03)
 
 
 @pytest.mark.parametrize("one", library(), ids=lambda e: type(e).__name__)

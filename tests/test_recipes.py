@@ -265,6 +265,9 @@ class Shaky(torch.nn.Module):
         self.falls, self.breaks = falls, breaks
         self.tried: list[float] = []
 
+    def density(self) -> torch.Tensor:
+        return self.field()
+
     def forward(self, gamma: torch.Tensor, *, gravity_scale: float) -> SimpleNamespace:
         assert gravity_scale == 0.5
         self.tried.append(gamma.max().item())

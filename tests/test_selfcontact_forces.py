@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsoro import Body, Simulator, Solid, Trajectory, fill, ground
 from torchsoro.design.robot import build
 from torchsoro.design.settings import Settings
-from torchsoro.output.delivery import folded, folding_line
+from torchsoro.output.folding import folded, folding_line
 from torchsoro.simulation.formulation import Total
 from torchsoro.simulation.laws import repulsion
 from torchsoro.simulation.ops import selfcontact
@@ -353,6 +353,9 @@ def test_a_robot_is_designed_with_contact_alone_and_in_scenarios():
     outcome = robot(gamma)
     outcome.travel.backward()
     assert gamma.grad is not None and bool(torch.isfinite(gamma.grad).all()) and bool(gamma.grad.any())
+    placed = build(dataclasses.replace(TINY, self_contact=True, chamber_design=("place",)))
+    travel = placed(gamma.detach()).travel
+    assert bool(torch.isfinite(travel))
     several = build(dataclasses.replace(TINY, self_contact=True, scenarios=3))
     batch = several.settings.distribution.sample(3, 0)
     together = several(gamma.detach(), scenarios=batch)

@@ -43,6 +43,8 @@ def changed(name: str, held: Any, kind: Any) -> tuple[str, ...]:
     special |= {"scenarios": "4"}
     several = {"sharpen": ("10", "20"), "amplitudes": ("0.5", "1"), "phases": ("0", "0.5"), "duties": ("0.4", "0.5")}
     several |= {"friction_range": ("0.2", "0.8"), "timing": ("phase", "duty"), "slopes": ("0", "0.1")}
+    several |= {"chamber_design": ("place", "size"), "chamber_centers": ("0", "0", "0.0175") * 2}
+    several |= {"chamber_sizes": ("0.0175", "0.0175", "0.0175") * 2}
     if name in several:
         return several[name]
     if name in special:
@@ -70,6 +72,7 @@ def test_every_setting_can_be_overridden():
         seen = getattr(chosen, name)
         assert seen != getattr(paper, name), name
         seen = seen if isinstance(seen, tuple) else (seen,)
+        seen = sum(seen, ()) if seen and isinstance(seen[0], tuple) else seen
         assert not values or seen == tuple(type(one)(value) for one, value in zip(seen, values, strict=True)), name
 
 

@@ -284,13 +284,35 @@ def test_velocity_of_a_free_body_in_a_fluid_matches_quadratic_drag(trial):
     assert way < 0.049
 
 
-def test_initial_motion_effect_equals_a_spin_stated_in_the_setup(trial):
+def test_initial_motion_of_a_free_body_equals_a_velocity_and_spin_stated_in_the_setup(trial):
     t = changed(trial, clamps=(), velocity=(0.0, 0.0, 0.0), duration=0.05)
-    effect = next(e for e in library() if type(e).__name__ == "InitialSpin")
+    effect = next(e for e in library() if type(e).__name__ == "InitialRigidMotion")
     twin = Twin(t.setup, edge=EDGE)
-    spun = effect(twin.scenario(t), torch.tensor([[0.0, 20.0, 5.0]], dtype=torch.float64), twin)
-    found = simulate(twin, [spun])[0].alone()
-    np.testing.assert_allclose(found.position, run(changed(t, angular_velocity=(0.0, 20.0, 5.0))).position, atol=1e-6)
+    given = np.array([0.1, -0.2, 0.0, 0.0, 20.0, 5.0])
+    moved = effect(twin.scenario(t), torch.from_numpy(given)[None], twin)
+    found = simulate(twin, [moved])[0].alone()
+    stated = changed(t, velocity=tuple(given[:3]), angular_velocity=tuple(given[3:]))
+    np.testing.assert_allclose(found.position, run(stated).position, atol=1e-6)
+
+
+def test_speed_of_an_initial_motion_is_that_of_the_fastest_corner(trial):
+    twin = Twin(changed(trial, clamps=()).setup, edge=EDGE)
+    effect = next(e for e in library() if type(e).__name__ == "InitialRigidMotion")
+    length, width, _ = trial.setup.size
+    told = effect.reported(np.array([0.0, 0.0, 0.3, 0.0, 0.0, 2.0]), twin.scenario(trial), twin)
+    # A turn about z and a velocity along it are at right angles.
+    assert told["speed_m_s"][0] == pytest.approx(math.hypot(0.3, 2.0 * math.hypot(length, width) / 2))
+
+
+def test_a_soft_half_lacks_the_fraction_that_is_told(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    effect, scenario = next(e for e in library() if type(e).__name__ == "SoftHalf"), twin.scenario(trial)
+    values = np.array([0.0, 0.5, 0.0])
+    modulus = effect(scenario, torch.from_numpy(values)[None], twin).youngs_modulus[0].numpy()
+    side = (twin.positions.numpy() - trial.setup.center)[:, 1] / trial.setup.size[1]
+    ratio = modulus[side < -0.2].mean() / modulus[side > 0.2].mean()
+    assert 1 - ratio == pytest.approx(effect.reported(values, scenario, twin)["fraction"][0], rel=0.03)
+    assert effect.place(values, twin)[1] == pytest.approx(trial.setup.origin[1] + 0.25 * trial.setup.size[1])
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])
@@ -340,7 +362,9 @@ def test_adhesion_acts_within_its_reach_only(trial, gap, speed, expected):
     twin = Twin(t.setup, edge=EDGE)
     effect = next(e for e in library() if e.name == "adhesion")
     values = torch.tensor([[traction, math.log(reach)]], dtype=torch.float64)
-    assert effect.reported(values[0].numpy(), twin.scenario(t))["energy_j_m2"][0] == pytest.approx(traction * reach)
+    assert effect.reported(values[0].numpy(), twin.scenario(t), twin)["energy_j_m2"][0] == pytest.approx(
+        traction * reach
+    )
     motion = simulate(twin, [effect(twin.scenario(t), values, twin)])[0].alone()
     last = 2 if expected < 0 else -1  # before it meets the plane
     assert motion.velocity[last, :, 2].mean() == pytest.approx(expected, rel=0.1, abs=2e-3)
@@ -358,7 +382,7 @@ def test_chamber_volume_grows_with_pressure_and_less_with_air_stiffness(trial):
     assert twice.applies(believed, twin) and not twice.applies(twin.scenario(t), twin)
     without = twice(believed, torch.tensor([[-1.0]], dtype=torch.float64), twin)
     assert not without.air_stiffness.any()
-    assert twice.reported(np.array([-1.0]), believed)["air_stiffness_pa"][0] == -2e4
+    assert twice.reported(np.array([-1.0]), believed, twin)["air_stiffness_pa"][0] == -2e4
     # Pressure acts from inside: the forces on the whole body add up to nothing.
     free = run(changed(t, t.pressure, clamps=(), duration=0.05))
     assert abs((free.position[-1] - free.position[0]).mean(0)[0]) < 2e-4
@@ -404,7 +428,7 @@ def test_a_diverged_variation_is_not_sound_and_leaves_others_unchanged(trial):
 
 @pytest.mark.parametrize("effect", library(), ids=lambda e: type(e).__name__)
 def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwise(trial, effect):
-    free = type(effect).__name__ in ("InitialTilt", "InitialSpin")
+    free = type(effect).__name__ in ("InitialTilt", "InitialRigidMotion")
     load = ForceTable(box=((0.03, 0.0, 0.0), (0.04, 0.02, 0.02)), force=(0.0, 0.0, -0.1))
     stick = "stick" if type(effect).__name__ == "Sliding" else 0.4
     t = hollow(
@@ -418,7 +442,7 @@ def test_every_effect_is_neutral_at_zero_strength_and_changes_the_motion_otherwi
     scenario = twin.scenario(t)
     if type(effect).__name__ == "AirTwice":
         scenario = scenario.replace(air_stiffness=torch.tensor([2e4], dtype=torch.float64))
-    assert effect.applies(scenario, twin) and len(effect.quantities) <= 3
+    assert effect.applies(scenario, twin) and len(effect.quantities) <= 6
     count = len(effect.quantities)
     zero = torch.zeros(1, count, dtype=torch.float64)
     some = torch.tensor(effect.probe_points(twin)[-1][:1, :count]) * torch.tensor([q.scale for q in effect.quantities])

@@ -13,7 +13,8 @@ from ringing import effect
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict, predictions
-from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, _unconstrained, distinct, running
+from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, distinct, running
+from torchsoro.sim2real.inference.starts import unconstrained
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import weighed
 from torchsoro.sim2real.report import sentences
@@ -58,8 +59,8 @@ def explanation(verdict):
 
 def test_modulus_beyond_its_tolerance_is_fitted_without_its_prior(still):
     problem, null_model = still
-    assert not _unconstrained(problem, library(), null_model)
-    ((chosen, begin),) = _unconstrained(problem, library(), dataclasses.replace(null_model, point=np.array([3.5])))
+    assert not unconstrained(problem, library(), null_model)
+    ((chosen, begin),) = unconstrained(problem, library(), dataclasses.replace(null_model, point=np.array([3.5])))
     assert [e.name for e in chosen] == ["modulus"]
     assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
 

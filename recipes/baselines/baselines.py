@@ -33,7 +33,7 @@ from torchsoro.sim2real.inference.heldout import predict
 from torchsoro.sim2real.inference.histories import Lines, simulate
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects
 from torchsoro.sim2real.inference.model import write_model
-from torchsoro.sim2real.inference.search import correlation
+from torchsoro.sim2real.inference.starts import correlation
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options as ExplainOptions

@@ -21,7 +21,7 @@ from torchsoro.command_line import Count, options, program, progress_bar
 from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import build
 from torchsoro.output import archive
-from torchsoro.output.delivery import folded
+from torchsoro.output.folding import folded
 
 
 @options

@@ -98,7 +98,7 @@ def fill(
         gamma = gamma.masked_fill(domain.outside.to(gamma.device), 0.0)
     scale = simp(gamma, epsilon=epsilon, power=power)
     zero = torch.zeros((), **like)
-    void = None if void_range is None else torch.where(air, zero, _void(gamma, *void_range))
+    void = None if void_range is None else torch.where(air, zero, void_share(gamma, *void_range))
 
     def number(value: Number) -> Tensor:
         return torch.as_tensor(value, **like)
@@ -134,6 +134,8 @@ def without_void(body: Body) -> tuple[Body, Tensor]:
     if body.void_fraction is None:
         return body, torch.ones_like(body.chamber, dtype=torch.bool)
     keep = body.void_fraction < 1
+    if body.air_share is not None:
+        keep = keep | (body.air_share > 0)
     return part(body, keep), keep
 
 
@@ -143,7 +145,7 @@ def part(body: Body, keep: Tensor) -> Body:
     return replace(body, **given)
 
 
-def _void(gamma: Tensor, low: Number, high: Number) -> Tensor:
-    """Smooth step from 1 at the lower density to 0 at the upper."""
+def void_share(gamma: Tensor, low: Number, high: Number) -> Tensor:
+    """Share of the law of void at a density: a smooth step from 1 at the lower density to 0 at the upper."""
     x = ((gamma - low) / (high - low)).clamp(0, 1)
     return 1 - x * x * (3 - 2 * x)

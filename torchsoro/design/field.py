@@ -102,7 +102,9 @@ class DesignField(nn.Module):
         frozen = torch.where(domain.lattice(domain.wall), 1.0, -1.0).double()
         self.register_buffer("_frozen", frozen, persistent=False)
 
-    def forward(self, phi: Tensor | None = None, *, threshold: float = 0.0) -> Tensor:
+    def forward(
+        self, phi: Tensor | None = None, *, threshold: float = 0.0, shares: tuple[Tensor, Tensor] | None = None
+    ) -> Tensor:
         """Return the density of every particle.
 
         Args:
@@ -110,6 +112,9 @@ class DesignField(nn.Module):
                 network of the particle positions.
             threshold: Value of phi~ between void and solid, in (-1, 1). Above 0 the design is eroded, below dilated;
                 see :func:`torchsoro.design.features.threshold_of`.
+            shares: Of each particle, what part is designed and what part is wall [N] each, instead of the domain's
+                regions. The filter then weighs by the first, and the density is that of the design times the first,
+                plus the second.
 
         Returns:
             Density gamma in [0, 1], [N], in the type of the design variable.
@@ -122,12 +127,16 @@ class DesignField(nn.Module):
         phi = self._checked(phi)
         # What phi~ = -1 and 1 come to is mapped to 0 and 1.
         low, high = (math.tanh(self.beta * (1.0 + side * threshold)) for side in (1.0, -1.0))
-        smooth = self._smooth(phi, beyond=threshold > 0)
+        design, wall = (None, None) if shares is None else map(self._on_lattice, shares)
+        smooth = self._smooth(phi, beyond=threshold > 0, design=design)
         pushed = torch.tanh(self.beta * (smooth - threshold)) + 0.5 * (low - high)
         gamma = 0.5 * (pushed / (0.5 * (low + high)) + 1.0)
         # Vectorised tanh may round two mirror images differently.
         gamma = _clip(self._mirror(gamma), 0.0, 1.0)
-        gamma = torch.where(self._design, gamma, 0.5 * (self._frozen + 1.0))
+        if design is None or wall is None:
+            gamma = torch.where(self._design, gamma, 0.5 * (self._frozen + 1.0))
+        else:
+            gamma = _clip(self._mirror(design * gamma + wall), 0.0, 1.0)
         return gamma.flatten().to(phi.dtype)
 
     def filtered(self, phi: Tensor | None = None) -> Tensor:
@@ -163,11 +172,21 @@ class DesignField(nn.Module):
             )
         return phi
 
-    def _smooth(self, phi: Tensor, beyond: bool = False) -> Tensor:
-        """Mirror mean and filter on the lattice, with void beyond the body or not, in the type of the kernel."""
-        values = self._mirror(phi.to(self._kernel.dtype)) * self._design
+    def _on_lattice(self, share: Tensor) -> Tensor:
+        """A share of each particle as a volume, in the type and on the device of the kernel."""
+        return self.domain.lattice(share).to(self._kernel)
+
+    def _smooth(self, phi: Tensor, beyond: bool = False, design: Tensor | None = None) -> Tensor:
+        """Mirror mean and filter on the lattice, with void beyond the body or not, in the type of the kernel.
+
+        The filter weighs by the designed shares of the particles, ``design``, instead of the domain's region if given.
+        """
+        weight, total = self._design, self._weight_sum
+        if design is not None:  # what is not designed at all has no density that counts
+            weight, total = design, torch.where(design > 0, _Convolution.apply(design, self._kernel), 1.0)
+        values = self._mirror(phi.to(self._kernel.dtype)) * weight
         void = self._beyond if beyond else 0.0
-        smooth = (_Convolution.apply(values, self._kernel) - void) / (self._weight_sum + void)
+        smooth = (_Convolution.apply(values, self._kernel) - void) / (total + void)
         # The sums of the filter are rounded in an order that has no mirror symmetry; this mean has.
         return _clip(self._mirror(smooth), -1.0, 1.0)
 

@@ -14,9 +14,11 @@ import torch
 
 from torchsoro.design.ensemble import MOST, VARIANTS, Ensemble, fallen, overall, shares
 from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
+from torchsoro.design.placement import Placement
 from torchsoro.design.processes import Processes
 from torchsoro.design.robot import Outcome, Robot
 from torchsoro.design.settings import Settings
+from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 
@@ -26,6 +28,7 @@ Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
 LARGEST_C = 0.25  # of any design
 WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
 KEPT = 8  # designs to step back to
+BESIDE = ("supply", "placement")  # what may be designed beside the field
 MOST_LOST = 9  # iterations in a row whose gradients are not finite
 
 
@@ -38,7 +41,7 @@ def simulate(
     steps back still falls, that is what is returned.
 
     Args:
-        robot: Its field, and a timing that is designed, are changed where it has to step back.
+        robot: Its field, and what else is designed, are changed where it has to step back.
         good: Of that design (see :func:`design_of`).
         gravity_scale: Share of gravity.
         ensemble: Of the run's scenarios, if it has any.
@@ -51,7 +54,7 @@ def simulate(
         SimulationDiverged: if half and a quarter of the way, and the last good design, break down as well.
     """
     for left in (3, 2, 1, 0):
-        gamma = robot.field()
+        gamma = robot.density()
         try:
             if ensemble is None:
                 outcome = robot(gamma, gravity_scale=gravity_scale)
@@ -65,19 +68,34 @@ def simulate(
         with torch.no_grad():
             back = 0.5 if left > 1 else 1.0
             robot.field.phi.lerp_(good["phi"].to(robot.field.phi), back)
-            if "supply" in good:
-                robot.supply.blend_(good["supply"], back)
+            for part in good.keys() & set(BESIDE):
+                getattr(robot, part).blend_(good[part], back)
         if left == 1:
             robot.field.beta = good["beta"]
     raise AssertionError
 
 
 def design_of(robot: Robot) -> dict[str, Any]:
-    """A copy of the present design: design variable ``phi``, sharpness ``beta``, and ``supply`` if that is designed."""
+    """A copy of the present design: ``phi`` and ``beta`` of the field, ``supply`` and ``placement`` if designed."""
     held: dict[str, Any] = {"phi": robot.field.phi.detach().clone(), "beta": robot.field.beta}
-    if robot.supply.designed():
-        held["supply"] = {name: one.detach().clone() for name, one in robot.supply.state_dict().items()}
+    for part, module in beside(robot).items():
+        held[part] = {name: one.detach().clone() for name, one in module.state_dict().items()}
     return held
+
+
+def beside(robot: Robot) -> dict[str, Supply | Placement]:
+    """What is designed beside the field, by name."""
+    found: dict[str, Supply | Placement] = {"supply": robot.supply} if robot.supply.designed() else {}
+    return found | ({} if robot.placement is None else {"placement": robot.placement})
+
+
+def take_(robot: Robot, design: dict[str, Any]) -> None:
+    """Give a robot the design that :func:`design_of` has copied."""
+    with torch.no_grad():
+        robot.field.phi.copy_(design["phi"])
+    robot.field.beta = design["beta"]
+    for part, module in beside(robot).items():
+        module.load_state_dict(design[part])
 
 
 def fell(robot: Robot, outcome: Outcome) -> bool:
@@ -132,6 +150,32 @@ def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Te
     return torch.relu(margin * WALKS * travel - feet)
 
 
+def settle(robot: Robot, placement: Placement, gravity_scale: float) -> dict[str, float]:
+    """Round the chambers of a design to lattice planes for good, and simulate it before and after.
+
+    Args:
+        robot: The robot.
+        placement: Its chambers; changed.
+        gravity_scale: Share of gravity.
+
+    Returns:
+        Travel [m] and what is maximised (see :func:`worth_of`) before and after, by their tags; nothing if the
+        simulation breaks down.
+    """
+    found: dict[str, float] = {}
+    try:
+        for when in ("unrounded", "rounded"):
+            if when == "rounded":
+                placement.settle_()
+            with torch.no_grad():
+                outcome = robot(robot.density(), gravity_scale=gravity_scale)
+            found |= {f"chamber/L_{when}": float(outcome.travel), f"chamber/objective_{when}": worth_of(robot, outcome)}
+    except SimulationDiverged:
+        placement.settle_()
+        return {}
+    return found
+
+
 def better(worth: float, violation: float, best: dict[str, Any] | None, lagrangian: Lagrangian) -> bool:
     """Whether a design is better than the best so far: one within the limit, of such the one that goes farther.
 
@@ -172,11 +216,11 @@ def restore(
     lagrangian: Lagrangian,
     path: Path,
 ) -> tuple[bool, dict[str, Any] | None, list[dict[str, Any]]]:
-    """Put a checkpoint's state into field, designed timing, optimizer and schedule.
+    """Put a checkpoint's state into field, what is designed beside it, optimizer and schedule.
 
     Args:
         state: As saved by :func:`optimize`.
-        robot: Whose field and supply are designed.
+        robot: Whose field, and maybe supply and chambers, are designed.
         adam: The optimizer of their parameters.
         lagrangian: The schedule.
         path: Folder of the run, for messages.
@@ -188,28 +232,29 @@ def restore(
         ValueError: if a part is missing, or of another shape than the lattice.
     """
     where = f"path: {path / 'checkpoint.pt'}"
-    field, timing = robot.field, robot.supply.designed()
-    wanted = ("field", "adam", "lagrangian", "stopped", "best", "good", *(["supply"] if timing else []))
+    field, others = robot.field, beside(robot)
+    numbers = [one for module in others.values() for one in module.designed()]
+    wanted = ("field", "adam", "lagrangian", "stopped", "best", "good", *others)
     if missing := [name for name in wanted if name not in state]:
         raise ValueError(f"{where} lacks {', '.join(missing)}, wanted the state of a design run; start another folder")
     try:
         moments = [
             (value, wanted)
-            for own, wanted in zip(state["adam"]["state"].values(), (field.phi, *timing), strict=False)
+            for own, wanted in zip(state["adam"]["state"].values(), (field.phi, *numbers), strict=False)
             for value in own.values()
             if value.ndim
         ]
         best = state["best"]
         designs = [one for one in (state["field"], *state["good"], best) if one is not None]
         pairs = [(one["phi"], field.phi) for one in designs] + moments
-        if timing:
-            supplies = [state["supply"], *(one["supply"] for one in designs[1:])]
-            pairs += [(one[name], own) for one in supplies for name, own in robot.supply.named_parameters()]
+        for part, module in others.items():
+            parts = [state[part], *(one[part] for one in designs[1:])]
+            pairs += [(one[name], own) for one in parts for name, own in module.named_parameters()]
         if wrong := [(tuple(one.shape), tuple(own.shape)) for one, own in pairs if one.shape != own.shape]:
             raise ValueError(f"a design of shape {wrong[0][0]}, wanted {wrong[0][1]}")
         field.load_state_dict(state["field"])
-        if timing:
-            robot.supply.load_state_dict(state["supply"])
+        for part, module in others.items():
+            module.load_state_dict(state[part])
         adam.load_state_dict(state["adam"])
         lagrangian.load_state_dict(state["lagrangian"])
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
@@ -263,14 +308,16 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
         SimulationDiverged: if the simulation breaks down on a design and on those nearer to the last good one, or if
             gradients overflow again and again and no design is within the limit on C.
     """
-    s, field, supply = robot.settings, robot.field, robot.supply
-    timing = supply.designed()
+    s, field, supply, others = robot.settings, robot.field, robot.supply, beside(robot)
+    timing, placement = supply.designed(), robot.placement
+    spacing, chambers = robot.domain.spacing, [] if placement is None else placement.designed()
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
     def new_adam() -> torch.optim.Adam:
         groups: list[dict[str, Any]] = [{"params": list(field.parameters()), "lr": s.learning_rate}]
-        return torch.optim.Adam(groups + ([{"params": timing, "lr": s.timing_rate}] if timing else []))
+        groups += [{"params": timing, "lr": s.timing_rate}] if timing else []
+        return torch.optim.Adam(groups + ([{"params": chambers, "lr": s.chamber_rate * spacing}] if chambers else []))
 
     adam = new_adam()
     lagrangian = _schedule(s)
@@ -284,8 +331,14 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     with folder as run:
         if state := run.load():
             stopped, best, good = restore(state, robot, adam, lagrangian, run.path)
+        until = s.chamber_until or math.inf  # from where on the chambers stay
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
+            told = {}
+            if placement is not None and k == until:
+                told = settle(robot, placement, s.gravity_scale(k))
+                best = None  # earlier designs would change as they are rounded
+            placing = [] if placement is None else placement.designed()
             # Steps shrink as the projection sharpens, so that they change the density as before.
             field.beta = s.sharpness(k)
             if isinstance(lagrangian, ExactPenalty):
@@ -298,7 +351,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             loss = lagrangian(goal.detach(), violation)
             middle = time.perf_counter()
             # Only the gradient of the motion is clipped: beside that of a rough one the price of C would vanish.
-            (price,) = torch.autograd.grad(loss, field.phi, retain_graph=True)
+            price, *prices = torch.autograd.grad(loss, (field.phi, *placing), retain_graph=True)
             adam.zero_grad()
             if ensemble is None:
                 (-goal).backward()
@@ -308,8 +361,10 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
             # By itself: a designed timing's few numbers have far larger gradients than each of the field's many.
             timing_norm = torch.nn.utils.clip_grad_norm_(timing, s.clip or math.inf)
+            # By one spacing, as a limit by one metre would be some hundreds of times as tight.
+            placing_norm = spacing * torch.nn.utils.clip_grad_norm_(placing, (s.clip or math.inf) / spacing)
             design = design_of(robot)
-            if norm.isfinite() and timing_norm.isfinite():
+            if norm.isfinite() and timing_norm.isfinite() and placing_norm.isfinite():
                 lost = 0
                 if not (back or fell(robot, outcome)):
                     good = [*good[1 - KEPT :], design]
@@ -327,20 +382,26 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                     )
             if back and len(good) > 1:
                 good.pop()  # the next failure goes farther back, or it would be the same again
-            field.phi.grad = price if field.phi.grad is None else field.phi.grad + price
+            for one, more in zip((field.phi, *placing), (price, *prices), strict=True):
+                one.grad = more if one.grad is None else one.grad + more
             worth, excess = worth_of(robot, outcome), float(violation.detach())
             if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):
                 best = {"iteration": k, "worth": worth, "violation": excess, **design}
             end = time.perf_counter()
             timed = {f"supply/{name}": value for name, value in supply.numbers().items()} if timing else {}
             timed |= {"grad_norm/supply": timing_norm} if timing else {}
+            if placement is not None:
+                timed |= {f"chamber/{name}": value for name, value in placement.numbers().items()}
+                timed |= {"grad_norm/chamber": placing_norm, **told}
             adam.step()
             field.clamp_()
-            supply.clamp_()
+            for module in others.values():
+                module.clamp_()
             event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
-            stopped = lost > MOST_LOST or (event is not None and event.stop and s.gravity_scale(k) == 1.0)
+            whole = s.gravity_scale(k) == 1.0 and (until == math.inf or k >= until)
+            stopped = lost > MOST_LOST or (event is not None and event.stop and whole)
             center = outcome.center.detach()
             run.log(
                 k,
@@ -369,16 +430,11 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                 run.log_histogram("scenarios/L", outcome.travel.detach(), k)
             if observe is not None:
                 observe(run, robot, gamma.detach(), k)
-            more = {"supply": supply} if timing else {}
-            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good, **more)
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good, **others)
             if stopped or time.perf_counter() > end_at:
                 break
         if best is not None:
-            with torch.no_grad():
-                field.phi.copy_(best["phi"])
-            field.beta = best["beta"]
-            if timing:
-                supply.load_state_dict(best["supply"])
+            take_(robot, best)
         none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
         told = {name: (best or none)[name] for name in none}
-        return Optimized(gamma=field().detach(), metrics=run.metrics, **told)
+        return Optimized(gamma=robot.density().detach(), metrics=run.metrics, **told)

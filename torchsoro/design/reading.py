@@ -16,6 +16,7 @@ from torchsoro.command_line import CommandLine, as_called, plain_errors
 from torchsoro.design.processes import take_gpu
 from torchsoro.design.settings import Settings, cuda_available
 
+CHAMBERS = "chambers.json"  # settings of the chambers that a run has designed, beside those that it began with
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
 GROUPS = {
     "robot": "run",
@@ -102,6 +103,8 @@ def _grouped(default: Settings) -> type[Any]:
 def read_settings(path: Path, **changes: object) -> Settings:
     """Read the settings of a run.
 
+    Chambers whose place or size was designed are given, as they were delivered, once there is a ``chambers.json``.
+
     Args:
         path: Its ``settings.json``.
         **changes: Settings to replace.
@@ -116,10 +119,14 @@ def read_settings(path: Path, **changes: object) -> Settings:
     wanted = "wanted the settings.json of a run"
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
+        delivered = path.with_name(CHAMBERS)
+        chambers = json.loads(delivered.read_text(encoding="utf-8")) if delivered.is_file() else {}
     except (OSError, ValueError) as error:
         raise ValueError(f"path: {path} holds no settings ({error}), {wanted}") from error
-    if not isinstance(found, dict):
-        raise ValueError(f"path: {path} holds a {type(found).__name__}, {wanted}")
+    for held in (found, chambers):
+        if not isinstance(held, dict):
+            raise ValueError(f"path: {path} holds a {type(held).__name__}, {wanted}")
+    found |= chambers
     if unknown := sorted(set(found) - {field.name for field in dataclasses.fields(Settings)}):
         raise ValueError(f"path: {path} has {', '.join(unknown)}, wanted names of the settings only")
     try:

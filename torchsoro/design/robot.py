@@ -10,12 +10,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from torchsoro.design.chambers import chambers_of, port_of, sockets
+from torchsoro.design.blending import fill_blended, solid_shares
+from torchsoro.design.chambers import chambers_of, placement_of, port_of, sockets
 from torchsoro.design.density import fill, without_void
 from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel, yaw
+from torchsoro.design.placement import Membership
 from torchsoro.design.scenarios import ScenarioBatch, leaning_gravity, posed, supplied, varied
 from torchsoro.design.settings import Settings
 from torchsoro.design.supply import supply_of
@@ -111,6 +113,7 @@ class Robot(nn.Module):
             port=self.port if s.feature else None,
         )
         self.field = DesignField(self.domain, radius=s.filter_radius, beta=s.beta, symmetry=symmetry).to(s.target)
+        self.placement = placement_of(s, self.domain, symmetry)
         self.solid = Solid(youngs_modulus=s.youngs_modulus, poisson_ratio=s.poisson_ratio, density=s.density)
         self.formulation: Formulation = formulation_of(s.formulation, s.transfer)
         air = s.air_density
@@ -130,7 +133,8 @@ class Robot(nn.Module):
         self.soles = _outermost(self.domain, planes).to(s.target)
         self.socket = sockets(self.domain, self.port.direction).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
-        everywhere = self.filled(torch.ones(self.domain.count))
+        with torch.no_grad():
+            everywhere = self.filled(torch.ones(self.domain.count))
         self.full_mass = float(everywhere.mass[~self.domain.gas].sum())
         if s.scenarios:
             stiff, light = (torch.tensor([factor]) for factor in (s.modulus_range[1], s.density_range[0]))
@@ -169,8 +173,9 @@ class Robot(nn.Module):
             SimulationDiverged: if the simulation breaks down.
         """
         s = self.settings
-        body = self.filled(gamma)
-        solid, weight = self.weights(body)
+        member = self.membership(gamma)
+        body = self.filled(gamma, member)
+        solid, weight = self.weights(body, gamma, member)
         pressure = self.pressure if pressure is None else pressure
         trajectory = self._simulate(body, weight, gravity_scale, everything, void, pressure, progress, scenarios, dt)
         end = s.settle + s.duration
@@ -188,7 +193,7 @@ class Robot(nn.Module):
             inflated=until(s.settle + closes),
             turn=self.turned(trajectory, gamma, end),
             turn_inflated=self.turned(trajectory, gamma, s.settle + closes),
-            intermediate=intermediate_density(gamma, self.design),
+            intermediate=intermediate_density(gamma, self.design) if member is None else member.intermediate(gamma),
             mass=total_mass(solid),
             fall=torch.relu(height[..., 0] - height.amin(-1) - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
@@ -196,8 +201,38 @@ class Robot(nn.Module):
             dt=trajectory.dt,
         )
 
-    def weights(self, body: Body) -> tuple[Tensor, Tensor]:
-        """Masses of the solid with the chamber walls, and of what is counted in the travel, each [..., N] kg."""
+    def density(self) -> Tensor:
+        """Density of the present design [N], with a gradient by the field and by chambers that are designed."""
+        if self.placement is None:
+            return self.field()
+        member = self.placement()
+        return self.field(shares=(member.design, member.wall))
+
+    @property
+    def rounded_domain(self) -> Domain:
+        """The domain; chambers that are designed lie where they are now, rounded to lattice planes."""
+        return self.domain if self.placement is None else replace(self.domain, chambers=self.placement.rounded())
+
+    def membership(self, like: Tensor) -> Membership | None:
+        """What chambers that are designed make of each particle, in the type of a tensor; None if they are given."""
+        return None if self.placement is None else self.placement().to(like)
+
+    def weights(
+        self, body: Body, gamma: Tensor | None = None, member: Membership | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Masses of the solid with the chamber walls, and of what is counted in the travel, each [..., N] kg.
+
+        Args:
+            body: The body.
+            gamma: Its density [..., N]; wanted where chambers are designed.
+            member: What these make of each particle.
+        """
+        if member is not None and gamma is not None:
+            whole = self.domain.volume * float(self.solid.density)
+            s = self.settings
+            wall, designed = solid_shares(gamma, member, epsilon=s.epsilon, power=s.power)
+            solid = whole * (wall + designed)
+            return solid, solid if s.counted == "body" else whole * designed
         none = torch.zeros_like(body.mass)
         solid = torch.where(self.design | self.wall, body.mass, none)
         return solid, solid if self.settings.counted == "body" else torch.where(self.design, body.mass, none)
@@ -253,18 +288,18 @@ class Robot(nn.Module):
         """What the supply gives now, from the start of the simulation, with a gradient by a timing that is designed."""
         return self.supply()
 
-    def filled(self, gamma: Tensor) -> Body:
-        """The domain filled with a density [N]."""
+    def filled(self, gamma: Tensor, member: Membership | None = None) -> Body:
+        """The domain filled with a density [N].
+
+        Args:
+            gamma: The density.
+            member: What chambers that are designed make of each particle, if that is known already.
+        """
         s = self.settings
-        return fill(
-            self.domain,
-            gamma,
-            solid=self.solid,
-            gas=self.gas,
-            epsilon=s.epsilon,
-            power=s.power,
-            void_range=s.void_range,
-        )
+        how: dict[str, Any] = {"solid": self.solid, "gas": self.gas, "epsilon": s.epsilon, "power": s.power}
+        how["void_range"] = s.void_range
+        member = self.membership(gamma) if member is None else member
+        return fill(self.domain, gamma, **how) if member is None else fill_blended(self.domain, gamma, member, **how)
 
     def _simulate(
         self,

@@ -30,6 +30,8 @@ _Density = Annotated[float, Field(strict=True, ge=0, le=1)]
 _Friction = Literal["stick"] | AtLeastZero
 _Finite = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 _Range = tuple[_Finite, _Finite]
+_Place = tuple[_Finite, _Finite, _Finite]
+_Edges = tuple[_Length, _Length, _Length]
 
 
 def cuda_available() -> bool:
@@ -78,6 +80,20 @@ class Settings:
     """Chambers side by side in the middle, each with a wall of its own; together they hold the air of the one."""
     chamber_axis: Literal["x", "y", "z"] = "x"
     """Axis along which several chambers lie, the first at its lower end."""
+    chamber_centers: tuple[_Place, ...] = ()
+    """Centre of each box chamber [m], x = y = 0 and z = 0 in the middle of the lower face; as above if left out."""
+    chamber_sizes: tuple[_Edges, ...] = ()
+    """Outer edges of each box chamber [m], walls included; as above if left out."""
+    chamber_design: tuple[Literal["place", "size"], ...] = ()
+    """What of each box chamber is designed with the body, beginning with what is given; nothing if left out."""
+    chamber_edges: tuple[AtLeastZero, AtLeastZero] = (0.0, 0.0)
+    """Least and most outer edge of a designed chamber [m]; 0 for a layer of air in its wall, and for the body."""
+    chamber_volume: Literal["free", "fixed"] = "free"
+    """Whether designed chambers keep the volume of their air, all together."""
+    chamber_until: CountOrZero = 0
+    """Iteration from which designed chambers stay, on lattice planes, and the body goes on; 0: rounded at the end."""
+    chamber_rate: Positive = 0.05
+    """Learning rate of a designed chamber, in particle spacings."""
     body_mesh: Path | None = None
     """Closed surface of the body within ``size``, whose lower face is at z = 0 and centred at x = y = 0: STL or MSH."""
     chamber_mesh: Path | None = None
@@ -281,7 +297,7 @@ class Settings:
         self._check_chambers()
         edges = [edge - 2 * self.wall for edge in self.chamber]
         edges["xyz".index(self.chamber_axis)] /= self.chambers
-        cavity = min(edges)
+        cavity = min(edges) if not self.chamber_sizes else min(map(min, self.chamber_sizes)) - 2 * self.wall
         if self.chamber_mesh is None and self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
             low = 0.05 * cavity
             raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
@@ -301,6 +317,10 @@ class Settings:
                 raise ValueError(f"{name} = {values}: wanted none for a single chamber, or several chambers (chambers)")
             if values and len(values) != self.chambers:
                 raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers")
+        for name in ("chamber_centers", "chamber_sizes"):
+            values = getattr(self, name)
+            if values and len(values) != self.chambers:
+                raise ValueError(f"{name} = {values}: wanted one for each of the {self.chambers} chambers (chambers)")
         if "phase" in self.timing and self.chambers == 1:
             raise ValueError(f"timing = {self.timing}: wanted no phase for a single chamber, which would only wait")
 

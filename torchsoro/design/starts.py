@@ -42,7 +42,8 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     simulation breaks down is left out as long as another one ends.
 
     Args:
-        robot: What to design; its field and supply are what the first start begins with, and what the best ends with.
+        robot: What to design; its field, supply and chambers are what the first start begins with, and what the best
+            ends with.
         observe: See :func:`torchsoro.design.loop.optimize`; called by several threads on a CPU.
         processes: That share the scenarios of a single start.
 
@@ -95,6 +96,8 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     robot.field.load_state_dict(robots[best].field.state_dict())
     robot.field.beta = robots[best].field.beta
     robot.supply.load_state_dict(robots[best].supply.state_dict())
+    if (placement := robots[best].placement) is not None and robot.placement is not None:
+        robot.placement.load_state_dict(placement.state_dict())
     with RunFolder(s.out, dataclasses.asdict(s), overwrite=True) as run:
         for row in _rows(found[best].metrics):
             run.log(int(row.pop("iteration")), row)

@@ -61,6 +61,7 @@ _DELIVERED = (
     "shape.json",
     "motion.npz",
     "motion.html",
+    "chambers.json",
 )
 _DELIVERED += ("walker.mp4", "climber.mp4", "turner.mp4")
 _PARTS = {"iteration": int, "settings": dict, "rng_cpu": torch.Tensor, "rng_cuda": list, "items": dict}

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
-from torchsoro.design.reading import read_settings
+from torchsoro.design.reading import CHAMBERS, read_settings
 from torchsoro.design.resampling import fit_, resampled
 from torchsoro.design.robot import build
 from torchsoro.design.supply import Supply
@@ -215,7 +215,7 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
     if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
         raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
     folder.mkdir(parents=True, exist_ok=True)
-    files += tuple(name for name in ("amendments.json", "motion.npz") if (run / name).is_file())
+    files += tuple(name for name in ("amendments.json", "motion.npz", CHAMBERS) if (run / name).is_file())
     for name in files:
         with atomic_write(folder / name) as file:
             file.write((run / name).read_bytes())

@@ -15,7 +15,7 @@ import torch
 
 from torchsoro.command_line import progress_bar
 from torchsoro.design.objective import mean_stride
-from torchsoro.design.reading import read_settings
+from torchsoro.design.reading import CHAMBERS, read_settings
 from torchsoro.design.robot import Outcome, Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
@@ -209,6 +209,7 @@ def compare(
         listed = ", ".join(map(str, kept)) or "none"
         raise ValueError(f"iterations = {gone}: wanted some of those that {folder} has kept: {listed}")
     copied = ("settings.json", "metrics.csv", "design.npz")  # for the pages
+    copied += (CHAMBERS,) if (folder / CHAMBERS).is_file() else ()
     if missing := [name for name in copied if not (folder / name).is_file()]:
         raise ValueError(f"robot = {robot!r}: {folder} has no {', '.join(missing)}, wanted a finished run")
     load_design(folder / "design.npz", build(dataclasses.replace(base, device="cpu")).domain)

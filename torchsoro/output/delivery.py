@@ -16,29 +16,25 @@ import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
 from torchsoro.design.density import thickened
-from torchsoro.design.domain import Region
 from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import intermediate_density, mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
 from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.rounding import changes, rounded, rounding_line, save_chambers
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import begin_with, save_design
 from torchsoro.output.fabricate import fabricate, surface
+from torchsoro.output.folding import folded, folding_line
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
-from torchsoro.simulation.selfcontact import overlapping
-from torchsoro.simulation.trajectory import Trajectory
 from torchsoro.storage import atomic_write
-
-HALF = 0.5  # density above which a particle counts as solid, as in the printed part
-FOLDS = 24  # samples of a motion that are searched for folds, a tenth of a second for each at the paper's size
 
 
 def design(robot: Robot, name: str) -> dict[str, float]:
@@ -50,7 +46,9 @@ def design(robot: Robot, name: str) -> dict[str, float]:
 
     Returns:
         The final metrics (see :func:`show`), the iteration of the design, the number of iterations, and their time
-        [s]: median of forward and backward, and in all. Also written to ``result.json``, with null for NaN.
+        [s]: median of forward and backward, and in all; of chambers that are designed, which are then rounded to
+        lattice planes, what :func:`torchsoro.design.rounding.changes` says. Also written to ``result.json``, with null
+        for NaN.
 
     Raises:
         ValueError: see :func:`torchsoro.design.starts.optimize_starts`; also if the design has no connected body, if
@@ -90,7 +88,15 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         "seconds": sum(history["time/iteration"]),
         **(robot.supply.numbers() if designed_supply(robot) is not None else {}),
     }
-    found = deliver(s.out, robot, optimized.gamma, history, name=name, chosen=optimized.iteration, more=more)
+    gamma = optimized.gamma
+    if robot.placement is not None:
+        sharp = rounded(robot)
+        gamma = sharp.density().detach()
+        save_chambers(s.out, sharp)
+        save_design(s.out / "design.npz", sharp.domain, gamma, designed_supply(sharp))
+        more |= changes(robot, sharp, history)
+        robot = sharp
+    found = deliver(s.out, robot, gamma, history, name=name, chosen=optimized.iteration, more=more)
     print(report(found, s))
     return found
 
@@ -99,7 +105,8 @@ def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -
     """Show the shape in TensorBoard, and keep the design, as often as the settings say."""
     if iteration % robot.settings.picture_every == 0:
         show_shape(run, robot, gamma, iteration)
-    if iteration % robot.settings.shape_every == 0:
+    # Other checks would take designs with other chambers than the delivered ones for bodies without walls.
+    if iteration % robot.settings.shape_every == 0 and robot.placement is None:
         save_design(run.path / "shapes" / f"{iteration:05d}.npz", robot.domain, gamma)
 
 
@@ -113,7 +120,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
-        f"{folding_line(result, settings)}"
+        f"{rounding_line(result)}{folding_line(result, settings)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -143,10 +150,11 @@ def numbers(found: Mapping[str, Any]) -> str:
 def show_shape(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
     """Put the present shape into TensorBoard, as a picture and as a mesh."""
     density = gamma.detach().cpu().numpy()
-    vertices, faces = surface(robot.domain, density)
+    domain = robot.rounded_domain
+    vertices, faces = surface(domain, density)
     run.log_mesh("shape/mesh", vertices, faces, None, iteration)
     title = f"iteration {iteration}"
-    picture = shape_image(domain=robot.domain, gamma=density, planes=drawn_planes(robot), title=title)
+    picture = shape_image(domain=domain, gamma=density, planes=drawn_planes(robot), title=title)
     run.log_image("shape/picture", picture, iteration)
 
 
@@ -395,31 +403,6 @@ def told_of(part: Part, plain: Outcome) -> dict[str, float]:
         "mended_share": done.share,
         "L_before": float(plain.travel),
     }
-
-
-def folded(robot: Robot, density: np.ndarray, trajectory: Trajectory) -> int:
-    """How many solid particles of a motion lie in another part of the body, at the worst of up to 24 samples.
-
-    Args:
-        robot: The robot.
-        density: Of the design [N].
-        trajectory: Its motion, of all particles.
-    """
-    domain = robot.domain
-    solid = torch.from_numpy(density > HALF) & (domain.region != Region.GAS)
-    count = len(trajectory.time)
-    some = torch.linspace(0, count - 1, min(count, FOLDS)).round().long()
-    places = trajectory.position[some.to(trajectory.position.device)].cpu()
-    return int(overlapping(places, domain.positions.to(places), solid, spacing=domain.spacing).sum(-1).max())
-
-
-def folding_line(found: Mapping[str, Any], settings: Settings) -> str:
-    """That the body has folded into itself, in a line; empty where it has not."""
-    count = int(found.get("folded") or 0)
-    if not count:
-        return ""
-    remedy = "" if settings.self_contact else "; --self-contact keeps them apart"
-    return f"the body folds into itself: {count} particles lie in another part of it at the worst{remedy}\n"
 
 
 def mending_line(found: Mapping[str, Any]) -> str:

@@ -126,6 +126,7 @@ def body_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
     """Tensors of a body with loads, with the number of axes that are not a batch."""
     body = attached.body
     flat = (body.mass, body.volume, body.bulk, body.shear, body.viscosity, body.volume_viscosity, body.void_fraction)
+    flat += (body.air_share, body.share_stiffness)
     pairs = [(t, 1) for t in (*flat, attached.spring, attached.drag) if t is not None]
     return pairs + [(t, 2) for t in (body.velocity, body.stiffening, attached.anchor) if t is not None]
 
@@ -149,6 +150,8 @@ def coefficients(attached: Attached, wide: Wide) -> Tensor:
         (layout.VOID_FRACTION, body.void_fraction),
         (layout.STIFFENING, stiffening[0]),
         (layout.STIFFENING + 1, stiffening[1]),
+        (layout.AIR_SHARE, body.air_share),
+        (layout.AIR_STIFFNESS, body.share_stiffness),
     ):
         rows[place] = wide(zero if values is None else values, 1)
     for c in range(3):
@@ -212,6 +215,8 @@ def check_body(body: Body) -> None:
         "void_fraction",
         "drag",
         "stiffening",
+        "air_share",
+        "share_stiffness",
     ):
         value = getattr(body, name)
         if value is None:
@@ -240,13 +245,16 @@ def check_body(body: Body) -> None:
             raise ValueError(f"body.{name} = {value.tolist()}: wanted finite and at least 0")
     if body.softening is not None and not bool((body.softening.detach()[..., 1] > 0).all()):
         raise ValueError("body.softening: a range of 0, wanted positive ranges")
+    if body.share_stiffness is not None and body.air_share is None:
+        raise ValueError("body.share_stiffness: given without body.air_share, wanted both")
+    if body.air_share is not None:
+        share = body.air_share.detach()
+        if bool((share > 1).any()) or bool((share[..., body.chamber < 0] > 0).any()):
+            raise ValueError(
+                f"body.air_share: up to {float(share.max())}, wanted 0 to 1, and 0 where body.chamber names no chamber"
+            )
     void = body.void_fraction
-    if (
-        void is not None
-        and void.is_leaf
-        and void.requires_grad
-        and bool((void.detach()[..., body.chamber < 0] == 1).any())
-    ):
+    if void is not None and void.is_leaf and void.requires_grad and bool((void.detach()[..., ~body.gas] == 1).any()):
         raise ValueError(
             "body.void_fraction: exactly 1 with a gradient, which is not computed there, wanted less than 1"
         )

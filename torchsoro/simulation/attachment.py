@@ -47,6 +47,7 @@ def refuse_nodes(attached: Attached) -> None:
     given = {
         "body.softening": body.softening is not None,
         "body.air_stiffness": body.air_stiffness is not None,
+        "body.air_share": body.air_share is not None,
         **{f"loads: {type(load).__name__} on nodes or means": True for load in attached.more},
     }
     for name in (name for name, there in given.items() if there):

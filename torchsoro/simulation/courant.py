@@ -26,7 +26,7 @@ class Courant:
 def updated_courant(attached: Attached, prony: Prony | None, dt: float, cell: float) -> Courant:
     """Courant number of a step in the updated form; see ``stability.courant``."""
     body = attached.body
-    air = body.chamber >= 0
+    air = body.gas
     factor, solid = _stiffened(prony, dt, body.shear.detach())
     density = (body.mass / body.volume).detach()
     bulk = 1.4 * body.bulk.detach()
@@ -64,7 +64,9 @@ def total_courant(attached: Attached, prony: Prony | None, dt: float, steep: flo
     """
     body = attached.body
     factor, solid = _stiffened(prony, dt, body.shear.detach())
-    air = body.chamber >= 0
+    air = body.gas
+    if body.air_share is not None and body.void_fraction is not None:  # whose law of void knows no Maxwell elements
+        air = (body.air_share.detach() > 0) & (body.void_fraction.detach() == 1)
     zero = torch.zeros((), dtype=body.bulk.dtype, device=body.bulk.device)
     density = (body.mass / body.volume).detach()
     bulk = torch.where(air, zero, body.bulk.detach())

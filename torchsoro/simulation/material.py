@@ -202,6 +202,11 @@ class Body:
         air_stiffness: Pressure that the air in each hollow chamber of the lattice loses as its volume doubles
             [..., hollow chambers] Pa; 0 if None. Hollow chambers hold no particles, and follow in number those that do.
             Total formulation only.
+        air_share: Share of each particle's volume that is air of the chamber in ``chamber`` [..., N], 0 to 1. With it
+            every particle follows the law of solids, whatever ``chamber`` says, and those of a chamber add their shares
+            to its volume and feel its pressure by them. None where those of a chamber are gas altogether. Total
+            formulation only.
+        share_stiffness: k of that air [..., N] Pa; 0 if None.
     """
 
     position: Tensor
@@ -218,6 +223,13 @@ class Body:
     stiffening: Tensor | None = None
     softening: Tensor | None = None
     air_stiffness: Tensor | None = None
+    air_share: Tensor | None = None
+    share_stiffness: Tensor | None = None
+
+    @property
+    def gas(self) -> Tensor:
+        """Which particles are gas altogether, bool [N]."""
+        return self.chamber >= 0 if self.air_share is None else torch.zeros_like(self.chamber, dtype=torch.bool)
 
 
 def value_of(name: str, number: Number) -> float:

@@ -274,6 +274,8 @@ class Simulator(nn.Module):
         """Constant data of the run, by particle."""
         body = attached.body
         kind = body.chamber.to(device=probes.device, dtype=torch.int32)
+        if body.air_share is not None:  # solids, of which a share may be air
+            kind = torch.where(kind >= 0, layout.ENCLOSES - kind, kind)
         contact = [plane.integers() for plane in planes]
         return Scene(
             dt=dt,
@@ -432,7 +434,7 @@ def _whole(name: str, value: float, dt: float) -> int:
 def _present(body: Body, *coefficients: Tensor | None) -> bool:
     """Whether any of these coefficients [..., N] of the solid differs from zero or requires a gradient."""
     given = [v for v in coefficients if v is not None]
-    return any(v.requires_grad or bool((v[..., body.chamber < 0] != 0).any()) for v in given)
+    return any(v.requires_grad or bool((v[..., ~body.gas] != 0).any()) for v in given)
 
 
 def _triple(values: Sequence[float]) -> tuple[float, float, float]:

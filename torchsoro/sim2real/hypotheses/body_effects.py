@@ -15,6 +15,8 @@ from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
+EDGE = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
+
 
 class Modulus(Hypothesis):
     """The solid is stiffer or softer than believed."""
@@ -24,7 +26,7 @@ class Modulus(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.1, -12.0, 12.0),)
     starts = ((1.0,), (-1.0,), (2.5,), (-2.5,), (5.0,), (-5.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -44,7 +46,7 @@ class Viscoelastic(Hypothesis):
     )
     starts = tuple((g, tau) for g in (1.0, 4.0) for tau in (-6.5, -5.0, -3.5, -1.5))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The element, and its viscosity."""
         g, tau = float(values[0]), math.exp(values[1])
         nu = float(scenario.poisson_ratio.reshape(-1)[0])
@@ -98,7 +100,7 @@ class Density(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The factor."""
         return {"factor": (math.exp(values[0]), "1")}
 
@@ -115,10 +117,10 @@ class SoftSide(Hypothesis):
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The slopes, and what a soft half lacks that moves nearly the same: 1 - exp(-2/3 of the slope)."""
         lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
-        return {**super().reported(values, scenario), "fraction": (lost, "1")}
+        return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
 
     def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
         """Middle of the soft half."""
@@ -136,6 +138,38 @@ class SoftSide(Hypothesis):
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
         xi = (twin.positions - low) / size - 0.5
         return scenario.replace(youngs_modulus=scenario.youngs_modulus * (values @ xi.T).exp())
+
+
+class SoftHalf(Hypothesis):
+    """Young's modulus is lower on one half of the body, along x, y and z."""
+
+    name, affected_quantity, model_form_deviation = "soft_side", "Young's modulus over the body", LAW
+    nonnegative = frozenset({"fraction"})
+    quantities = tuple(Quantity(f"contrast_{axis}", "between halves", 0.2, -10.0, 10.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """The contrasts, and what the soft half lacks of the other."""
+        lost = 1 - math.exp(-float(np.abs(values).max()))
+        return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
+
+    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
+        """Middle of the soft half."""
+        most = int(np.abs(values[:3]).argmax())
+        middle = np.array(twin.setup.center)
+        middle[most] -= np.sign(values[most]) * 0.25 * twin.setup.size[most]
+        return middle
+
+    def varies(self, values: np.ndarray) -> float:
+        """At the stiffest corner."""
+        return 0.5 * float(np.abs(values[:3]).sum())
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """E exp(a . tanh(xi / EDGE) / 2), xi from -1/2 to 1/2 over the body's box."""
+        low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
+        xi = (twin.positions - low) / size - 0.5
+        factor = (values @ (torch.tanh(xi / EDGE) / 2).T).exp()
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * factor)
 
 
 class PrintOffset(Hypothesis):

@@ -91,12 +91,13 @@ class Hypothesis(nn.Module):
         """Whether the experiment has what the effect changes."""
         return True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """Values [K] as they are reported: numbers and units by name.
 
         Args:
             values: In the units of ``quantities``, without a place.
             scenario: That the effect is missing from.
+            twin: The body.
         """
         return {q.name: (float(v), q.unit) for q, v in zip(self.quantities, values, strict=True)}
 

@@ -9,6 +9,7 @@ from torchsoro.sim2real.hypotheses.body_effects import (
     Modulus,
     PrintOffset,
     Softening,
+    SoftHalf,
     SoftSide,
     Stiffening,
     Tether,
@@ -22,7 +23,7 @@ from torchsoro.sim2real.hypotheses.outer_effects import (
     GravityTilt,
     InitialMotion,
     InitialPose,
-    InitialSpin,
+    InitialRigidMotion,
     InitialTilt,
     Sliding,
     WallOffset,
@@ -40,9 +41,19 @@ from torchsoro.sim2real.hypotheses.supply_effects import (
 def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
-        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, PrintOffset, Density),
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftHalf, PrintOffset, Density),
         *(AttachedMass, Tether, LoadInertia, FluidDrag),
         *(PressureLag, PressureGain, Leak, OrificeLeak, AirStiffness, AirTwice),
-        *(Sliding, Friction, Adhesion, WallOffset, GravityTilt, InitialMotion, InitialSpin, InitialTilt, InitialPose),
+        *(
+            Sliding,
+            Friction,
+            Adhesion,
+            WallOffset,
+            GravityTilt,
+            InitialMotion,
+            InitialRigidMotion,
+            InitialTilt,
+            InitialPose,
+        ),
     )
     return tuple(kind() for kind in kinds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping
 
@@ -35,10 +36,10 @@ class Sliding(Hypothesis):
 
     name, affected_quantity = "friction", "friction of the planes"
     ratios = frozenset({"coefficient"})
-    quantities = (Quantity("inverse_coefficient", "1", 1.0, 0.0, 50.0),)
-    starts = ((1.0,), (2.0,), (4.0,), (8.0,))
+    quantities = (Quantity("inverse_coefficient", "1", 0.1, 0.0, 500.0),)
+    starts = ((10.0,), (20.0,), (40.0,), (80.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The coefficient."""
         return {"coefficient": (1 / max(float(values[0]), 1e-3), "1")}
 
@@ -62,7 +63,7 @@ class Friction(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.1, -40.0, 40.0),)
     starts = ((2.0,), (-2.0,), (6.0,), (-6.0,), (11.0,), (-15.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The coefficient."""
         believed = next(float(g.friction.reshape(-1)[0]) for g in scenario.planes if isinstance(g.friction, Tensor))
         return {"coefficient": (believed * math.exp(values[0]), "1")}
@@ -87,7 +88,7 @@ class Adhesion(Hypothesis):
     quantities = (Quantity("traction", "Pa", 50.0, 0.0, 1000.0), Quantity("ln_reach", "ln m", 1.0, -11.5, -5.0))
     starts = ((2.0, -8.5), (8.0, -8.5), (30.0, -8.5), (8.0, -7.0))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """Traction, reach, and the energy that it takes to separate."""
         reach = math.exp(values[1])
         return {
@@ -135,9 +136,9 @@ class GravityTilt(Hypothesis):
     quantities = (Quantity("about_first", "rad", 0.03, -20.0, 20.0), Quantity("about_second", "rad", 0.03, -20.0, 20.0))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """Both angles, and the whole."""
-        return {**super().reported(values, scenario), "angle_rad": (float(np.hypot(*values)), "rad")}
+        return {**super().reported(values, scenario, twin), "angle_rad": (float(np.hypot(*values)), "rad")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Turned about the two axes normal to gravity."""
@@ -150,36 +151,51 @@ class GravityTilt(Hypothesis):
 
 
 class InitialMotion(Hypothesis):
-    """The body is not at rest, or moves otherwise, at the start."""
+    """A clamped body is not at rest, or moves otherwise, at the start."""
 
     name, affected_quantity, model_form_deviation = "initial_motion", "velocity at the start", LAW
     nonnegative = frozenset({"speed_m_s"})
     quantities = tuple(Quantity(f"velocity_{axis}", "m/s", 0.02, -50.0, 50.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The velocity, and its size."""
-        return {**super().reported(values, scenario), "speed_m_s": (float(np.linalg.norm(values)), "m/s")}
+        return {**super().reported(values, scenario, twin), "speed_m_s": (float(np.linalg.norm(values)), "m/s")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Of the whole body; for a clamped one, as of its farthest points, less near the clamp."""
+        """As of its farthest points, less near the clamp."""
         shape = torch.ones(twin.nodes, dtype=torch.float64)
         for axis, side in twin.faces:
             shape = shape * (twin.depth(twin.places, axis, side) / twin.setup.size[axis]).clamp(0, 1) ** 2
         return scenario.replace(velocity=scenario.velocity + values[:, None, :] * shape[:, None])
 
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a body that something holds."""
+        return bool(twin.held.any())
 
-class InitialSpin(Hypothesis):
-    """A free body turns at the start, or turns otherwise."""
 
-    name, affected_quantity, model_form_deviation = "initial_motion", "angular velocity at the start", LAW
-    quantities = tuple(Quantity(f"spin_{axis}", "rad/s", 0.5, -100.0, 100.0) for axis in "xyz")
-    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+class InitialRigidMotion(Hypothesis):
+    """A free body is not at rest, or moves and turns otherwise, at the start."""
+
+    name, affected_quantity, model_form_deviation = "initial_motion", "velocity at the start", LAW
+    nonnegative = frozenset({"speed_m_s"})
+    quantities = (
+        *(Quantity(f"velocity_{axis}", "m/s", 0.02, -50.0, 50.0) for axis in "xyz"),
+        *(Quantity(f"spin_{axis}", "rad/s", 0.5, -100.0, 100.0) for axis in "xyz"),
+    )
+    starts, joint = tuple(map(tuple, np.eye(6))), True
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """Velocity of the centre, rate of turn, and the largest speed that these are at a corner of the body's box."""
+        corners = np.array(list(itertools.product((-0.5, 0.5), repeat=3))) * twin.setup.size
+        speed = np.linalg.norm(values[:3] + np.cross(values[3:], corners), axis=1).max()
+        return {**super().reported(values, scenario, twin), "speed_m_s": (float(speed), "m/s")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """About the body's centre."""
+        """Of the body's centre, and about it."""
         arms = twin.places - torch.tensor(twin.setup.center, dtype=torch.float64)
-        return scenario.replace(velocity=scenario.velocity + torch.linalg.cross(values[:, None], arms[None]))
+        moved = values[:, None, :3] + torch.linalg.cross(values[:, None, 3:], arms[None])
+        return scenario.replace(velocity=scenario.velocity + moved)
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With a body that nothing holds."""
@@ -194,9 +210,9 @@ class InitialTilt(Hypothesis):
     quantities = tuple(Quantity(f"about_{axis}", "rad", 0.03, -20.0, 20.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """The turn, and its size."""
-        return {**super().reported(values, scenario), "angle_rad": (float(np.linalg.norm(values)), "rad")}
+        return {**super().reported(values, scenario, twin), "angle_rad": (float(np.linalg.norm(values)), "rad")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Turned about its centre; what is behind a plane then is moved out."""
@@ -217,9 +233,9 @@ class InitialPose(Hypothesis):
     quantities = tuple(Quantity(f"offset_{i}_m", "m", 0.002, -25.0, 25.0) for i in ("first", "second"))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """Both offsets, and the whole."""
-        return {**super().reported(values, scenario), "deflection_m": (float(np.hypot(*values)), "m")}
+        return {**super().reported(values, scenario, twin), "deflection_m": (float(np.hypot(*values)), "m")}
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Of a slender cantilever under a force at its end, whose cross-sections stay plane and normal to it.

@@ -26,7 +26,7 @@ class PressureGain(Hypothesis):
     quantities = (Quantity("ln_factor", "1", 0.05, -30.0, 12.0),)
     starts = ((-1.0,), (-4.0,), (-10.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """What is lost."""
         return {"fraction": (1 - math.exp(values[0]), "1")}
 
@@ -108,7 +108,7 @@ class AirTwice(Hypothesis):
     quantities = (Quantity("share", "1", 0.1, -10.0, 0.0),)
     starts = ((-3.0,), (-10.0,))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """What is to be added."""
         return {"air_stiffness_pa": (float(values[0]) * float(scenario.air_stiffness.max()), "Pa")}
 
@@ -161,7 +161,7 @@ class OrificeLeak(Hypothesis):
     )
     starts = tuple((f, t) for f in (2.0, 6.0) for t in (1.0, 3.0))
 
-    def reported(self, values: np.ndarray, scenario: Scenario) -> dict[str, tuple[float, str]]:
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """By the names of the other form."""
         return {"fraction": (float(values[0]), "1"), "time_constant_s": (float(values[1]), "s")}
 

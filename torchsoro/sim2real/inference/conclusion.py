@@ -392,8 +392,10 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
     faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
-        # An extension that moves as what it extends, as far as the twin tells, adds nothing.
+        # An extension that moves as what it extends, as far as it matters and the twin tells, adds nothing, unless
+        # evidence is for it.
         plain = [names[n] for n in c.best.near.model.simpler if n in names]
+        plain = [d for d in plain if c.probability <= CREDIBLE * (c.probability + d.probability)]
         plain = [d for d in plain if apart(c.best, d.best) < max(least, c.best.near.numerics.size)]
         if c.size < max(least, c.best.near.numerics.size):
             told[NOTHING] += c.probability

@@ -165,9 +165,9 @@ class Likelihood:
         return self.chance > VALLEYS
 
     @property
-    def walks(self) -> bool:
-        """Whether a body with chambers meets planes and a finer twin searches it, however noisy its recording is."""
-        return self.touches and bool(self.experiment.setup.chambers) and self.finer_twin is not None
+    def searched_finely(self) -> bool:
+        """Whether the finer twin searches, too: of bodies that meet planes, however noisy their recordings are."""
+        return self.touches and self.finer_twin is not None
 
     @cached_property
     def common(self) -> tuple[tuple[Hypothesis, float], ...]:

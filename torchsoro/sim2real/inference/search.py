@@ -6,22 +6,28 @@ import itertools
 from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
-import torch
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, EDGE, Request
+from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
-from torchsoro.sim2real.twin.twin import Twin
-
-BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
-FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
-COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
-STARTS = 3  # searches of each effect, from probe points that differ
-EARLY_ABOVE = (
-    3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
+from torchsoro.sim2real.inference.starts import (
+    EARLY_ABOVE,
+    FAINT,
+    STARTS,
+    Task,
+    correlation,
+    likely,
+    looked_at,
+    null_starts,
+    probe_points,
+    screened,
+    unconstrained,
+    within_tolerances,
 )
+
+COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
 CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
@@ -29,7 +35,6 @@ REFINED = 2  # rounds in which the best are corrected by the finer twin
 PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes only, over that with all lanes filled
 MOST = 10  # searches that are begun, at most
 MOST_VALLEYS = 24  # the same where most end in valleys nearby
-SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
@@ -38,13 +43,9 @@ TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
 ENDS_FINER = 16  # the same where a finer twin is searched, too
-PLACES = 16  # within the tolerances of what is stated, from the best of which the null model begins among many valleys
-FIRST = 2  # of them
 AHEAD = 3  # ends of searches that are always in the running
 FARTHER = 4.0  # times the least chi-squared: an end that leaves more is far out of it
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
-
-Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
 
 
 def search(
@@ -66,7 +67,7 @@ def search(
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
-    begun = MOST_VALLEYS if problem.many_valleys and not problem.walks else MOST
+    begun = MOST_VALLEYS if problem.many_valleys and not problem.searched_finely else MOST
     most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, begun))
     carried: list[Task] = []
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
@@ -81,28 +82,28 @@ def search(
         problem, null_model = _fit_null_model(problem, [((), null_model.point)], report)
     tasks = [t for t in carried if t[0]]
     if not tasks:
-        probe_points = _probe_points(problem, null_model, effects)
+        looks = probe_points(problem, null_model, effects)
         for effect in effects:
-            mine = [chi2 for chi2, e, _ in probe_points if e is effect]
+            mine = [chi2 for chi2, e, _ in looks if e is effect]
             report(
                 f"{effect.name}: chi-squared {min(mine):.0f} by its linear response"
                 if mine
                 else f"{effect.name}: breaks down"
             )
-        tasks = _likely(probe_points, null_model, most)
-    if problem.many_valleys and not problem.walks:
-        tasks = [*_likely(_screened(problem, null_model, effects), null_model, most), *tasks]
+        tasks = likely(looks, null_model, most)
+    if problem.many_valleys and not problem.searched_finely:
+        tasks = [*likely(screened(problem, null_model, effects), null_model, most), *tasks]
     tried = []
-    unconstrained = _unconstrained(problem, effects, null_model)
+    released = unconstrained(problem, effects, null_model)
     if len(tasks) > COMPLETED:
         tried = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=TRIED, settle=False) if f is not None]
         tried.sort(key=lambda fit: fit.chi2)
         behind = tried[0].chi2 + BEHIND * max(null_model.chi2 - tried[0].chi2, 0.0)
         led = [f for i, f in enumerate(tried[:COMPLETED]) if i < 3 or f.chi2 < behind]
         # A modulus beyond its tolerance may be that of a stiff side.
-        led += [f for f in tried if unconstrained and varied(f) > 0 and f not in led]
+        led += [f for f in tried if released and varied(f) > 0 and f not in led]
         tasks = [(f.effects, f.point) for f in led]
-    tasks += unconstrained
+    tasks += released
     completed = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=ROUNDS) if f is not None]
     best = _best([*completed, *tried])
     if best and null_model.chi2 > CORRECTED * null_model.samples:
@@ -115,10 +116,10 @@ def search(
     ends = distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)], ENDS)
     ends = running(problem, ends)
     valleys = _other_valleys(problem, null_model, ends)
-    if not problem.walks:
+    if not problem.searched_finely:
         return problem, null_model, [*valleys, *ends]
     # What two searches find in turn, so that neither crowds out the other.
-    nothing, finer = _by_finer(problem, effects, null_model, report)
+    nothing, finer = _by_finer(problem, effects, null_model, ends, report)
     mixed = [f for pair in itertools.zip_longest(finer, ends) for f in pair if f is not None]
     return problem, null_model, [*valleys, *nothing, *distinct(mixed, ENDS_FINER)]
 
@@ -138,27 +139,37 @@ def _beside(one: Fit, other: Fit) -> bool:
 
 
 def _by_finer(
-    problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit, report: Callable[[str], None]
+    problem: FitProblem,
+    effects: Sequence[Hypothesis],
+    null_model: Fit,
+    ends: Sequence[Fit],
+    report: Callable[[str], None],
 ) -> tuple[list[Fit], list[Fit]]:
-    """Fits by the finer twin, without an effect and with one, of bodies with chambers that touch planes.
+    """Fits by the finer twin, without an effect and with one, of bodies that touch planes.
 
-    A twin whose cells are as large as walls is off by as much as effects are. What a finer one adds to its motion as
-    stated holds as long as nodes touch when they do there, so that no correction makes up for it. And no response tells
-    an effect from afar: chi-squared itself is simulated, at evenly spread points.
+    What the finer twin adds to the motion as stated holds as long as nodes touch when they do there, so that no
+    correction makes up for cells that are off by as much as effects are. And no response tells an effect from afar:
+    chi-squared itself is simulated, at evenly spread points.
     """
     assert problem.fine is not None
     fine = problem.by(problem.fine)
-    begin = [((), null_model.point), *_null_starts(fine)]
+    begin = [((), null_model.point), *null_starts(fine)]
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:
         return [], []
     best = min(nothing, key=lambda fit: fit.chi2)
     one = fine.only(fine.trials[:1])  # the others are as good, and take as long
-    looks = sorted(_screened(one, best, effects), key=lambda look: look[0])
+    # Components that add up are told from afar by their responses; so may be where the search before has ended.
+    joint = [effect for effect in effects if effect.joint]
+    started = [(e, start) for e, own in zip(joint, fine.probe(joint, fine.base(best)), strict=True) for _, start in own]
+    started += [(f.effects[0], f.point) for f in ends if len(f.effects) == 1]
+    looks = sorted([*screened(one, best, effects), *looked_at(one, started)], key=lambda look: look[0])
     first = {effect.name: ((effect,), point) for _, effect, point in reversed(looks)}
     order = list(dict.fromkeys(effect.name for _, effect, _ in looks))
     tasks = [first[name] for name in order[:FINER]]
     found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))
+    leading = [(f.effects, f.point) for f in found[:AHEAD]]
+    found = _best([*found, *fine.fit(leading, errors=best.errors, rounds=FINER_ROUNDS, settle=False)])
     report(f"by the finer twin: nothing {best.chi2:.0f}, " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in found))
     return nothing, found
 
@@ -232,86 +243,6 @@ def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]
     return best
 
 
-def _unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit) -> list[Task]:
-    """Starts for an unconstrained modulus or pressure, where the null model needs one beyond its tolerance."""
-    found: list[Task] = []
-    for i, (common, tolerance) in enumerate(problem.common):
-        for effect in effects:
-            if type(effect) is type(common) and abs(null_model.point[i]) > BELIEVED:
-                rest = np.where(np.arange(len(null_model.point)) == i, 0.0, null_model.point)
-                strength = null_model.point[i] * tolerance / effect.quantities[0].scale
-                found.append(((effect,), np.append(rest, strength)))
-    return found
-
-
-def _probe_points(
-    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
-) -> list[tuple[float, Hypothesis, np.ndarray]]:
-    """What each effect's looks would leave, and where to begin a search; from nothing, and from what is believed."""
-    bases = [problem.base(null_model)]
-    if null_model.chi2 > EARLY_ABOVE * null_model.samples:
-        bases.append(problem.base())
-    probe_points = []
-    for base in bases:
-        for effect, ranked in zip(effects, problem.probe(effects, base), strict=True):
-            probe_points += [(chi2, effect, start) for chi2, start in ranked]
-    return probe_points
-
-
-def _screened(
-    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
-) -> list[tuple[float, Hypothesis, np.ndarray]]:
-    """Chi-squared of each effect at evenly spread points, where the effect stands in for what is stated, and beside it.
-
-    In turn, modulus and pressure are as stated, and as they explain most by themselves.
-    """
-    points = [spread(problem.twin, e) for e in effects]
-    stated = np.stack([np.zeros_like(null_model.point), null_model.point])
-    turn = [np.arange(len(x)) // len(e.starts) % 2 for e, x in zip(effects, points, strict=True)]
-    at = [np.concatenate([stated[k], x], 1) for k, x in zip(turn, points, strict=True)]
-    asked = [((e,), x) for e, x in zip(effects, at, strict=True)]
-    errors = np.zeros(len(problem.observation.deviations))
-    rows = zip(effects, at, _simulated(problem, asked, errors), strict=True)
-    return [(chi2, effect, x[k]) for effect, x, left in rows for k, chi2 in left.items()]
-
-
-def _simulated(problem: FitProblem, asked: Sequence[Request], errors: np.ndarray) -> list[dict[int, float]]:
-    """Chi-squared at the points of each request by their number, without those that break down."""
-    found = []
-    for motions in problem.simulate(asked):
-        sound = map(int, np.flatnonzero(np.all([m.sound for m in motions], axis=0)))
-        found.append({k: problem.measure([m.alone(k) for m in motions], errors)[0] for k in sound})
-    return found
-
-
-def spread(twin: Twin, effect: Hypothesis) -> np.ndarray:
-    """Evenly spread values of an effect [N, K] in scales.
-
-    Strengths are half to twice those of its starts, components that add up both ways; places are anywhere in the body.
-
-    Args:
-        twin: The body.
-        effect: Which.
-    """
-    kinds, starts = len(effect.quantities), np.array(effect.starts)
-    low, high = np.array([[q.least, q.most] for q in effect.quantities]).T
-    count = SCREENED * (4 if effect.local else 1)
-    u = torch.quasirandom.SobolEngine(kinds + 3 * effect.local).draw(count + 2, dtype=torch.float64).numpy()
-    u = u[2:]  # after a corner and the middle
-    if effect.joint:
-        values = 4 * (u[:, :kinds] - 0.5) * starts.max(0)
-    else:
-        values = starts[np.arange(count) % len(starts)]
-        # A second quantity that may be negative, as the logarithm of a time, is a shape and no strength.
-        scaled = (low >= 0) | (np.arange(kinds) == 0)
-        values = values * np.where(scaled, 2 ** (2 * u[:, :kinds] - 1), 1.0)
-    values = np.clip(np.where(low >= 0, np.abs(values), values), low, high)
-    if effect.local:
-        origin, size = np.array(twin.setup.origin), np.array(twin.setup.size)
-        values = np.concatenate([values, 10 * origin / size + 10 * u[:, kinds:]], 1)
-    return values[np.sort(np.unique(values, axis=0, return_index=True)[1])]
-
-
 def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most: int) -> list[Task]:
     """Where searches end that see more and more of the trials: that for nothing, and the best for each effect."""
     carried: list[Task] = [((), None)]
@@ -323,7 +254,7 @@ def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most
         if not still:
             continue
         null_model = still[0]
-        tasks = [*(t for t in carried if t[0]), *_likely(_probe_points(early, null_model, effects), null_model, most)]
+        tasks = [*(t for t in carried if t[0]), *likely(probe_points(early, null_model, effects), null_model, most)]
         ends = _best(early.fit(tasks, errors=null_model.errors, rounds=6, settle=False))
         carried = [((), null_model.point), *((f.effects, f.point) for f in ends)]
     return carried
@@ -373,7 +304,7 @@ def _fit_null_model(
     having found the better one.
     """
     if problem.many_valleys:
-        tasks = [*tasks, *_null_starts(problem)]
+        tasks = [*tasks, *null_starts(problem)]
     while True:
         # What did well on the beginning of the trials may break down later.
         ends = [f for f in problem.fit(tasks, rounds=rounds) if f is not None]
@@ -393,54 +324,6 @@ def _fit_null_model(
         problem = problem.only(problem.trials, slips=tuple(slips))
 
 
-def within_tolerances(problem: FitProblem) -> np.ndarray:
-    """Evenly spread values of the stated numbers within their tolerances [N, K]; the first is what is stated."""
-    even = torch.quasirandom.SobolEngine(len(problem.common)).draw(PLACES, dtype=torch.float64).numpy()
-    return 2 * ((even + 0.5) % 1) - 1
-
-
-def _null_starts(problem: FitProblem) -> list[Task]:
-    """Where the stated numbers, within their tolerances, leave the least, of evenly spread points."""
-    points = within_tolerances(problem)
-    (left,) = _simulated(problem, [((), points)], np.zeros(len(problem.observation.deviations)))
-    return [((), points[k]) for k in sorted(left, key=lambda k: left[k])[:FIRST]]
-
-
-def _likely(probe_points: Sequence[tuple[float, Hypothesis, np.ndarray]], null_model: Fit, most: int) -> list[Task]:
-    """Where to begin searches: each effect that promises something at its best look, then at others that differ."""
-    unit = max(1.0, null_model.chi2 / null_model.samples) * correlation(null_model)
-    strained = np.abs(null_model.point).max(initial=0.0) > 1  # so that much is taken up that it should not be
-    first: list[Task] = []
-    more: list[Task] = []
-    known: dict[str, list[np.ndarray]] = {}
-    for chi2, effect, start in sorted(probe_points, key=lambda probe: probe[0]):
-        faint = null_model.chi2 - chi2 < 2 * FAINT * unit
-        if faint and null_model.chi2 < 2 * null_model.samples and not strained:
-            continue
-        mine = known.setdefault(effect.name, [])
-        if not mine:
-            first.append(((effect,), start))
-        elif len(mine) < STARTS:
-            scale = np.where(np.abs(start) > 1, np.abs(start), 1.0)
-            if not all((np.abs(start - k) / scale).max() > 0.4 for k in mine):
-                continue
-            more.append(((effect,), start))
-        else:
-            continue
-        mine.append(start)
-    return [*first, *more][:most]
-
-
 def varied(fit: Fit) -> float:
     """Excess of ln of the modulus on a stiff side over its mean, by all effects of a fit."""
     return sum(e.varies(v) for e, v in zip(fit.effects, fit.values, strict=True))
-
-
-def correlation(fit: Fit) -> float:
-    """Correlation length of the whitened residual, in samples, from its lag-one autocorrelation."""
-    above = below = 0.0
-    for r in fit.whitened:
-        above += float(r[1:] @ r[:-1])
-        below += float(r @ r)
-    rho = min(max(above / max(below, 1e-300), 0.0), 0.98)
-    return (1 + rho) / (1 - rho)

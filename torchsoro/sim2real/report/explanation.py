@@ -22,6 +22,7 @@ from torchsoro.sim2real.inference.verdict import Verdict
 from torchsoro.sim2real.report.body import BodyMotion
 from torchsoro.sim2real.report.improvement import Improvement, Worst
 from torchsoro.sim2real.twin.scenario import Scenario
+from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.version import VERSION
 
 LEVEL = 0.9  # probability that an interval is to hold the truth
@@ -113,8 +114,9 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
         own = np.where(logarithm, 1.0, values[:count])
         whole = covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)
         steps = 1e-4 * np.array([q.scale for q in effect.quantities])
-        reported = effect.reported(values[:count], scenario)
-        ahead = [effect.reported(values[:count] + step * np.eye(count)[k], scenario) for k, step in enumerate(steps)]
+        reported = effect.reported(values[:count], scenario, problem.twin)
+        beside = values[:count] + np.diag(steps)
+        ahead = [effect.reported(row, scenario, problem.twin) for row in beside]
         parameters = {}
         for name, (value, unit) in reported.items():
             slope = np.array([(a[name][0] - value) / step for a, step in zip(ahead, steps, strict=True)])
@@ -123,7 +125,7 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
                 ratio = math.exp(min(wide * deviation / value, 50.0))
                 low, high = value / ratio, value * ratio
             else:
-                low, high = _possible(value, deviation, _limits(effect, name, scenario))
+                low, high = _possible(value, deviation, _limits(effect, name, scenario, problem.twin))
             parameters[name] = {"value": value, "low": low, "high": high, "unit": unit}
         place = effect.place(values, problem.twin)
         within = wide * np.sqrt(np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2)
@@ -140,12 +142,12 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
     return rows
 
 
-def _limits(effect: Hypothesis, name: str, scenario: Scenario) -> tuple[float, float]:
+def _limits(effect: Hypothesis, name: str, scenario: Scenario, twin: Twin) -> tuple[float, float]:
     """Between which a reported quantity can be."""
     ranges = {q.name: (q.least * q.scale, q.most * q.scale) for q in effect.quantities}
     if len(ranges) == 1:  # of which what is reported is a monotone function
         ((low, high),) = ranges.values()
-        one, other = (effect.reported(np.array([end]), scenario)[name][0] for end in (low, high))
+        one, other = (effect.reported(np.array([end]), scenario, twin)[name][0] for end in (low, high))
         return min(one, other), max(one, other)
     low, high = ranges.get(name, (-math.inf, math.inf))
     return max(low, 0.0) if name in effect.nonnegative else low, min(high, 1.0) if name == "fraction" else high

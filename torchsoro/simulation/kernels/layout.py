@@ -30,7 +30,8 @@ MASS, VOLUME, BULK, SHEAR, VISCOSITY, VOLUME_VISCOSITY, SPRING, ANCHOR, DRAG, VO
     11,
 )
 STIFFENING = 12  # two of them: by I1b - 3 and by its square
-COEFFICIENTS = 14
+AIR_SHARE, AIR_STIFFNESS = 14, 15  # of a solid that encloses air of a chamber: share of its volume, and that air's k
+COEFFICIENTS = 16
 
 # Per-element numbers of the exact-exponential history update: decay a, gain b, modulus g relative to equilibrium.
 PRONY_DECAY, PRONY_GAIN, PRONY_MODULUS = 0, 1, 2
@@ -86,8 +87,9 @@ FACED, TIES, PUSHES, WALL_CHUNKS, FLUID, WATCHED, SAMPLE_AT = range(26, 33)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
-# recorded at samples; contact of a body with itself.
-LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED, REPELLED = (2**n for n in range(9))
+# recorded at samples; solids that have shares of the chambers' air; contact of a body with itself.
+LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED = (2**n for n in range(8))
+SHARED_AIR, REPELLED = 2**8, 2**9
 # All loads and laws, for variations that have now one and now another.
 ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 
@@ -242,3 +244,4 @@ NODAL = 5
 CHAMBER_STIFFNESS, CHAMBER_VOLUME = 0, 1
 CHAMBER = 2
 ABSENT = -2  # kind of a lattice place without a particle
+ENCLOSES = -3  # kind of a solid of which a share is air of the first chamber; -4 of the second, and so on

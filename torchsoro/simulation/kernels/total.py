@@ -12,6 +12,7 @@ from torchsoro.simulation.kernels.lattice import nodes_per_axis, particle_place,
 from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
+    AIR_SHARE,
     ANCHOR,
     BATCH,
     BLOCKS,
@@ -22,6 +23,7 @@ from torchsoro.simulation.kernels.layout import (
     COLLAPSED,
     ELEMENT,
     ELEMENTS,
+    ENCLOSES,
     FLUID,
     FORCE,
     GRAVITY,
@@ -60,6 +62,7 @@ from torchsoro.simulation.kernels.layout import (
     SHAPES,
     SHARE,
     SHARED,
+    SHARED_AIR,
     SHEAR,
     SLOT_CHAMBER,
     SLOTS,
@@ -166,11 +169,20 @@ def force_at(block: ti.template(), t, b, g):
 
 
 @ti.func
+def air_of(block: ti.template(), p):
+    """The chamber whose air point p is, or has a share of; negative for none."""
+    kind = block.ints[block.head[KIND] + p]
+    if ti.static(block.features & SHARED_AIR):
+        kind = ti.select(kind <= ENCLOSES, ENCLOSES - kind, kind)
+    return kind
+
+
+@ti.func
 def chamber_share(block: ti.template(), q, b, p, mine):
     """Hand over the share of point p in its chamber's area, volume times cof F; nothing if it is in none (``mine``).
 
     Returns:
-        The reference volume, the volume ratio, and cof F.
+        The reference volume of its air, the volume ratio, and cof F.
     """
     points = product(points_per_axis(block.head))
     zero = block.fixed[STEP_SIZE] * 0
@@ -180,6 +192,8 @@ def chamber_share(block: ti.template(), q, b, p, mine):
     if mine == 1:
         F = plus_identity(tile_gradient(block, 0, q), 1)
         volume = block.fixed[block.head[COEFFICIENT] + (b * COEFFICIENTS + VOLUME) * points + p]
+        if ti.static(block.features & SHARED_AIR):
+            volume *= block.fixed[block.head[COEFFICIENT] + (b * COEFFICIENTS + AIR_SHARE) * points + p]
         cof = cofactor(F)
         ratio = contract(cof, F) / 3
     hand_over(block, q, volume * cof)
@@ -243,6 +257,9 @@ def stress_point(block: ti.template(), q, t, b, p):
             else:
                 for c in range(head[HISTORIES]):
                     state[out + c * points] = 0
+            if ti.static(block.features & SHARED_AIR):
+                if kind <= ENCLOSES and fixed[mat + AIR_SHARE * points] > 0 and not F.determinant() > 0:
+                    ti.atomic_min(block.ints[COLLAPSED], t)
             P = volume * piola(F, Q, bulk, solid, shear, factor, void_fraction)
         else:
             for c in range(head[HISTORIES]):
@@ -291,7 +308,7 @@ def point_pass(block: ti.template(), item, fresh, t):
                 p = point_of(block, cell, counts, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
-                    mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
+                    mine = ti.cast(air_of(block, p) == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
                 volume, ratio, _ = chamber_share(block, q, b, p, mine)
                 block.pad[block.base + ALONE + q] = volume * ratio
         sync(gpu)

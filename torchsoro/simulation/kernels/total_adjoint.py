@@ -28,7 +28,6 @@ from torchsoro.simulation.kernels.layout import (
     HEAD,
     HOLLOW,
     IMMERSED,
-    KIND,
     LOADED,
     NEAR_NODES,
     NODAL,
@@ -88,7 +87,7 @@ from torchsoro.simulation.kernels.tile import (
     tile_count,
     tile_gradient,
 )
-from torchsoro.simulation.kernels.total import chamber_share, slow
+from torchsoro.simulation.kernels.total import air_of, chamber_share, slow
 from torchsoro.simulation.kernels.total_points_adjoint import rate_point_adjoint, stress_point_adjoint
 from torchsoro.simulation.kernels.total_walls import (
     chamber_volume_bar,
@@ -247,7 +246,7 @@ def point_pass_adjoint(block: ti.template(), item, fresh, t):
                 p = point_of(block, cell, counts, q)
                 mine = ti.cast(0, ti.i32)
                 if p >= 0:
-                    mine = ti.cast(ints[head[KIND] + p] == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
+                    mine = ti.cast(air_of(block, p) == ints[head[SLOT_CHAMBER] + 2 * slot], ti.i32)
                 volume, _, cof = chamber_share(block, q, b, p, mine)
                 P_bar = tile_gradient(block, 1, ti.select(mine == 1, q, 0))
                 block.pad[block.base + ALONE + q] = volume * contract(P_bar, cof)

@@ -6,6 +6,7 @@ from torchsoro.simulation.kernels.lattice import nodes_per_axis, points_per_axis
 from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     ABSENT,
+    AIR_SHARE,
     ANCHOR,
     BATCH,
     BULK,
@@ -16,6 +17,7 @@ from torchsoro.simulation.kernels.layout import (
     ELEMENT,
     ELEMENT_BAR,
     ELEMENTS,
+    ENCLOSES,
     HISTORIES,
     JACOBIANS,
     KIND,
@@ -24,6 +26,7 @@ from torchsoro.simulation.kernels.layout import (
     PRONY_DECAY,
     PRONY_GAIN,
     PRONY_MODULUS,
+    SHARED_AIR,
     SHEAR,
     SOFTENING,
     SOFTENING_BAR,
@@ -126,6 +129,27 @@ def softened_adjoint(block: ti.template(), x, at, here, b, p, points, left_bar):
 
 
 @ti.func
+def chamber_pressure_at(block: ti.template(), t, b, chamber):
+    """Pressure of a chamber in substep t, by the volume that was kept."""
+    one = b * block.head[CHAMBERS] + chamber
+    volume = block.kept[block.head[VOLUMES] + t * block.head[BATCH] * block.head[CHAMBERS] + one]
+    return chamber_pressure(block, t, volume, one)
+
+
+@ti.func
+def owed_by_volume(block: ti.template(), b, p, chamber, mat, mat_bar, points):
+    """Gradient by a point's volume of air from that by its chamber's, which is known one pass after the points."""
+    head, sums = ti.static((block.head, block.sums))
+    by_volume = (
+        block.back[head[VOLUME_BAR] + b * head[CHAMBERS] + chamber] * block.back[head[JACOBIANS] + b * points + p]
+    )
+    if ti.static(block.features & SHARED_AIR):
+        add(False, sums, mat_bar + AIR_SHARE * points, by_volume * block.fixed[mat + VOLUME * points])
+        by_volume *= block.fixed[mat + AIR_SHARE * points]
+    add(False, sums, mat_bar + VOLUME * points, by_volume)
+
+
+@ti.func
 def stress_point_adjoint(block: ti.template(), q, t, b, p):
     """Adjoint of ``total.stress_point``: hands over the gradients by F and by the place of point p."""
     head, fixed, state, bar, sums = ti.static((block.head, block.fixed, block.state, block.bar, block.sums))
@@ -138,10 +162,11 @@ def stress_point_adjoint(block: ti.template(), q, t, b, p):
     points, elements, nodes = product(points_per_axis(head)), head[ELEMENTS], product(nodes_per_axis(head))
     mine = b * COEFFICIENTS * points + p
     mat, mat_bar = head[COEFFICIENT] + mine, head[COEFFICIENT_BAR] + mine
-    if kind >= 0 and t + 1 < head[STEPS]:
-        # The gradient by a chamber's volume is known one pass after the points that fill it.
-        by_volume = block.back[head[VOLUME_BAR] + b * head[CHAMBERS] + kind]
-        add(False, sums, mat_bar + VOLUME * points, by_volume * block.back[head[JACOBIANS] + b * points + p])
+    air = kind
+    if ti.static(block.features & SHARED_AIR):
+        air = ti.select(kind <= ENCLOSES, ENCLOSES - kind, kind)
+    if air >= 0 and t + 1 < head[STEPS]:
+        owed_by_volume(block, b, p, air, mat, mat_bar, points)
     if t >= 0 and kind != ABSENT:
         history = b * state_length(head) + 6 * nodes + p
         maxwell = (t * head[BATCH] + b) * state_length(head) + 6 * nodes + p
@@ -197,13 +222,20 @@ def stress_point_adjoint(block: ti.template(), q, t, b, p):
                 F_bar += by_F
                 add(False, sums, mat_bar + STIFFENING * points, linear_bar)
                 add(False, sums, mat_bar + (STIFFENING + 1) * points, square_bar)
+            if ti.static(block.features & SHARED_AIR):
+                if air >= 0:
+                    cof, share = cofactor(F), fixed[mat + AIR_SHARE * points]
+                    pressure = chamber_pressure_at(block, t, b, air)
+                    pressed = pressure * contract(P_bar, cof)
+                    F_bar -= share * pressure * cross(F, P_bar)
+                    work -= share * pressed
+                    add(False, sums, mat_bar + AIR_SHARE * points, -pressed)
+                    block.back[head[JACOBIANS] + b * points + p] = contract(cof, F) / 3
         else:
             for c in range(head[HISTORIES]):
                 bar[history + c * points] = 0
             cof = cofactor(F)
-            one = b * head[CHAMBERS] + kind
-            step = t * head[BATCH] * head[CHAMBERS] + one
-            pressure = chamber_pressure(block, t, block.kept[head[VOLUMES] + step], one)
+            pressure = chamber_pressure_at(block, t, b, kind)
             shear_bar = void_work(F, P_bar)
             F_bar = void_piola_adjoint(F, shear, P_bar) - pressure * cross(F, P_bar)
             work = shear * shear_bar - pressure * contract(P_bar, cof)
@@ -233,7 +265,8 @@ def rate_point_adjoint(block: ti.template(), q, b, p):
     zero = fixed[STEP_SIZE] * 0
     rate_bar = ti.Matrix([[zero, zero, zero], [zero, zero, zero], [zero, zero, zero]])
     if p >= 0:
-        if block.ints[head[KIND] + p] == -1:
+        kind = block.ints[head[KIND] + p]
+        if kind < 0 and kind != ABSENT:
             points = product(points_per_axis(head))
             mat = head[COEFFICIENT] + b * COEFFICIENTS * points + p
             F = plus_identity(tile_gradient(block, 0, q), 1)

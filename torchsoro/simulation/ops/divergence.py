@@ -26,7 +26,9 @@ def report(scene: Scene, inputs: Inputs, step: int, state: Tensor) -> None:
     lattice = _lattice(scene)
     d = _nodes(lattice, state)
     J = torch.linalg.det(lattice.gradient(d).permute(0, 3, 1, 2) + torch.eye(3).to(state))
-    solid = (scene.kind == -1) & (inputs.coefficients[:, layout.VOID_FRACTION] == 0)
+    mixed = scene.kind <= layout.ENCLOSES
+    tangled = (scene.kind >= 0) | (mixed & (inputs.coefficients[:, layout.AIR_SHARE] > 0))
+    solid = ((scene.kind == -1) | mixed) & (inputs.coefficients[:, layout.VOID_FRACTION] == 0)
     x = _points(lattice, d)
     there = scene.kind != layout.ABSENT
     smaller = "a smaller time step, a lower pressure or a higher void fraction"
@@ -36,7 +38,7 @@ def report(scene: Scene, inputs: Inputs, step: int, state: Tensor) -> None:
         (~torch.isfinite(J) & there, "the state is not finite", "J", J, smaller),
         ((J <= 0) & solid, "the volume ratio is not positive", "J", J, smaller),
         (
-            (J <= 0) & (scene.kind >= 0),
+            (J <= 0) & tangled,
             "the chamber is tangled inside",
             "J",
             J,

@@ -89,7 +89,7 @@ def _areas(scene: Scene, planes: Tensor) -> Tensor:
 def _integers(scene: Scene, chambers: int, like: Tensor) -> list[Tensor]:
     """In the order of ``layout.BUFFERS``."""
     assert scene.lattice is not None
-    found = tables(scene.lattice, tiles_of(scene.lattice, like), scene.kind, chambers)
+    found = tables(scene.lattice, tiles_of(scene.lattice, like), scene.air, chambers)
     near = np.full(0 if scene.markers is None else scene.lattice.nodes, -1)
     if scene.markers is not None:
         near[scene.markers.near.cpu()] = np.arange(len(scene.markers.near))

@@ -92,12 +92,14 @@ def gather_gradients(
     found[:, COEFFICIENTS] = by_point
     by_air = lanes.summed(tensor(sums.air, groups, mesh.chambers, layout.CHAMBER, LANES))
     if len(lanes.pairs):
-        rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * (torch.from_numpy(case.gas) != 0).view(
-            groups, -1, 8, LANES
-        )
+        rows = tensor(sums.gas, groups, len(lanes.pairs), 8, LANES) * lanes.holds(s.air)
         wide = c.new_zeros(groups, blocks, 8, 1, LANES)
         wide[:, :, :, 0].index_add_(1, lanes.pairs[:, 0], rows)
-        found[:, layout.VOLUME] += lanes.to_points(wide, points)[:, 0]
+        by_volume = lanes.to_points(wide, points)[:, 0]
+        if s.shared:
+            found[:, layout.AIR_SHARE] += by_volume * c[:, layout.VOLUME]
+            by_volume = by_volume * c[:, layout.AIR_SHARE]
+        found[:, layout.VOLUME] += by_volume
         means = chamber_means(s, c, s.gas_chambers)
         found += chamber_adjoint(s, c, means, by_air[:, : s.gas_chambers])
     if s.springs:

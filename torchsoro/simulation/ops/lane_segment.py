@@ -19,7 +19,7 @@ from torchsoro.simulation.kernels.lane_points import MAXWELL, VOID_FRACTION, VOL
 from torchsoro.simulation.kernels.lane_selfcontact import SelfContact
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
-from torchsoro.simulation.ops.chambers import chamber_means
+from torchsoro.simulation.ops.chambers import air_volumes, chamber_means
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.lane_gradients import (
     COEFFICIENTS,
@@ -87,7 +87,7 @@ class LaneIntegrator:
         self.steps = inputs.gravity.shape[0]
         like = inputs.coefficients
         self.batch, self.elements = like.shape[0], inputs.prony.shape[1]
-        self.lanes: Lanes = lay_out(scene.lattice, scene.kind, self.batch, like.dtype)
+        self.lanes: Lanes = lay_out(scene.lattice, scene.kind, scene.air, self.batch, like.dtype)
         self.mesh: Mesh = self.lanes.mesh
         self.history = 6 * self.elements + scene.softens
         # Nodes whose motion is observed; all if None.
@@ -112,12 +112,8 @@ class LaneIntegrator:
 
     def _gas(self, values: Tensor) -> Tensor:
         """Volumes of the gas in each pair of a block and a chamber [groups, pairs, 8, 16]."""
-        lanes = self.lanes
-        kinds = self.scene.kind.to(values.dtype).expand(self.batch, 1, -1)
-        kind = lanes.from_points(kinds, empty=-1.0)[:, :, :, 0]
-        V = lanes.from_points(values.unsqueeze(1))[:, :, :, 0]
-        block, chamber = lanes.pairs.unbind(1)
-        return torch.where(kind[:, block] == chamber[:, None, None], V[:, block], 0.0)
+        V = self.lanes.from_points(values.unsqueeze(1))[:, :, :, 0]
+        return torch.where(self.lanes.holds(self.scene.air), V[:, self.lanes.pairs[:, 0]], 0.0)
 
     def _coefficients(self) -> Tensor:
         """Numbers of the points: gas counts as void that only shears; what is absent as void without volume."""
@@ -181,7 +177,7 @@ class LaneIntegrator:
             flags=(bool(s.stiffens), bool(s.softens), bool(s.viscous), False, bool(s.springs)),
             numbers=numbers(self._coefficients()),
             attached=numbers(self._attached()),
-            gas=numbers(self._gas(like[:, layout.VOLUME])),
+            gas=numbers(self._gas(air_volumes(s, like))),
             maxwell=numbers(lanes.from_batch(prony)),
             softening=numbers(lanes.from_batch(i.softening)),
             inverse_mass=numbers(lanes.from_nodes(inverse)),

@@ -75,6 +75,16 @@ class Lanes:
         places = (flat >= 0).nonzero().squeeze(1)
         return flat[places], places
 
+    def holds(self, air: Tensor) -> Tensor:
+        """Which points of each pair of a block and a chamber hold air of that chamber, bool [pairs, 8, 16].
+
+        Args:
+            air: The chamber whose air each point is, or has a share of [points].
+        """
+        block, chamber = self.pairs.unbind(1)
+        of = torch.where(self._there, air.cpu()[self.points.clamp(min=0)], -1)
+        return of[block] == chamber[:, None, None]
+
     def from_points(self, values: Tensor, empty: float = 0.0) -> Tensor:
         """Values by point [B, K, points] as [groups, blocks, 8, K, 16]."""
         batch, count, _ = values.shape
@@ -182,26 +192,27 @@ _known: OrderedDict[tuple, Lanes] = OrderedDict()
 MOST = 64  # layouts that are remembered
 
 
-def lay_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
+def lay_out(lattice: Lattice, kind: Tensor, air: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
     """:func:`_laid_out`, remembered: every call of a simulator asks again for the same body."""
     axes = ((a.knots.tobytes(), a.first.tobytes()) for a in lattice.axes)
     walls = None if lattice.walls is None else lattice.walls.key
-    key = (*axes, walls, kind.cpu().numpy().tobytes(), batch, dtype)
+    key = (*axes, walls, kind.cpu().numpy().tobytes(), batch, dtype)  # which the chambers' air follows from
     found = _known.pop(key, None)
     if found is None:
-        found = _laid_out(lattice, kind, batch, dtype)
+        found = _laid_out(lattice, kind, air, batch, dtype)
     _known[key] = found  # the last one
     while len(_known) > MOST:
         _known.popitem(last=False)
     return found
 
 
-def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
+def _laid_out(lattice: Lattice, kind: Tensor, air: Tensor, batch: int, dtype: torch.dtype) -> Lanes:
     """Deal the cells of a lattice, and the simulations of a batch, to blocks of sixteen lanes.
 
     Args:
         lattice: Of the bodies.
-        kind: Of each point [points]: -1 for solid, else the number of a chamber, or ABSENT.
+        kind: Of each point [points], see ``Scene.kind``; or ABSENT.
+        air: The chamber whose air each point is, or has a share of [points]; negative for none.
         batch: Number of simulations.
         dtype: Of the kernels' numbers.
     """
@@ -256,7 +267,7 @@ def _laid_out(lattice: Lattice, kind: Tensor, batch: int, dtype: torch.dtype) ->
         items += [(int(layer[0, 0]), a, b) for a, b in itertools.pairwise(cuts)]
 
     points = np.stack([where for _, where, _, _ in blocks])
-    flat = kind.cpu().numpy()
+    flat = air.cpu().numpy()
     of = np.where(points >= 0, flat[np.maximum(points, 0)], -1)
     gas = int(flat.max()) + 1 if (flat >= 0).any() else 0
     chambers = gas + (0 if lattice.walls is None else lattice.walls.count)

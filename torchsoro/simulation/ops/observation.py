@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.ops.axis_sums import PARTICLES, QUADRATURE
+from torchsoro.simulation.ops.chambers import chamber_air, chamber_air_adjoint
 from torchsoro.simulation.ops.inertia import Matching
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.markers import Markers
@@ -134,10 +135,10 @@ def _total_observe(state: Tensor, weight: Tensor, coefficients: Tensor, pressure
     whole = pairwise_sum(motion * nodal.unsqueeze(1))
     volumes, means = [pressure[..., :0]], [pressure[..., :0]]
     for c in range(scene.gas_chambers):
-        gas, _, _, F = _chamber(d, c, scene)
-        J, V = torch.linalg.det(F), coefficients[:, layout.VOLUME, gas]
+        *_, F = _chamber(d, c, scene)
+        J, (V, K) = torch.linalg.det(F), chamber_air(scene, coefficients, c)
         full = pairwise_sum(V)
-        k = pairwise_sum(V * coefficients[:, layout.BULK, gas]) / full
+        k = pairwise_sum(V * K) / full
         volumes.append(_whole(V * J))
         means.append((pressure[..., c] - k * (volumes[-1][..., 0] / full - 1)).unsqueeze(-1))
     if lattice.walls is not None:
@@ -190,8 +191,8 @@ def _total_observe_adjoint(
     if m is not None:
         _add_at(motion_bar[0], at, torch.einsum("bpca,pan->bcpn", gradient_bar, m.slopes.to(state)))
     for c in range(scene.gas_chambers if chambers else 0):
-        gas, at, slopes, F = _chamber(motion[0], c, scene)
-        V, K = coefficients[:, (layout.VOLUME, layout.BULK)][..., gas].unbind(1)
+        at, slopes, F = _chamber(motion[0], c, scene)
+        V, K = chamber_air(scene, coefficients, c)
         whole = _whole(V)
         a, b, e = F.unbind(-2)
         cofactor = torch.stack([torch.linalg.cross(b, e), torch.linalg.cross(e, a), torch.linalg.cross(a, b)], -2)
@@ -199,10 +200,8 @@ def _total_observe_adjoint(
         k, growth = _whole(V * K) / whole, _whole(V * J) / whole - 1
         by_mean = mean_bar[:, c : c + 1]
         swept_bar, k_bar = volume_bar[:, c : c + 1] - by_mean * k / whole, -by_mean * growth
-        coefficients_bar[:, layout.VOLUME, gas] += (
-            swept_bar * J + (k_bar * (K - k) + by_mean * k * (growth + 1)) / whole
-        )
-        coefficients_bar[:, layout.BULK, gas] += k_bar * V / whole
+        V_bar = swept_bar * J + (k_bar * (K - k) + by_mean * k * (growth + 1)) / whole
+        chamber_air_adjoint(scene, coefficients, c, V_bar, k_bar * V / whole, coefficients_bar)
         pressure_bar[:, c] += by_mean[:, 0]
         by_nodes = torch.einsum("bpca,pan->bcpn", (swept_bar * V)[..., None, None] * cofactor, slopes)
         _add_at(motion_bar[0], at, by_nodes)
@@ -241,12 +240,12 @@ def _motion(state: Tensor, nodes: int) -> tuple[Tensor, Tensor]:
     return d, v
 
 
-def _chamber(d: Tensor, c: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points of a chamber, their nodes and slopes there, and their deformation gradients [B, points, 3, 3]."""
+def _chamber(d: Tensor, c: int, scene: Scene) -> tuple[Tensor, Tensor, Tensor]:
+    """Nodes of the points of a chamber, slopes there, and deformation gradients [B, points, 3, 3]."""
     gas = scene.gas(c)
     at, _, slopes = _stencil(scene, f"chamber {c}", lambda: gas, QUADRATURE, d)
     F = torch.einsum("...cpn,pan->...pca", d[..., at], slopes) + torch.eye(3).to(d)
-    return gas, at, slopes, F
+    return at, slopes, F
 
 
 # Stencils of the probes and chambers, computed once per scene.

@@ -37,7 +37,8 @@ class Scene:
         blend: 0 for APIC, 1 for affine FLIP, between them a mixture.
         low: Lower corner of the analysis box [m].
         high: Upper corner of the analysis box [m].
-        kind: int32 [N], -1 for solid, else the number of the gas chamber.
+        kind: int32 [N], -1 for solid, else the number of the gas chamber; ENCLOSES - c for a solid of which a share is
+            air of chamber c.
         share: [groups, N], each particle's share of its group's force.
         plane_kind: int32 [planes, PLANE_INTEGERS]: axis (-1 if oblique), side (+1 or -1), 1 for stick or 0 for Coulomb,
             1 for elastic landing or 0.
@@ -102,7 +103,17 @@ class Scene:
     @cached_property
     def gas_chambers(self) -> int:
         """Number of chambers of gas particles; hollow ones follow them."""
-        return int(self.kind.max()) + 1 if bool((self.kind >= 0).any()) else 0
+        return max(int(self.air.max()) + 1, 0) if len(self.air) else 0
+
+    @cached_property
+    def air(self) -> Tensor:
+        """The chamber whose air each particle is, or has a share of, int32 [N]; negative for none."""
+        return torch.where(self.kind <= layout.ENCLOSES, layout.ENCLOSES - self.kind, self.kind)
+
+    @cached_property
+    def shared(self) -> bool:
+        """Whether solids have shares of the chambers' air, rather than that gas particles are all of it."""
+        return bool((self.kind <= layout.ENCLOSES).any())
 
     @property
     def chambers(self) -> int:
@@ -126,9 +137,9 @@ class Scene:
         return {}
 
     def gas(self, chamber: int) -> Tensor:
-        """The particles of a chamber, int64."""
+        """The particles that are air of a chamber, or have a share of it, int64."""
         if chamber not in self._gas:
-            self._gas[chamber] = (self.kind == chamber).nonzero().squeeze(1)
+            self._gas[chamber] = (self.air == chamber).nonzero().squeeze(1)
         return self._gas[chamber]
 
 

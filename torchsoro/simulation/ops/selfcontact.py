@@ -53,7 +53,8 @@ class Surface:
         """
         lattice = scene.lattice
         assert lattice is not None
-        void_fraction, solid = coefficients[:, layout.VOID_FRACTION].detach(), scene.kind == -1
+        void_fraction = coefficients[:, layout.VOID_FRACTION].detach()
+        solid = (scene.kind == -1) | (scene.kind <= layout.ENCLOSES)
         matter = solid & (void_fraction < 1).any(0)
         whole = (solid & (void_fraction == 0).all(0)).view(1, 1, *lattice.points)
         partly = torch.nn.functional.pad((~whole).to(torch.float32), (1,) * 6, value=1.0)

@@ -76,8 +76,8 @@ def _tiles_of(axes: tuple[Axis, ...], itemsize: int) -> Tiles:
     return min(found, key=lambda tiles: tiles.count)
 
 
-def tables(lattice: Lattice, tiles: Tiles, kind: Tensor, chambers: int) -> list[np.ndarray]:
-    """Index tables of a lattice whose points are of these kinds [points].
+def tables(lattice: Lattice, tiles: Tiles, air: Tensor, chambers: int) -> list[np.ndarray]:
+    """Index tables of a lattice whose points are air of these chambers, or have a share of it [points].
 
     Returns:
         In the order of ``layout.BUFFERS``: the lowest node of the cells along x, y and z; the tiles along them; where
@@ -87,7 +87,7 @@ def tables(lattice: Lattice, tiles: Tiles, kind: Tensor, chambers: int) -> list[
         followed by the chunks of its wall points.
     """
     counts, shape = tiles.counts, tiles.of
-    kinds = kind.cpu().numpy().reshape(lattice.points)
+    kinds = air.cpu().numpy().reshape(lattice.points)
     points = np.meshgrid(*map(_tile_of_points, tiles.along), indexing="ij")
     tile_of = np.ravel_multi_index(points, counts)
     has = np.zeros((tiles.count, chambers), bool)

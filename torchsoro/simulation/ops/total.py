@@ -52,6 +52,7 @@ def _features(scene: Scene) -> int:
         layout.PUSHED_NODES: scene.node_share is not None,
         layout.HOLLOW: scene.lattice.walls is not None,
         layout.RECORDED: scene.only_markers and scene.markers is not None,
+        layout.SHARED_AIR: scene.shared,
         layout.REPELLED: scene.self_contact,
     }
     return sum(feature for feature, on in there.items() if on)
