@@ -45,6 +45,8 @@ class Options:
     """Pictures of the movie per second."""
     follow: bool = False
     """Let the movie's camera follow the robot."""
+    self_contact: bool | None = None
+    """Let parts of the body that fold onto each other repel each other; as in the robot's settings if left out."""
     min_wall: AtLeastZero | None = None
     """Thickness up to which thin walls are mended [m]; as in the robot's settings if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -71,6 +73,7 @@ def main(chosen: Options) -> dict[str, float]:
     from torchsoro.design.robot import build
     from torchsoro.output import archive
     from torchsoro.output.delivery import mending_line, numbers, show
+    from torchsoro.output.folding import folding_line
     from torchsoro.storage import check_folder
 
     if chosen.archive is not None:
@@ -91,7 +94,9 @@ def main(chosen: Options) -> dict[str, float]:
     duration = max(1, round(chosen.cycles / base.frequency / base.sample_every)) * base.sample_every
     settle = chosen.settle if base.settle > 0 else 0.0
     min_wall = base.min_wall if chosen.min_wall is None else chosen.min_wall
-    robot = build(dataclasses.replace(base, duration=duration, settle=settle, min_wall=min_wall))
+    touches = base.self_contact if chosen.self_contact is None else chosen.self_contact
+    changes = {"duration": duration, "settle": settle, "min_wall": min_wall, "self_contact": touches}
+    robot = build(dataclasses.replace(base, **changes))
     out = chosen.out or Path("runs/replay") / folder.name
     written = ("motion.npz", "motion.html", "shape.stl", "shape.3mf", "shape.json")
     check_folder("out", out, (f"{folder.name}.mp4", *written))
@@ -105,7 +110,7 @@ def main(chosen: Options) -> dict[str, float]:
     print(f"{folder.name}, {chosen.cycles:g} cycles: travel {1e3 * found['L']:.2f} mm; {numbers(found)}")
     if (then := designed.get("stride")) is not None:
         print(f"in the design run, over all of its cycles and with void: stride {1e3 * then:.2f} mm")
-    print(mending_line(found), end="")
+    print(mending_line(found) + folding_line(found, robot.settings), end="")
     print(f"printable part: {part.report}\nmovie and STL are in {out}")
     return found
 

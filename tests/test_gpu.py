@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
@@ -41,3 +43,32 @@ def test_cuda_float32_agrees_with_cpu_float64(cuda: torch.device, transfer: str)
     torchsoro.init("cpu")
     assert travel == pytest.approx(exact, rel=2e-3)
     assert (gradient - exact_gradient).norm() < 5e-3 * exact_gradient.norm()
+
+
+@pytest.mark.slow
+def test_a_body_that_meets_itself_does_so_on_cuda_as_on_a_cpu(cuda: torch.device) -> None:
+    def closed(device: str, dtype: torch.dtype) -> tuple[torch.Tensor, torch.Tensor]:
+        """Places of two limbs that close on each other, and the gradient by their stiffness."""
+        torchsoro.init(device)
+        h = 2.5e-3
+        domain = Domain(size=(4 * h, 8 * h, 8 * h), particles=(4, 8, 8))
+        x = domain.positions
+        slot = (x[:, 1] > 2 * h) & (x[:, 1] < 6 * h) & (x[:, 2] > 2 * h)
+        gamma = torch.where(slot, 0.0, 1.0).to(device, dtype).requires_grad_()
+        speed = torch.zeros_like(x)
+        speed[:, 1] = torch.where(x[:, 1] < 4 * h, 1.0, -1.0) * (x[:, 2] / h - 2).clamp(min=0)
+        body = fill(domain, gamma, solid=Solid(), epsilon=1e-2, void_range=(0.1, 0.6))
+        body = dataclasses.replace(body, velocity=speed.to(device, dtype))
+        simulator = Simulator(
+            cell=2 * h, dt=8e-5, low=(-0.1,) * 3, high=(0.1,) * 3, formulation="total", self_contact=True
+        )
+        run = simulator(body, duration=60 * 8e-5, gravity=(0.0, 0.0, 0.0), probes=(~slot).nonzero().squeeze(1))
+        run.position[-1, :, 1].square().sum().backward()
+        assert gamma.grad is not None
+        return run.position[-1].detach().double().cpu(), gamma.grad.double().cpu()
+
+    exact, exact_gradient = closed("cpu", torch.float64)
+    places, gradient = closed(str(cuda), torch.float32)
+    torchsoro.init("cpu")
+    assert (places - exact).abs().max() < 1e-5
+    assert (gradient - exact_gradient).norm() < 1e-2 * exact_gradient.norm()

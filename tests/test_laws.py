@@ -38,6 +38,8 @@ def arguments(name: str) -> np.ndarray:
             column = rng.uniform(0.2, 1, STATES)
         elif argument == "touch":
             column = rng.uniform(0.05, 0.2, STATES)
+        elif argument in ("square", "a", "b"):
+            column = rng.uniform(-0.1, 1, STATES)
         elif argument in ("friction", "hold"):
             column = rng.uniform(0, 1, STATES) * rng.integers(0, 2, STATES)
         else:

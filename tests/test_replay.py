@@ -37,7 +37,7 @@ def play(replay: ModuleType, robot: Path | str, out: Path, **changes: Any) -> di
 def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, straight, tmp_path, capsys):
     path, result = straight
     found = play(replay, path, tmp_path / "out", void=True)
-    names = ("L", "feet", "stride", "C", "C_limit", "C_within_limit", "mass", "thinnest_wall", "thinnest_gap")
+    names = ("L", "feet", "stride", "C", "C_limit", "C_within_limit", "mass", "folded", "thinnest_wall", "thinnest_gap")
     assert found == {name: pytest.approx(result[name], rel=1e-6) for name in names}
     assert {file.name for file in (tmp_path / "out").iterdir()} == {
         "straight.mp4",

@@ -405,6 +405,7 @@ class Robot(nn.Module):
             formulation=self.formulation,
             memory_budget=int(s.memory * 2**30) or None,
             together=self.carried(s.scenarios) or None,  # by however many processes
+            self_contact=s.self_contact,
         )
 
 

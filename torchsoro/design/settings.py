@@ -205,6 +205,8 @@ class Settings:
     """Total-Lagrangian, several times faster and without losses; or updated MLS-MPM, the paper's."""
     transfer: Literal["apic", "flip"] = "apic"
     """Transfer between particles and grid, of the updated formulation."""
+    self_contact: bool = False
+    """Let parts of the body that fold onto each other repel each other, void excepted, in the total formulation."""
     void_range: tuple[_Density, _Density] = (0.1, 0.3)
     """Densities between which stress goes over from a law of void, which stands being crushed, to the solid's."""
     memory: AtLeastZero = 0.0
@@ -275,6 +277,11 @@ class Settings:
         parse_resolution(self.resolution)
         if self.fps > 120:
             raise ValueError(f"fps = {self.fps}: wanted at most 120")
+        if self.self_contact and self.formulation != "total":
+            raise ValueError(
+                f"self_contact = True: beside formulation = {self.formulation!r}, wanted 'total'; "
+                "in the updated formulation parts of a body meet on the grid"
+            )
         if not self.void_range[0] < self.void_range[1]:
             raise ValueError(f"void_range = {self.void_range}: wanted two increasing densities from 0 to 1")
         if self.offset > 0.25 * min(self.size):

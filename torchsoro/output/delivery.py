@@ -27,6 +27,7 @@ from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import begin_with, save_design
 from torchsoro.output.fabricate import fabricate, surface
+from torchsoro.output.folding import folded, folding_line
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
@@ -119,7 +120,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
-        f"{rounding_line(result)}"
+        f"{rounding_line(result)}{folding_line(result, settings)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -259,9 +260,10 @@ def show(
 
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
-        whether it is met, mass [kg], of a turner its angles to the left, and to the right with the supply mirrored
-        [rad], thinnest wall and gap of the part [m] (NaN if there is none), of one whose walls were to be mended what
-        :func:`told_of` says, ``more``; and the printable part. All but C are those of the part with its walls mended.
+        whether it is met, mass [kg], how many particles lie in another part of the body at the worst (``folded``), of a
+        turner its angles to the left, and to the right with the supply mirrored [rad], thinnest wall and gap of the
+        part [m] (NaN if there is none), of one whose walls were to be mended what :func:`told_of` says, ``more``; and
+        the printable part. All but C are those of the part with its walls mended.
 
     Raises:
         ValueError: if the design has no connected body to print; all but the part is written before.
@@ -285,6 +287,7 @@ def show(
         # Rounding differs between the run's device and this one.
         "C_within_limit": bool(intermediate <= s.c_max * (1 + 1e-4)),
         "mass": float(outcome.mass),
+        "folded": folded(robot, density, trajectory),
     }
     if s.robot == "turner":
         with progress_bar(f"simulating {name}, supply mirrored") as progress:

@@ -297,6 +297,27 @@ def formulation_of(formulation: FormulationName | Formulation, transfer: str | N
     return kinds[formulation]
 
 
+def check_self_contact(wanted: bool, formulation: Formulation) -> None:
+    """Refuse contact of a body with itself in a formulation that has none.
+
+    Raises:
+        ValueError: naming what is in its way.
+    """
+    if not isinstance(wanted, bool):
+        raise ValueError(f"self_contact = {wanted!r}: wanted True or False")
+    if not wanted:
+        return
+    if not isinstance(formulation, Total):
+        raise ValueError(
+            f'self_contact = True: beside formulation = {formulation.name!r}, wanted "total"; '
+            "in the updated formulation parts of a body meet on the grid"
+        )
+    if formulation.lattice is not None:
+        raise ValueError("self_contact = True: beside Total(lattice=...), wanted particles on a uniform lattice")
+    if formulation.device is not None:
+        raise ValueError(f"self_contact = True: beside Total(device={formulation.device!r}), wanted it with the body")
+
+
 def _check_transfer(transfer: str) -> None:
     if transfer not in TRANSFERS:
         raise ValueError(f"transfer = {transfer!r}: wanted one of {', '.join(map(repr, TRANSFERS))}")

@@ -317,3 +317,35 @@ def softening_adjoint(x, largest, depth, span, left_bar, largest_bar):
         -left_bar * below * back,
         left_bar * depth * below * back * back,
     )
+
+
+def repulsion(square, reach, a, b):
+    """Force between two points of a body that have come near each other, over the vector between them [N/m].
+
+    Its stiffness is that of two springs in series, twice, so that the weaker point sets it; it vanishes with its slope
+    at the reach. The energy is stiffness x reach x (1 - square / reach)^3 / 6.
+
+    Args:
+        square: Squared distance [m2].
+        reach: Squared distance from which on nothing acts [m2].
+        a: Stiffness of the one point [N/m].
+        b: Likewise of the other.
+    """
+    push = square * 0
+    if square < reach and a > 0 and b > 0:
+        left = 1 - square / reach
+        push = 2 * a * b / (a + b) * left * left
+    return push
+
+
+def repulsion_adjoint(square, reach, a, b, push_bar):
+    """Adjoint of :func:`repulsion`: gradients by the squared distance and both stiffnesses."""
+    square_bar, a_bar, b_bar = square * 0, square * 0, square * 0
+    if square < reach and a > 0 and b > 0:
+        left = 1 - square / reach
+        whole = a + b
+        square_bar = -4 * a * b / whole * left / reach * push_bar
+        by_series = 2 * left * left * push_bar / (whole * whole)
+        a_bar = by_series * b * b
+        b_bar = by_series * a * a
+    return square_bar, a_bar, b_bar

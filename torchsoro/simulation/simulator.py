@@ -24,7 +24,7 @@ from torchsoro.simulation.assembly import (
 from torchsoro.simulation.attachment import held_still, on_nodes
 from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
 from torchsoro.simulation.contact import Plane
-from torchsoro.simulation.formulation import Formulation, FormulationName, formulation_of
+from torchsoro.simulation.formulation import Formulation, FormulationName, check_self_contact, formulation_of
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import Attached, Load, attach
 from torchsoro.simulation.material import Body, Prony
@@ -42,7 +42,7 @@ class Simulator(nn.Module):
     - "updated": MLS-MPM, the paper's. The grid stays, particles move through it; bodies meet each other on the grid.
     - "total": total-Lagrangian. The grid is the body's own lattice and moves with it: no loss of energy, the same bits
       in every run, several times faster. Needs particles on a lattice of half a cell, chambers have one pressure each,
-      and a body does not feel itself where it folds (see ``selfcontact``).
+      and a body feels itself where it folds if ``self_contact`` is on (else see ``selfcontact``).
 
     A call simulates a body and returns a :class:`Trajectory`. Gradients flow to every tensor of the body, the Prony
     series, pressure, gravity, planes and loads that requires one.
@@ -66,9 +66,14 @@ class Simulator(nn.Module):
             gradient of each has the same bits in any part; those of the call if None.
         segment: Substeps between two kept states, instead of the plan from the budget; for tests.
         safety: Share of the largest stable step that dt = "auto" takes.
+        self_contact: Whether parts of a body repel each other, without friction, where they come nearer than one and a
+            half particle spacings although they were more than three apart in the undeformed body. Stiffness is
+            Young's modulus times spacing, of the weaker of two particles; void has none. Of the total formulation; in
+            the updated one parts of a body meet on the grid.
 
     Raises:
-        ValueError: for numbers that are not finite and positive, an empty box, or an unknown formulation or transfer.
+        ValueError: for numbers that are not finite and positive, an empty box, an unknown formulation or transfer, or
+            self-contact of what has none.
     """
 
     def __init__(
@@ -84,6 +89,7 @@ class Simulator(nn.Module):
         together: int | None = None,
         segment: int | None = None,
         safety: float = 0.9,
+        self_contact: bool = False,
     ) -> None:
         super().__init__()
         numbers = {"cell": cell, "dt": dt, "memory_budget": memory_budget, "segment": segment, "safety": safety}
@@ -101,6 +107,8 @@ class Simulator(nn.Module):
         self.dt: float | Literal["auto"] = "auto" if dt == "auto" else float(dt)
         self.low, self.high = _triple(low), _triple(high)
         self.memory_budget, self.together, self.segment = memory_budget, together, segment
+        check_self_contact(self_contact, self.formulation)
+        self.self_contact = self_contact
 
     def extra_repr(self) -> str:
         """For ``print``."""
@@ -283,6 +291,7 @@ class Simulator(nn.Module):
             viscous=_present(body, body.viscosity, body.volume_viscosity),
             stiffens=body.stiffening is not None and _present(body, *body.stiffening.unbind(-1)),
             probes=probes,
+            self_contact=self.self_contact,
             steady=True,
         )
 

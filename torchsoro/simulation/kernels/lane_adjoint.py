@@ -15,7 +15,8 @@ from torchsoro.simulation.kernels.lane_march import SCRATCH
 from torchsoro.simulation.kernels.lane_nodes import gravity_row, pressed, slow, sum_chamber, sum_items, tied
 from torchsoro.simulation.kernels.lane_points import ROOM
 from torchsoro.simulation.kernels.lane_points_adjoint import add, gas_end, points_backward
-from torchsoro.simulation.kernels.lane_threads import meet
+from torchsoro.simulation.kernels.lane_selfcontact import contact_backward, repelled, strayed
+from torchsoro.simulation.kernels.lane_threads import look, meet
 from torchsoro.simulation.kernels.lane_walls import ties_backward
 from torchsoro.simulation.kernels.lanes import fast, load, part, select, store
 from torchsoro.simulation.kernels.laws_lanes import laws
@@ -51,7 +52,11 @@ class Sums(NamedTuple):
 
 @part
 def retreat(mesh, case, work, sums, g, p, t, steps):
-    """Finish the gradients by the nodes of plane p after t + 1 substeps, and go back to the forces in substep t."""
+    """Finish the gradients by the nodes of plane p after t + 1 substeps, and go back to the forces in substep t.
+
+    Returns whether any node is too far away for the list of pairs in contact.
+    """
+    contact, far = work.contact, False
     n, own, dt = mesh.component, g * 6 * mesh.component, case.dt
     first = g * len(mesh.item_plane) * 9 * mesh.patch
     finishes, planes = t + 1 < steps, len(case.plane_stick)
@@ -78,6 +83,9 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
         if finishes:
             f0, f1, f2 = pressed(mesh, work, g, p, at, sum_items(work.forces, mesh, first, p, at))
             d0, d1, d2 = d0 + f0, d1 + f1, d2 + f2
+            if contact.actives[g] > 0:
+                f0, f1, f2 = repelled(mesh, contact, g, i)
+                d0, d1, d2 = d0 + f0, d1 + f1, d2 + f2
             if case.tie_stiffness.size:
                 d0, d1, d2 = (
                     d0 + tied(mesh, case, work, g, 0, i),
@@ -109,6 +117,8 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
             moves, light = load(case.moves, node) > 0, load(case.inverse_mass, node)
             left, zero = load(case.drag_factor, node), 0 * d0
             state = (t * case.groups + g) * 6 * n
+            if contact.count > 0:
+                far = strayed(mesh, contact, g, i, vector(work.states, state + i, n)) or far
             b0, b1, b2 = v0 + dt * d0, v1 + dt * d1, v2 + dt * d2
             w = vector(work.states, state + 3 * n + i, n)
             # Velocity before drag, after the quadratic one, and before planes.
@@ -151,11 +161,15 @@ def retreat(mesh, case, work, sums, g, p, t, steps):
             if sums.pulls.size > case.groups * 3 * n:
                 store_vector(sums.pulls, f + (t + 1) * case.groups * 3 * n, n, (f0, f1, f2))
         store_vector(sums.bar, a + 3 * n, n, (v0, v1, v2))
+    return far
 
 
 @fast
-def march_back(mesh, case, work, rank, threads, sums, steps):
-    """A thread's share of all substeps, the last first."""
+def march_back(mesh, case, work, rank, threads, sums, begin, listed, steps):
+    """A thread's share of all substeps, the last first, from substep ``begin`` on.
+
+    Returns -2 at the end, or the substep that wants pairs to be listed and to begin with again, ``listed``.
+    """
     items, blocks = len(mesh.item_plane), len(mesh.block_at)
     tasks, planes = case.groups * items, case.groups * mesh.planes
     own = work.scratch[rank * SCRATCH : (rank + 1) * SCRATCH]
@@ -163,11 +177,17 @@ def march_back(mesh, case, work, rank, threads, sums, steps):
     rates = own[ROOM + 2304 :]
     state_size = case.groups * 6 * mesh.component
     history_size = case.groups * blocks * 128 * case.history
-    for back in range(steps + 1):
-        t = steps - 1 - back
-        for task in range(planes * rank // threads, planes * (rank + 1) // threads):
-            retreat(mesh, case, work, sums, task // mesh.planes, task % mesh.planes, t, steps)
-        meet(work.sync, threads)
+    for back in range(begin + 2):
+        t = begin - back
+        if not (listed and back == 0):
+            for task in range(planes * rank // threads, planes * (rank + 1) // threads):
+                if retreat(mesh, case, work, sums, task // mesh.planes, task % mesh.planes, t, steps):
+                    work.contact.moved[8 * rank] = 1
+            meet(work.sync, threads)
+            if work.contact.count > 0:
+                for other in range(threads):
+                    if look(work.contact.moved, 8 * other) > 0:
+                        return t
         for task in range(tasks * rank // threads, tasks * (rank + 1) // threads):
             g, item = task // items, task % items
             if t >= 0:
@@ -180,4 +200,9 @@ def march_back(mesh, case, work, rank, threads, sums, steps):
         if rank == 0 and case.tie_stiffness.size and t >= 0:
             for g in range(case.groups):
                 ties_backward(mesh, case, work, sums, g, t * state_size + g * 6 * mesh.component)
+        for g in range(rank, case.groups, threads):
+            if work.contact.actives[g] > 0 and t >= 0:
+                state = t * state_size + g * 6 * mesh.component
+                contact_backward(mesh, work.contact, work.states, g, state, sums.pulls)
         meet(work.sync, threads)
+    return -2

@@ -26,6 +26,7 @@ from torchsoro.simulation.kernels.lane_points import (
     stretch,
     value,
 )
+from torchsoro.simulation.kernels.lane_selfcontact import SelfContact, contact_forward
 from torchsoro.simulation.kernels.lane_threads import look, meet
 from torchsoro.simulation.kernels.lane_walls import ties_forward, walls_forward
 from torchsoro.simulation.kernels.lanes import fast, law, load, part, store
@@ -137,6 +138,7 @@ class Work(NamedTuple):
     collapsed: np.ndarray
     sync: np.ndarray
     scratch: np.ndarray
+    contact: SelfContact
 
 
 @law
@@ -229,8 +231,8 @@ def points_forward(mesh, case, work, g, item, past, future, state, room, G, rate
 
 
 @fast
-def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where_collapsed):
-    """A thread's share of all substeps; how many were done."""
+def march(mesh, case, work, rank, threads, begin, steps, ring, history_ring, stop_where_collapsed):
+    """A thread's share of the substeps from ``begin`` on, up to where pairs are to be listed; how many were done."""
     items = len(mesh.item_plane)
     blocks = len(mesh.block_at)
     tasks, planes = case.groups * items, case.groups * mesh.planes
@@ -238,7 +240,7 @@ def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where
     room, G, rates = own[:ROOM], own[ROOM : ROOM + 1152], own[ROOM + 1152 :]
     state_size = case.groups * 6 * mesh.component
     history_size = case.groups * blocks * 128 * case.history
-    for t in range(steps):
+    for t in range(begin, steps):
         now, then = (t % ring) * state_size, ((t + 1) % ring) * state_size
         past, future = (t % history_ring) * history_size, ((t + 1) % history_ring) * history_size
         for task in range(tasks * rank // threads, tasks * (rank + 1) // threads):
@@ -248,12 +250,20 @@ def march(mesh, case, work, rank, threads, steps, ring, history_ring, stop_where
         if rank == 0 and case.tie_stiffness.size:
             for g in range(case.groups):
                 ties_forward(mesh, case, work, g, now + g * 6 * mesh.component)
+        for g in range(rank, case.groups, threads):
+            if work.contact.actives[g] > 0:
+                contact_forward(mesh, work.contact, work.states, g, now + g * 6 * mesh.component)
         meet(work.sync, threads)
         if stop_where_collapsed:
             for other in range(threads):
                 if look(work.collapsed, 8 * other) <= t:
                     return t
         for task in range(planes * rank // threads, planes * (rank + 1) // threads):
-            advance(mesh, case, work, task // mesh.planes, task % mesh.planes, t, ring, now, then)
+            if advance(mesh, case, work, task // mesh.planes, task % mesh.planes, t, ring, now, then):
+                work.contact.moved[8 * rank] = 1
         meet(work.sync, threads)
+        if work.contact.count > 0:
+            for other in range(threads):
+                if look(work.contact.moved, 8 * other) > 0:
+                    return t + 1
     return steps

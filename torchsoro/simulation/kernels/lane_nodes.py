@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchsoro.simulation.kernels.lane_contact import meets, store_vector, vector
+from torchsoro.simulation.kernels.lane_selfcontact import repelled, strayed
 from torchsoro.simulation.kernels.lanes import law, load, part, select, store, total
 from torchsoro.simulation.kernels.laws_lanes import laws
 
@@ -106,8 +107,8 @@ def slow(mesh, case, g, i, light, u0, u1, u2):
 
 @part
 def advance(mesh, case, work, g, p, t, ring, now, then):
-    """Move the nodes of plane p over substep t."""
-    dt = case.dt
+    """Move the nodes of plane p over substep t; whether any went too far for the list of pairs in contact."""
+    dt, contact, far = case.dt, work.contact, False
     own = g * 6 * mesh.component
     d = work.states
     slot = t % (work.pushed.size // (case.groups * 3 * mesh.component)) if work.pushed.size else 0
@@ -133,6 +134,9 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
             outer_force(mesh, case, work, f2, g, p, 2, at, t),
         )
         f0, f1, f2 = pressed(mesh, work, g, p, at, (f0, f1, f2))
+        if contact.actives[g] > 0:
+            b0, b1, b2 = repelled(mesh, contact, g, i)
+            f0, f1, f2 = f0 - b0, f1 - b1, f2 - b2
         a, b = now + own + i, then + own + i
         n = mesh.component
         d0, d1, d2 = load(d, a), load(d, a + n), load(d, a + 2 * n)
@@ -155,6 +159,8 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
         d0 = select(moves, d0 + dt * (o0 + u0), d0)
         d1 = select(moves, d1 + dt * (o1 + u1), d1)
         d2 = select(moves, d2 + dt * (o2 + u2), d2)
+        if contact.count > 0:
+            far = strayed(mesh, contact, g, i, (d0, d1, d2)) or far
         store_vector(d, b, n, (d0, d1, d2))
         store_vector(d, b + 3 * n, n, (u0, u1, u2))
         if sample >= 0 and work.seen_place[i // 16] >= 0:
@@ -162,3 +168,4 @@ def advance(mesh, case, work, g, p, t, ring, now, then):
             o = (sample * case.groups + g) * 6 * width + 16 * work.seen_place[i // 16]
             store_vector(work.seen, o, width, (d0, d1, d2))
             store_vector(work.seen, o + 3 * width, width, (u0, u1, u2))
+    return far

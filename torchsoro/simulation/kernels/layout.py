@@ -87,8 +87,9 @@ FACED, TIES, PUSHES, WALL_CHUNKS, FLUID, WATCHED, SAMPLE_AT = range(26, 33)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
-# recorded at samples; solids that have shares of the chambers' air.
-LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED, SHARED_AIR = (2**n for n in range(9))
+# recorded at samples; solids that have shares of the chambers' air; contact of a body with itself.
+LOADED, STIFFENS, SOFTENS, IMMERSED, TIED, PUSHED_NODES, HOLLOW, RECORDED = (2**n for n in range(8))
+SHARED_AIR, REPELLED = 2**8, 2**9
 # All loads and laws, for variations that have now one and now another.
 ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 
@@ -106,7 +107,7 @@ BUFFERS = {
     ),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed", "seen"),
-    "scratch": ("partials", "swept", "pads", "tension", "normals"),
+    "scratch": ("partials", "swept", "pads", "tension", "normals", "repulsion"),
     "backward": ("forces", "surfaces", "volume_bar", "jacobians"),
     "sums": tuple(
         f"{name}_bar"
@@ -122,11 +123,11 @@ NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, ARE
 QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(56, 63)
 PRESSURE, GRAVITY, FORCE = range(63, 66)
 VOLUMES, PUSHED, SEEN = range(66, 69)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS = range(69, 74)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(74, 78)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(78, 86)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(86, 89)
-HEAD = 89
+PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(69, 75)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(75, 79)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(79, 87)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(87, 90)
+HEAD = 90
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors.

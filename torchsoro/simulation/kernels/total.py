@@ -54,6 +54,8 @@ from torchsoro.simulation.kernels.layout import (
     PUSHES,
     QUADRATIC,
     RECORDED,
+    REPELLED,
+    REPULSION,
     RING,
     SAMPLE_AT,
     SEEN,
@@ -373,6 +375,8 @@ def node_pass(block: ti.template(), item, t):
                     f += wall_force(block, t, b, i)
                 if ti.static(block.features & TIED):
                     f += tied(block, b, i, nodes)
+                if ti.static(block.features & REPELLED):
+                    f -= load_vector(block.scratch, head[REPULSION] + 3 * b * nodes + i, nodes)
                 if ti.static(block.features & PUSHED_NODES):
                     for g in range(head[PUSHES]):
                         force = load_vector(block.supply, force_at(block, t, b, head[GROUPS] + g), 1)

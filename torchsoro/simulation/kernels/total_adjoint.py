@@ -45,6 +45,8 @@ from torchsoro.simulation.kernels.layout import (
     PUSHES,
     QUADRATIC,
     QUADRATIC_BAR,
+    REPELLED,
+    REPULSION,
     SHAPES,
     SHARE,
     SHARED,
@@ -119,6 +121,8 @@ def node_adjoint(block: ti.template(), t, b, i):
             d_bar += wall_spread(block, b, i)
         if ti.static(block.features & TIED):
             d_bar += tied(block, b, i, nodes)
+        if ti.static(block.features & REPELLED):
+            d_bar += load_vector(block.scratch, head[REPULSION] + 3 * b * nodes + i, nodes)
         if head[PLANES] > 0:
             after = ((t + 1) * head[BATCH] + b) * state_length(head)
             d_bar += surface_spread(ints, fixed, state, after, block.back, (t + 1) % 2, b, i)

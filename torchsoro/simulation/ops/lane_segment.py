@@ -15,11 +15,8 @@ from torchsoro.simulation.kernels.compiled import remove_stale_code
 from torchsoro.simulation.kernels.lane_adjoint import Sums, march_back
 from torchsoro.simulation.kernels.lane_contact import PLANE
 from torchsoro.simulation.kernels.lane_march import NEVER, SCRATCH, Case, Mesh, Work, march
-from torchsoro.simulation.kernels.lane_points import (
-    MAXWELL,
-    VOID_FRACTION,
-    VOLUME,
-)
+from torchsoro.simulation.kernels.lane_points import MAXWELL, VOID_FRACTION, VOLUME
+from torchsoro.simulation.kernels.lane_selfcontact import SelfContact
 from torchsoro.simulation.kernels.lane_threads import SYNC
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.ops.chambers import air_volumes, chamber_means
@@ -33,10 +30,12 @@ from torchsoro.simulation.ops.lane_gradients import (
     node_shares,
     signs,
 )
+from torchsoro.simulation.ops.lane_selfcontact import fresh_contact, list_pairs, surface_contact
 from torchsoro.simulation.ops.lanes import Lanes, lay_out
 from torchsoro.simulation.ops.memory import kept_memory
 from torchsoro.simulation.ops.once import once
 from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
+from torchsoro.simulation.ops.selfcontact import Surface
 from torchsoro.simulation.threads import thread_count
 
 _ROOM = 2**22  # numbers of samples that are observed at a time
@@ -95,14 +94,14 @@ class LaneIntegrator:
         self.near = scene.markers.near if scene.only_markers and scene.markers is not None else None
         constants = [like, inputs.prony, inputs.planes, inputs.softening, inputs.fluid, inputs.ties]
         constants += [inputs.air, inputs.attached]
-        self.nodal, case = once(scene, "case", constants, self._constants)
+        self.nodal, case, self.surface, self.contact = once(scene, "case", constants, self._constants)
         self.case = case._replace(**self._supply())
 
-    def _constants(self) -> tuple[Tensor, Case]:
+    def _constants(self) -> tuple[Tensor, Case, Surface | None, SelfContact]:
         """What the segments of a run have in common: all but what acts over time."""
         c, attached = self.inputs.coefficients.detach(), self.inputs.attached.detach()
         self.nodal = self.lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], self.scene.dt, attached)
-        return self.nodal, self._case()
+        return self.nodal, self._case(), *surface_contact(self.scene, c, self.lanes)
 
     def _supply(self) -> dict[str, np.ndarray]:
         """What acts over time, for the kernels."""
@@ -255,7 +254,10 @@ class LaneIntegrator:
         if 0 in self.samples:
             motion = start[:, : 6 * nodes].unflatten(1, (6, nodes))
             observe(0, start if self.near is None else motion[..., self.near].flatten(1))
-        done = min(self._march(work, march, self.steps, ring, past, not self.scene.apart))
+        done, wide = 0, groups * size
+        while done < self.steps and (self.scene.apart or work.collapsed.min() > done):
+            work = self._listed(work, done % ring * wide)
+            done = min(self._march(work, march, done, self.steps, ring, past, not self.scene.apart))
         self.kept = (states, histories, pushed, volumes)
         if done < self.steps:
             last = lanes.to_nodes(states[done % ring].view(groups, 6, -1)).reshape(self.batch, -1)
@@ -275,6 +277,12 @@ class LaneIntegrator:
         if self.steps not in self.samples:
             self._check(self.steps, end)
         return end.unsqueeze(0)
+
+    def _listed(self, work: Work, state: int) -> Work:
+        """With the pairs in contact in a state that begins at a place."""
+        spacing = self.scene.cell / 2
+        contact = list_pairs(self.surface, work.contact, self.lanes, spacing, work.states, state)
+        return work._replace(contact=contact)
 
     def _check(self, step: int, state: Tensor) -> None:
         """Raise ``SimulationDiverged`` if a state is not finite or outside of the box."""
@@ -311,6 +319,7 @@ class LaneIntegrator:
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),
             scratch=aligned(threads * SCRATCH, numbers(like).dtype),
+            contact=fresh_contact(self.contact, self.lanes, threads),
         )
 
     def _joined(self, state: Tensor, history: Tensor) -> Tensor:
@@ -402,10 +411,18 @@ class LaneIntegrator:
         )  # fmt: skip
         sampled = bar.new_zeros(0), at, lanes.sixteens(None)
         work = self._work(bar, states, histories, pushed, volumes, sampled, thread_count())
-        self._march(work, march_back, sums, steps)
+        at, listed = steps - 1, False
+        while at >= -1:
+            work = self._listed(work, at * groups * 6 * mesh.component)
+            at, listed = max(self._march(work, march_back, sums, at, listed, steps)), True
         first, found = gather_gradients(
             self.scene, self.inputs, lanes, self.case, self.nodal[:, :1], (moving, history, pulls, sums), wanted
         )
+        if self.surface is not None:
+            wide = torch.from_numpy(work.contact.stiffness_bar).view(groups, -1, LANES)
+            stiffness_bar = lanes.summed(wide)
+            coefficients = self.inputs.coefficients
+            found["coefficients"] += self.surface.stiffness_adjoint(coefficients, self.scene.cell / 2, stiffness_bar)
         bar.copy_(first)
         return found
 

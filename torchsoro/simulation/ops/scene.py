@@ -62,6 +62,7 @@ class Scene:
         only_markers: Whether nothing is recorded but the motion of the markers; where simulations go on apart only.
         device: Where to simulate a scene whose tensors are on a CPU; with them if None. Of the total-Lagrangian form,
             where only markers are recorded.
+        self_contact: Whether the surface of a body repels itself; of the total-Lagrangian form, on a uniform lattice.
         steady: Whether the scene is of one run, whose segments have the same coefficients, Maxwell elements and planes.
         handle: Number of this scene in the process, valid as long as the scene exists.
     """
@@ -91,6 +92,7 @@ class Scene:
     apart: bool = False
     only_markers: bool = False
     device: torch.device | None = None
+    self_contact: bool = False
     steady: bool = False
     handle: int = field(init=False, default_factory=_handles.__next__)
 

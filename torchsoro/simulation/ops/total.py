@@ -18,6 +18,7 @@ from torchsoro.simulation.ops.launch import capture
 from torchsoro.simulation.ops.memory import empty_record
 from torchsoro.simulation.ops.scene import Inputs, Observe, ObserveMany, Scene
 from torchsoro.simulation.ops.tiles import tiles_of
+from torchsoro.simulation.ops.total_selfcontact import TotalSelfContact
 from torchsoro.simulation.runtime import init
 from torchsoro.simulation.sums import pairwise_sum
 
@@ -52,6 +53,7 @@ def _features(scene: Scene) -> int:
         layout.HOLLOW: scene.lattice.walls is not None,
         layout.RECORDED: scene.only_markers and scene.markers is not None,
         layout.SHARED_AIR: scene.shared,
+        layout.REPELLED: scene.self_contact,
     }
     return sum(feature for feature, on in there.items() if on)
 
@@ -102,7 +104,8 @@ class TotalSegmentIntegrator:
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, self.wall_chunks * layout.TILE, layout.WALL_VECTORS
-        self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors)
+        repulsion = self.batch, 3, self.nodes if scene.self_contact else 0
+        self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors, repulsion)
         self.kept = Arena.zeros("kept", like, (0,), (0,), (0,))
 
     def _started(self) -> Tensor:
@@ -130,6 +133,8 @@ class TotalSegmentIntegrator:
             *(total.total_march, total.total_substep, ints, self.fixed.buffer, self.supply.buffer, states.view(-1)),
             *(self.kept.buffer, self.scratch.buffer),
         )
+        if self.scene.self_contact:
+            march = self._with_contact(march, self._contact(states))
         if self.near is not None:  # simulations go on apart: kernels record their markers, and the host need not wait
             first = states[:1, :, : 6 * self.nodes].unflatten(2, (6, self.nodes)).index_select(3, self.near)
             march(0, self.steps)
@@ -205,6 +210,9 @@ class TotalSegmentIntegrator:
             *(bar.view(-1), back.buffer, sums.buffer),
             backward=True,
         )
+        contact = self._contact(states, back.buffer) if self.scene.self_contact else None
+        if contact is not None:
+            march = self._with_contact(march, contact, backward=True)
         at = steps
         for stop in sorted({0, *self.samples}, reverse=True):
             if stop < at:
@@ -232,7 +240,29 @@ class TotalSegmentIntegrator:
             found["fluid"] = torch.einsum("bcn,nc->b", quadratic_bar, self.lattice.faces.front.to(bar)) / 2
         found |= {"softening": pairwise_sum(softening_bar), "ties": ties_bar.clone()}
         found["air"] = chamber_bar[:, gas:, layout.CHAMBER_STIFFNESS].clone()
+        if contact is not None:
+            found["coefficients"] += contact.coefficients_bar()
         return {**found, "attached": attached_bar}
+
+    def _contact(self, states: Tensor, back: Tensor | None = None) -> TotalSelfContact:
+        """Contact of the bodies with themselves in a ring of states."""
+        offset = self.scratch.offsets[layout.REPULSION - layout.PARTIALS]
+        return TotalSelfContact(self.scene, self.inputs.coefficients, states, self.scratch.buffer, offset, back)
+
+    def _with_contact(
+        self, march: Callable[[int, int], None], contact: TotalSelfContact, backward: bool = False
+    ) -> Callable[[int, int], None]:
+        """A march that stops at each substep, for the forces before it, or after it for their adjoint."""
+
+        def stop_and_go(first: int, last: int) -> None:
+            for t in reversed(range(first, last)) if backward else range(first, last):
+                if not backward:
+                    contact.act(t)
+                march(t, t + 1)
+                if backward and t >= 0:
+                    contact.act(t)
+
+        return stop_and_go
 
     def _march(self, on_gpu, on_cpu, *buffers: Tensor, backward: bool = False) -> Callable[[int, int], None]:
         """A function that takes the substeps from its first number to before its second, or these back."""
