@@ -8,7 +8,10 @@ import pytest
 import torch
 
 import torchsoro
-from torchsoro import Chamber, DesignField, Domain, Prony, Simulator, Solid, fill, ground, square_wave
+from torchsoro import Chamber, DesignField, Domain, Gas, Prony, Simulator, Solid, fill, ground, square_wave
+from torchsoro.design.blending import fill_blended
+from torchsoro.design.placement import Placement
+from torchsoro.simulation.actuation import Waveform
 
 
 def pulsed_cube(device: str, dtype: torch.dtype, transfer: str) -> tuple[float, torch.Tensor]:
@@ -71,4 +74,37 @@ def test_a_body_that_meets_itself_does_so_on_cuda_as_on_a_cpu(cuda: torch.device
     places, gradient = closed(str(cuda), torch.float32)
     torchsoro.init("cpu")
     assert (places - exact).abs().max() < 1e-5
+    assert (gradient - exact_gradient).norm() < 1e-2 * exact_gradient.norm()
+
+
+@pytest.mark.slow
+def test_a_chamber_between_lattice_planes_has_the_gradient_on_cuda_that_it_has_on_a_cpu(cuda: torch.device) -> None:
+    chamber = Chamber(name="air", center=(0.01, 0.01, 0.011), size=(0.01,) * 3, wall=0.0025)
+    domain = Domain(size=(0.02,) * 3, particles=(8,) * 3, origin=(0.0, 0.0, 1e-3), chambers=(chamber,))
+
+    def inflated(device: str, dtype: torch.dtype) -> tuple[float, torch.Tensor]:
+        """Air at the end, and its gradient by the chamber's centre and edges."""
+        torchsoro.init(device)
+        placement = Placement(domain)
+        with torch.no_grad():
+            placement.center += 0.3 * domain.spacing
+        shares = placement()
+        # Limbs of solid, void between them.
+        gamma = (shares.wall + shares.design * (domain.positions[:, 2] < 0.01)).to(device, dtype)
+        body = fill_blended(
+            domain, gamma, shares, solid=Solid(), gas=Gas(density=3.0, viscosity=0.0), void_range=(0.1, 0.6)
+        )
+        simulator = Simulator(cell=domain.cell, dt=2e-5, low=(-0.1,) * 3, high=(0.1,) * 3, formulation="total")
+        run = simulator(
+            body, duration=2e-3, pressure=Waveform(time=torch.tensor([0.0, 1.0]), pressure=torch.full((1, 2), 2e4))
+        )
+        air = 1e6 * run.chamber_volume[-1].sum()
+        air.backward()
+        assert placement.center.grad is not None and placement.size.grad is not None
+        return air.item(), torch.cat([placement.center.grad, placement.size.grad]).flatten()
+
+    exact, exact_gradient = inflated("cpu", torch.float64)
+    air, gradient = inflated(str(cuda), torch.float32)
+    torchsoro.init("cpu")
+    assert air == pytest.approx(exact, rel=1e-4)
     assert (gradient - exact_gradient).norm() < 1e-2 * exact_gradient.norm()
