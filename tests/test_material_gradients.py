@@ -117,6 +117,8 @@ NO_NUMBERS = {
 OBLIQUE = {"Plane.normal"}
 # Of the total-Lagrangian form: test_nodes compares their gradients.
 OF_NODES = {"Body.softening", "Body.air_stiffness"}
+# Of solids that are air in part: test_shared_air compares their gradients.
+OF_SHARES = {"Body.air_share", "Body.share_stiffness"}
 REFUSED = {"Force.share", "Plane.reach"}
 # Without effect: the pressure of a chamber is uniform in the total form, air resists no distortion in the updated one.
 WITHOUT_EFFECT = {"total": {"Gas.viscosity", "Gas.volume_viscosity"}, "updated": {"Gas.shear"}}
@@ -245,7 +247,7 @@ def test_every_field_is_differentiated_or_refused_or_no_number():
         for kind in (Solid, Gas, Prony, Force, PointMass, Spring, Drag, Plane, Waveform, Body)
         for f in fields(kind)
     }
-    assert names == {name for name in NUMBERS if name[0].isupper()} | NO_NUMBERS | REFUSED | OBLIQUE | OF_NODES
+    assert names == {name for name in NUMBERS if name[0].isupper()} | NO_NUMBERS | REFUSED | OBLIQUE | OF_NODES | OF_SHARES
 
 
 def formulation(way: dict[str, str]) -> str:

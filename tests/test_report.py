@@ -150,7 +150,7 @@ def test_intervals_hold_their_value_and_only_what_is_possible(dragged, one, monk
     slippery = Plane.through(torch.zeros(3), normal=torch.tensor([0.0, 0.0, 1.0]), friction=torch.tensor(0.5))
     scenario = known.scenarios[0].replace(planes=(slippery,), air_stiffness=torch.tensor([1e4]))
     problem = SimpleNamespace(twin=known.twin, scenarios=[scenario])
-    shares = 1.0, 0.8, 0.6
+    shares = 1.0, 0.8, 0.6, 0.4, 0.3, 0.2
     values = np.array([s * q.scale * (1 if q.least > -1 else -1) for s, q in zip(shares, one.quantities, strict=False)])
     place = np.array(problem.twin.setup.center if one.local else ())
     for spread in (0.01, 1.0, 30.0):
