@@ -116,60 +116,45 @@ class SoftSide(Hypothesis):
     nonnegative = frozenset({"fraction"})
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+    # Of ln E over the body that a soft half lacks which moves nearly the same, and its middle off the body's.
+    contrast, off = 2 / 3, 0.27
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
-        """The slopes, and what a soft half lacks that moves nearly the same: 1 - exp(-2/3 of the slope)."""
-        lost = 1 - math.exp(-float(np.abs(values).max()) / 1.5)
-        return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
-
-    def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
-        """Middle of the soft half."""
-        steepest = int(np.abs(values[:3]).argmax())
-        middle = np.array(twin.setup.center)
-        middle[steepest] -= np.sign(values[steepest]) * 0.27 * twin.setup.size[steepest]
-        return middle
-
-    def varies(self, values: np.ndarray) -> float:
-        """At the stiffest corner."""
-        return 0.5 * float(np.abs(values[:3]).sum())
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """E exp(a . xi), xi from -1/2 to 1/2 over the body's box."""
-        low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
-        xi = (twin.positions - low) / size - 0.5
-        return scenario.replace(youngs_modulus=scenario.youngs_modulus * (values @ xi.T).exp())
-
-
-class SoftHalf(Hypothesis):
-    """Young's modulus is lower on one half of the body, along x, y and z."""
-
-    name, affected_quantity, model_form_deviation = "soft_side", "Young's modulus over the body", LAW
-    nonnegative = frozenset({"fraction"})
-    quantities = tuple(Quantity(f"contrast_{axis}", "between halves", 0.2, -10.0, 10.0) for axis in "xyz")
-    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
-
-    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
-        """The contrasts, and what the soft half lacks of the other."""
-        lost = 1 - math.exp(-float(np.abs(values).max()))
+        """What ln E gains over the body, and the fraction that a soft half lacks."""
+        lost = 1 - math.exp(-self.contrast * float(np.abs(values).max()))
         return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
 
     def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
         """Middle of the soft half."""
         most = int(np.abs(values[:3]).argmax())
         middle = np.array(twin.setup.center)
-        middle[most] -= np.sign(values[most]) * 0.25 * twin.setup.size[most]
+        middle[most] -= np.sign(values[most]) * self.off * twin.setup.size[most]
         return middle
 
     def varies(self, values: np.ndarray) -> float:
         """At the stiffest corner."""
         return 0.5 * float(np.abs(values[:3]).sum())
 
+    def profile(self, xi: Tensor) -> Tensor:
+        """What ln E gains by each quantity, from -1/2 to 1/2, where xi does so over the body's box."""
+        return xi
+
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """E exp(a . tanh(xi / EDGE) / 2), xi from -1/2 to 1/2 over the body's box."""
+        """E exp(a . profile(xi))."""
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
-        xi = (twin.positions - low) / size - 0.5
-        factor = (values @ (torch.tanh(xi / EDGE) / 2).T).exp()
-        return scenario.replace(youngs_modulus=scenario.youngs_modulus * factor)
+        gained = values @ self.profile((twin.positions - low) / size - 0.5).T
+        return scenario.replace(youngs_modulus=scenario.youngs_modulus * gained.exp())
+
+
+class SoftHalf(SoftSide):
+    """Young's modulus is lower on one half of the body, along x, y and z."""
+
+    quantities = tuple(Quantity(f"contrast_{axis}", "between halves", 0.2, -10.0, 10.0) for axis in "xyz")
+    contrast, off = 1.0, 0.25
+
+    def profile(self, xi: Tensor) -> Tensor:
+        """A smooth step in the middle."""
+        return torch.tanh(xi / EDGE) / 2
 
 
 class PrintOffset(Hypothesis):
