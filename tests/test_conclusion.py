@@ -151,6 +151,15 @@ def test_evidence_that_scatters_where_a_mode_is_looked_at_again_decides_by_no_mo
     assert again.latest(again.groups["drag"][0]) is again.effects[-1]
 
 
+def test_where_touching_is_no_matter_of_chance_the_most_probable_look_at_a_mode_counts():
+    data, nothing, drag = recorded(0.0, 1, effect=0.02)
+    sure = weighed(data, nothing, drag)
+    looks = tuple(shifted(p, d) for p in sure.effects for d in (0.0, 40.0, -400.0))
+    calm = dataclasses.replace(sure, effects=looks, rough=False)
+    assert (calm.scatter, calm.kappa) == (0.0, 1.0)
+    assert calm.groups["drag"] == (looks[1],)
+
+
 def test_the_best_look_at_nothing_is_known_beside_the_one_in_the_middle():
     data, nothing, drag = recorded(0.0, 1, effect=0.02)
     sure = weighed(data, nothing, drag)

@@ -339,7 +339,7 @@ def weighing_of(problem: Likelihood, found: Sequence[Posterior], names: int) -> 
     if not nothing:
         raise ValueError(BREAKS)
     effects = tuple(p for p in found if p.near.model.effects)
-    return Weighing(data=data_of(problem), nothing=nothing, effects=effects, names=names)
+    return Weighing(data=data_of(problem), nothing=nothing, effects=effects, names=names, rough=problem.rough)
 
 
 def at_mode(problem: Likelihood, fit: Fit, mode: Mode) -> Fit:

@@ -123,12 +123,15 @@ class Weighing:
         nothing: Modes of the model without an effect.
         effects: Modes of all others.
         names: Number of single effects that can be named.
+        rough: Whether looks at one mode differ by chance in touching. Where they do not, they differ as a linear model
+            does from a simulation, and the most probable one counts.
     """
 
     data: Data
     nothing: tuple[Posterior, ...]
     effects: tuple[Posterior, ...]
     names: int
+    rough: bool = True
 
     @cached_property
     def _looks_at_nothing(self) -> list[list[Posterior]]:
@@ -141,12 +144,16 @@ class Weighing:
     @cached_property
     def nulls(self) -> tuple[Posterior, ...]:
         """Distinct modes of the model without an effect, most probable first."""
-        return tuple(sorted(map(_middle, self._looks_at_nothing), key=lambda p: -p.ln_evidence))
+        return tuple(sorted(map(self._one_of, self._looks_at_nothing), key=lambda p: -p.ln_evidence))
 
     @property
     def null(self) -> Posterior:
         """The most probable of them."""
         return self.nulls[0]
+
+    def _one_of(self, same: Sequence[Posterior]) -> Posterior:
+        """The look that counts of those at one mode, which are sorted."""
+        return _middle(same) if self.rough else same[0]
 
     @property
     def valleys(self) -> tuple[Posterior, ...]:
@@ -164,6 +171,8 @@ class Weighing:
 
         Of rough motions that says how much of it hangs on which node touches when.
         """
+        if not self.rough:
+            return 0.0
         again = [[p.ln_evidence for p in same] for same in (*self._looks_at_nothing, *self._looks_at_effects)]
         free = sum(len(same) - 1 for same in again)
         return math.sqrt(sum(len(same) * float(np.var(same)) for same in again) / free) if free else 0.0
@@ -208,7 +217,7 @@ class Weighing:
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
         """Distinct modes of each name, most probable first."""
         found: dict[str, list[Posterior]] = {}
-        for p in sorted(map(_middle, self._looks_at_effects), key=lambda p: -p.ln_evidence):
+        for p in sorted(map(self._one_of, self._looks_at_effects), key=lambda p: -p.ln_evidence):
             found.setdefault(p.near.model.name, []).append(p)
         return {name: tuple(modes) for name, modes in found.items()}
 

@@ -263,18 +263,28 @@ def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most
 def _pairs(
     problem: FitProblem, effects: Sequence[Hypothesis], singles: Sequence[Fit], report: Callable[[str], None]
 ) -> list[Fit]:
-    """Two effects together: each in the running with every other, on more and more of the trials.
+    """Two effects together: each in the running with every other, and all pairs, on more and more of the trials.
 
-    Not the best ones alone: which of several that do badly by themselves does best hangs on rounding. Nor from one
-    place alone: a response far off says little of where to begin.
+    Not the best ones alone: which of several that do badly by themselves does best hangs on rounding. Nor from where
+    these have ended alone, and in one place: an effect that had to stand for two is far from where it is one of them,
+    and a response far off says little of where to begin.
     """
-    tasks: list[Task] = []
+    count = len(problem.common)
+    begun: list[tuple[np.ndarray, dict[Hypothesis, np.ndarray]]] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
         for other in (e for e in effects if e.name not in known):
             points = other.probe_points(problem.twin)
             for at in sorted({round(i * (len(points) - 1) / (STARTS - 1)) for i in range(STARTS)}):
-                tasks.append(((*one.effects, other), np.concatenate([one.point, points[at][0]])))
+                begun.append((one.point[:count], {one.effects[0]: one.point[count:], other: points[at][0]}))
+    first = {effect: effect.probe_points(problem.twin)[0][0] for effect in effects}
+    for one, other in itertools.combinations(effects, 2):
+        if one.name != other.name:
+            begun.append((np.zeros(count), {one: first[one], other: first[other]}))
+    tasks: list[Task] = []
+    for stated, own in begun:
+        both = [effect for effect in effects if effect in own]
+        tasks.append((tuple(both), np.concatenate([stated, *(own[effect] for effect in both)])))
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         whole = share == 1
