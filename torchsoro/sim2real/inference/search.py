@@ -148,8 +148,8 @@ def _by_finer(
     """Fits by the finer twin, without an effect and with one, of bodies that touch planes.
 
     What the finer twin adds to the motion as stated holds as long as nodes touch when they do there, so that no
-    correction makes up for cells that are off by as much as effects are. And no response tells an effect from afar:
-    chi-squared itself is simulated, at evenly spread points.
+    correction makes up for cells that are off by as much as effects are. From afar only components that add up are told
+    by their responses: of others chi-squared itself is simulated, at evenly spread points.
     """
     assert problem.fine is not None
     fine = problem.by(problem.fine)
