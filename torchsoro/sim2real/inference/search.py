@@ -270,6 +270,7 @@ def _pairs(
     and a response far off says little of where to begin.
     """
     count = len(problem.common)
+    first = {effect: effect.probe_points(problem.twin)[0][0] for effect in effects}
     begun: list[tuple[np.ndarray, dict[Hypothesis, np.ndarray]]] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
@@ -277,7 +278,7 @@ def _pairs(
             points = other.probe_points(problem.twin)
             for at in sorted({round(i * (len(points) - 1) / (STARTS - 1)) for i in range(STARTS)}):
                 begun.append((one.point[:count], {one.effects[0]: one.point[count:], other: points[at][0]}))
-    first = {effect: effect.probe_points(problem.twin)[0][0] for effect in effects}
+                begun.append((np.zeros(count), {one.effects[0]: first[one.effects[0]], other: points[at][0]}))
     for one, other in itertools.combinations(effects, 2):
         if one.name != other.name:
             begun.append((np.zeros(count), {one: first[one], other: first[other]}))
