@@ -15,7 +15,7 @@ from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
-EDGE = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
+HALF_WIDTH = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
 
 
 class Modulus(Hypothesis):
@@ -154,7 +154,7 @@ class SoftHalf(SoftSide):
 
     def profile(self, xi: Tensor) -> Tensor:
         """A smooth step in the middle."""
-        return torch.tanh(xi / EDGE) / 2
+        return torch.tanh(xi / HALF_WIDTH) / 2
 
 
 class PrintOffset(Hypothesis):

@@ -282,10 +282,13 @@ def _pairs(
     for one, other in itertools.combinations(effects, 2):
         if one.name != other.name:
             begun.append((np.zeros(count), {one: first[one], other: first[other]}))
-    tasks: list[Task] = []
+    # Of a leading effect by itself at first, one start is that of its pair: each is simulated once.
+    distinct_tasks: dict[tuple[tuple[Hypothesis, ...], bytes], Task] = {}
     for stated, own in begun:
-        both = [effect for effect in effects if effect in own]
-        tasks.append((tuple(both), np.concatenate([stated, *(own[effect] for effect in both)])))
+        both = tuple(effect for effect in effects if effect in own)
+        point = np.concatenate([stated, *(own[effect] for effect in both)])
+        distinct_tasks.setdefault((both, point.tobytes()), (both, point))
+    tasks = list(distinct_tasks.values())
     chosen: list[Fit] = []
     for share, most in zip((*EARLY, 1.0), (12, 6, 3), strict=True):
         whole = share == 1

@@ -23,11 +23,10 @@ PLACES = 16  # within the tolerances of what is stated, from the best of which t
 FIRST = 2  # of them
 
 Task = tuple[tuple[Hypothesis, ...], np.ndarray | None]  # effects, and where to begin a search
+Look = tuple[float, Hypothesis, np.ndarray]  # chi-squared that an effect leaves, or promises to, at a point
 
 
-def probe_points(
-    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
-) -> list[tuple[float, Hypothesis, np.ndarray]]:
+def probe_points(problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]) -> list[Look]:
     """What each effect's looks would leave, and where to begin a search; from nothing, and from what is believed."""
     bases = [problem.base(null_model)]
     if null_model.chi2 > EARLY_ABOVE * null_model.samples:
@@ -39,7 +38,7 @@ def probe_points(
     return found
 
 
-def likely(looks: Sequence[tuple[float, Hypothesis, np.ndarray]], null_model: Fit, most: int) -> list[Task]:
+def likely(looks: Sequence[Look], null_model: Fit, most: int) -> list[Task]:
     """Where to begin searches: each effect that promises something at its best look, then at others that differ."""
     unit = max(1.0, null_model.chi2 / null_model.samples) * correlation(null_model)
     strained = np.abs(null_model.point).max(initial=0.0) > 1  # so that much is taken up that it should not be
@@ -76,9 +75,7 @@ def unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], null_model
     return found
 
 
-def screened(
-    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
-) -> list[tuple[float, Hypothesis, np.ndarray]]:
+def screened(problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]) -> list[Look]:
     """Chi-squared of each effect at evenly spread points, where the effect stands in for what is stated, and beside it.
 
     In turn, modulus and pressure are as stated, and as they explain most by themselves.
@@ -92,9 +89,7 @@ def screened(
     return looked_at(problem, started)
 
 
-def looked_at(
-    problem: FitProblem, started: Sequence[tuple[Hypothesis, np.ndarray]]
-) -> list[tuple[float, Hypothesis, np.ndarray]]:
+def looked_at(problem: FitProblem, started: Sequence[tuple[Hypothesis, np.ndarray]]) -> list[Look]:
     """Chi-squared of effects at points, with no measurement errors; without those that break down."""
     points: dict[Hypothesis, list[np.ndarray]] = {}
     for effect, point in started:
