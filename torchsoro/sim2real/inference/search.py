@@ -45,6 +45,7 @@ ENDS = 10  # that are weighed, at most
 ENDS_FINER = 16  # the same where a finer twin is searched, too
 AHEAD = 3  # ends of searches that are always in the running
 FARTHER = 4.0  # times the least chi-squared: an end that leaves more is far out of it
+VALLEYS = 3  # of a pair that more of the trials decide between
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 
@@ -294,10 +295,17 @@ def _pairs(
         whole = share == 1
         early = None if whole else problem.early(share)
         where = early or problem
-        chosen = _best(where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole))
+        ends = where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole)
+        chosen = _best(ends)
         leading = ", ".join(f"{fit.name} {fit.chi2:.0f}" for fit in chosen[:4])
         report(f"pairs, {f'first {100 * share:.0f} %' if early else 'all'} of the trials: {leading}")
-        tasks = [(f.effects, f.point) for f in chosen[:most]]
+        # Which of a pair's valleys is the deepest one may show on more of the trials only.
+        order = sorted((f for f in ends if f is not None), key=lambda fit: fit.chi2)
+        tasks = [
+            (f.effects, f.point)
+            for pair in chosen[:most]
+            for f in distinct((f for f in order if f.name == pair.name), VALLEYS)
+        ]
     return chosen
 
 
