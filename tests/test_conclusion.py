@@ -381,21 +381,26 @@ def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
     assert found.probabilities["drag"] == pytest.approx(1.0, abs=1e-3)
 
 
-def test_an_extension_that_moves_nearly_as_what_it_extends_keeps_its_name_where_evidence_is_for_it():
-    data, _, drag = recorded(0.0, 8, effect=0.3)
+@pytest.mark.parametrize(
+    ("share", "priced", "name"), [(0.05, 0.0, "drag"), (0.15, 0.0, "tether"), (0.15, 3.0, "tether")]
+)
+def test_an_extension_keeps_its_name_where_evidence_is_for_a_difference_that_matters(share, priced, name):
+    data, nothing, drag = recorded(0.0, 8, effect=0.3)
     more = tuple(
-        0.05 * J[..., 0] * np.sin(20 * t.time)[:, None, None] for J, t in zip(drag.slopes, data.trials, strict=True)
+        share * J[..., 0] * np.sin(20 * t.time)[:, None, None] for J, t in zip(drag.slopes, data.trials, strict=True)
     )
     residuals = tuple(r + m for r, m in zip(drag.residuals, more, strict=True))
     spring = tuple(np.concatenate([J, m[..., None]], -1) for J, m in zip(drag.slopes, more, strict=True))
     model = Model(effects=("tether",), priors=(Prior(1.0), Prior(1.0)), own=(0, 1), simpler=("drag",))
-    tether = Linearised(model=model, at=np.zeros(2), residuals=residuals, slopes=spring, numerics=EXACT)
-    drag = dataclasses.replace(drag, residuals=residuals)
-    nothing = dataclasses.replace(recorded(0.0, 8, effect=0.3)[1], residuals=residuals)
-    weighing = weighed(data, nothing, drag, tether)
-    assert apart(*(modes[0] for modes in weighing.groups.values())) < MATTERS * data.size
+    twin = dataclasses.replace(EXACT, amplitude=EXACT.amplitude + priced * MATTERS * data.size)
+    tether = Linearised(model=model, at=np.zeros(2), residuals=residuals, slopes=spring, numerics=twin)
+    drag = dataclasses.replace(drag, residuals=residuals, numerics=twin)
+    weighing = weighed(data, dataclasses.replace(nothing, residuals=residuals, numerics=twin), drag, tether)
+    distance = apart(*(modes[0] for modes in weighing.groups.values()))
+    assert (distance < MATTERS * data.size) == (name == "drag")
+    assert not priced or distance < twin.size
     found = conclude(weighing, limit=0.0)
-    assert (found.kind, found.chosen) == ("explained", ("tether",))
+    assert (found.kind, found.chosen) == ("explained", (name,))
 
 
 def test_evidence_counts_less_where_the_twin_errs_along_an_effect():

@@ -401,11 +401,13 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
     faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
-        # An extension that moves as what it extends, as far as it matters and the twin tells, adds nothing, unless
-        # evidence is for it.
-        plain = [names[n] for n in c.best.near.model.simpler if n in names]
-        plain = [d for d in plain if c.probability <= CREDIBLE * (c.probability + d.probability)]
-        plain = [d for d in plain if apart(c.best, d.best) < max(least, c.best.near.numerics.size)]
+        # An extension that moves as what it extends, as far as it matters, adds nothing; nor does one that does so as
+        # far as the twin tells, unless evidence is for it.
+        simple = [names[n] for n in c.best.near.model.simpler if n in names]
+        off = {d.name: apart(c.best, d.best) for d in simple}
+        unsure = {d.name for d in simple if c.probability <= CREDIBLE * (c.probability + d.probability)}
+        price = c.best.near.numerics.size
+        plain = [d for d in simple if off[d.name] < (max(least, price) if d.name in unsure else least)]
         if c.size < max(least, c.best.near.numerics.size):
             told[NOTHING] += c.probability
         elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
