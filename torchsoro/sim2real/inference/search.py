@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 
@@ -37,6 +38,7 @@ MOST = 10  # searches that are begun, at most
 MOST_VALLEYS = 24  # the same where most end in valleys nearby
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
+PROMISING = 2  # of an effect's starts by its responses, that are simulated
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
@@ -149,8 +151,8 @@ def _by_finer(
     """Fits by the finer twin, without an effect and with one, of bodies that touch planes.
 
     What the finer twin adds to the motion as stated holds as long as nodes touch when they do there, so that no
-    correction makes up for cells that are off by as much as effects are. From afar only components that add up are told
-    by their responses: of others chi-squared itself is simulated, at evenly spread points.
+    correction makes up for cells that are off by as much as effects are. Searches begin where chi-squared itself is
+    least, of where responses promise most, where the search before has ended, and evenly spread points.
     """
     assert problem.fine is not None
     fine = problem.by(problem.fine)
@@ -160,14 +162,16 @@ def _by_finer(
         return [], []
     best = min(nothing, key=lambda fit: fit.chi2)
     one = fine.only(fine.trials[:1])  # the others are as good, and take as long
-    # Components that add up are told from afar by their responses; so may be where the search before has ended.
-    joint = [effect for effect in effects if effect.joint]
-    started = [(e, start) for e, own in zip(joint, fine.probe(joint, fine.base(best)), strict=True) for _, start in own]
+    base = one.base(dataclasses.replace(best, errors=np.zeros(len(one.observation.deviations))))
+    started = [
+        (effect, start)
+        for effect, own in zip(effects, one.probe(effects, base), strict=True)
+        for _, start in own[:PROMISING]
+    ]
     started += [(f.effects[0], f.point) for f in ends if len(f.effects) == 1]
     looks = sorted([*screened(one, best, effects), *looked_at(one, started)], key=lambda look: look[0])
-    first = {effect.name: ((effect,), point) for _, effect, point in reversed(looks)}
-    order = list(dict.fromkeys(effect.name for _, effect, _ in looks))
-    tasks = [first[name] for name in order[:FINER]]
+    first = {effect: ((effect,), point) for _, effect, point in reversed(looks)}  # of a name, each form by itself
+    tasks = [first[effect] for effect in list(dict.fromkeys(effect for _, effect, _ in looks))[:FINER]]
     found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))
     leading = [(f.effects, f.point) for f in found[:AHEAD]]
     found = _best([*found, *fine.fit(leading, errors=best.errors, rounds=FINER_ROUNDS, settle=False)])

@@ -18,7 +18,7 @@ STARTS = 3  # searches of each effect, from probe points that differ
 EARLY_ABOVE = (
     3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
 )
-SCREENED = 8  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
+SCREENED = 4  # points of each effect there, at which chi-squared itself is simulated; of a local one four times as many
 PLACES = 16  # within the tolerances of what is stated, from the best of which the null model begins among many valleys
 FIRST = 2  # of them
 
