@@ -403,12 +403,13 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     for c in candidates:
         # An extension that moves as what it extends, as far as it matters, adds nothing; nor does one that does so as
         # far as the twin tells, unless evidence is for it.
-        simple = [names[n] for n in c.best.near.model.simpler if n in names]
-        off = {d.name: apart(c.best, d.best) for d in simple}
-        unsure = {d.name for d in simple if c.probability <= CREDIBLE * (c.probability + d.probability)}
-        price = c.best.near.numerics.size
-        plain = [d for d in simple if off[d.name] < (max(least, price) if d.name in unsure else least)]
-        if c.size < max(least, c.best.near.numerics.size):
+        tells = max(least, c.best.near.numerics.size)
+        plain = []
+        for d in (names[n] for n in c.best.near.model.simpler if n in names):
+            sure = c.probability > CREDIBLE * (c.probability + d.probability)
+            if apart(c.best, d.best) < (least if sure else tells):
+                plain.append(d)
+        if c.size < tells:
             told[NOTHING] += c.probability
         elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
             told[UNKNOWN] += c.probability

@@ -45,9 +45,9 @@ TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
 ENDS = 10  # that are weighed, at most
 ENDS_FINER = 16  # the same where a finer twin is searched, too
+ENDS_PAIR = 3  # of each pair, that more of the trials decide between
 AHEAD = 3  # ends of searches that are always in the running
 FARTHER = 4.0  # times the least chi-squared: an end that leaves more is far out of it
-VALLEYS = 3  # of a pair that more of the trials decide between
 APART = 0.3  # of an unknown, or of its scale, below which two ends are one
 
 
@@ -170,8 +170,10 @@ def _by_finer(
     ]
     started += [(f.effects[0], f.point) for f in ends if len(f.effects) == 1]
     looks = sorted([*screened(one, best, effects), *looked_at(one, started)], key=lambda look: look[0])
-    first = {effect: ((effect,), point) for _, effect, point in reversed(looks)}  # of a name, each form by itself
-    tasks = [first[effect] for effect in list(dict.fromkeys(effect for _, effect, _ in looks))[:FINER]]
+    first: dict[Hypothesis, Task] = {}  # of a name, each form by itself
+    for _, effect, point in looks:
+        first.setdefault(effect, ((effect,), point))
+    tasks = list(first.values())[:FINER]
     found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))
     leading = [(f.effects, f.point) for f in found[:AHEAD]]
     found = _best([*found, *fine.fit(leading, errors=best.errors, rounds=FINER_ROUNDS, settle=False)])
@@ -300,15 +302,15 @@ def _pairs(
         early = None if whole else problem.early(share)
         where = early or problem
         ends = where.fit(tasks, errors=singles[0].errors, rounds=ROUNDS if whole else 6, settle=whole)
-        chosen = _best(ends)
+        order = sorted((f for f in ends if f is not None), key=lambda fit: fit.chi2)
+        chosen = _best(order)
         leading = ", ".join(f"{fit.name} {fit.chi2:.0f}" for fit in chosen[:4])
         report(f"pairs, {f'first {100 * share:.0f} %' if early else 'all'} of the trials: {leading}")
         # Which of a pair's valleys is the deepest one may show on more of the trials only.
-        order = sorted((f for f in ends if f is not None), key=lambda fit: fit.chi2)
         tasks = [
             (f.effects, f.point)
             for pair in chosen[:most]
-            for f in distinct((f for f in order if f.name == pair.name), VALLEYS)
+            for f in distinct((f for f in order if f.name == pair.name), ENDS_PAIR)
         ]
     return chosen
 
