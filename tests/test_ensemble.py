@@ -52,8 +52,9 @@ def assert_same_run(one: Path, other: Path) -> None:
     found = [torch.load(path / "checkpoint.pt", weights_only=True)["items"] for path in (one, other)]
     assert torch.equal(found[0]["field"]["phi"], found[1]["field"]["phi"])
     assert found[0].keys() == found[1].keys()
-    for name, value in found[0].get("supply", {}).items():
-        assert torch.equal(value, found[1]["supply"][name])
+    for part in found[0].keys() & {"supply", "placement"}:
+        for name, value in found[0][part].items():
+            assert torch.equal(value, found[1][part][name])
     assert found[0]["best"]["iteration"] == found[1]["best"]["iteration"]
 
 
@@ -107,6 +108,30 @@ def test_two_chambers_with_a_designed_timing_in_three_scenarios_have_the_gradien
     for one, other in zip(found, wanted, strict=True):
         assert float(other.abs().min()) > 0 or other is wanted[0]
         torch.testing.assert_close(one, other, rtol=0, atol=1e-5 * float(other.abs().max()))
+
+
+def test_designed_chambers_in_three_scenarios_have_the_gradients_of_single_runs():
+    placed = {"chamber_design": ("place", "size"), "modulus_range": (0.8, 1.2), "density_range": (0.9, 1.1)}
+    made = robot_of(**placed, scenarios=3, clip=0.0, lightness=0.1, dt=1e-4)
+    assert made.placement is not None
+    with torch.no_grad():
+        made.placement.size += 0.3 * made.domain.spacing
+        made.placement.center[:, 0] += 0.2 * made.domain.spacing
+    ensemble, designed = Ensemble(made), made.placement.designed()
+    gamma = made.density()
+    outcome = ensemble.judge(gamma, 1, 1.0)
+    aims = loop.aim(made, outcome, 1)
+    found = ensemble.gradient(gamma, aims)
+    batch = ensemble.sample(1)
+    singles = [made(made.density(), scenarios=batch.part([k] * 16)) for k in range(3)]
+    assert torch.equal(outcome.intermediate, singles[0].intermediate)
+    values = torch.cat([loop.aim(made, one, 1)[:1] for one in singles])
+    assert torch.equal(aims, values)
+    wanted = torch.autograd.grad(-overall(made, values), (made.field.phi, *designed))
+    assert len(found) == 3
+    for one, other in zip(found, wanted, strict=True):
+        assert float(other.abs().max()) > 0
+        torch.testing.assert_close(one, other, rtol=0, atol=2e-5 * float(other.abs().max()))
 
 
 def test_each_scenario_counts_with_its_part_of_the_clip_and_what_overflows_is_counted(monkeypatch):
@@ -267,7 +292,13 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(RECIPES.p
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 @pytest.mark.parametrize(
-    "more", [{}, {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)}, {"feature": 0.004}]
+    "more",
+    [
+        {},
+        {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)},
+        {"feature": 0.004},
+        {"chamber_design": ("place", "size")},
+    ],
 )
 def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(recipes, tmp_path, more):
     path = tmp_path / "two"

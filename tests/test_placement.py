@@ -244,7 +244,7 @@ def test_what_a_placement_cannot_do_is_refused():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scenarios": 4}, r"chamber_design = \('place',\) with scenarios = 4: wanted one of them left out"),
+        ({"feature": 0.004, "scenarios": 3}, r"chamber_design = \('place',\) with feature = 0.004: wanted one of them"),
         ({"body_mesh": "body.stl"}, r"with body_mesh = body.stl: wanted"),
         ({"chamber_mesh": "air.stl"}, r"with chamber_mesh = air.stl: wanted"),
         ({"chamber_mesh": "a.stl", "chamber_sizes": ((0.01,) * 3,)}, r"chamber_sizes = .* with chamber_mesh = a.stl"),

@@ -27,6 +27,7 @@ from tiny import TINY, tiny
 from torchsoro.design import loop
 from torchsoro.design.lagrangian import AugmentedLagrangian
 from torchsoro.design.presets import CLIMBER, WALKER
+from torchsoro.design.reading import from_command_line
 from torchsoro.design.robot import climber, walker
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
@@ -190,6 +191,18 @@ def test_a_checkpoint_of_other_settings_is_refused_and_stays_whole(recipes, stra
     with pytest.raises(ValueError, match="already holds a run; resume it"):
         recipes["walker"].main(tiny(path))
     assert {file: file.read_bytes() for file in path.rglob("*.*")} == held
+
+
+def test_a_run_is_resumed_with_its_own_settings_but_for_the_flags_given(straight):
+    path, _ = straight
+    given = json.loads((path / "settings.json").read_text())
+    assert given["particles"] != list(WALKER["desk"].particles)
+    flags = ["--resume", "--out", str(path), "--iterations", "7", "--device", "cpu"]
+    read = from_command_line(WALKER, description="walks", arguments=flags)
+    told = {**given, "iterations": 7, "resume": True, "device": "cpu"}
+    assert json.loads(json.dumps(dataclasses.asdict(read), default=str)) == told
+    preset = from_command_line(WALKER, description="walks", arguments=[*flags, "--preset", "desk"])
+    assert preset.particles == WALKER["desk"].particles
 
 
 def test_a_bad_schedule_is_refused_before_the_folder_is_made(recipes, tmp_path):

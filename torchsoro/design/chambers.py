@@ -51,7 +51,7 @@ def _check(s: Settings) -> None:
     if not s.chamber_design:
         return
     designed = f"chamber_design = {s.chamber_design}"
-    for name, wanted in (("chamber_mesh", None), ("body_mesh", None), ("feature", 0.0), ("scenarios", 0)):
+    for name, wanted in (("chamber_mesh", None), ("body_mesh", None), ("feature", 0.0)):
         if (value := getattr(s, name)) != wanted:
             raise ValueError(f"{designed} with {name} = {value}: wanted one of them left out")
     if s.formulation != "total":

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchsoro.design.features import threshold_of
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass
+from torchsoro.design.placement import Membership
 from torchsoro.design.processes import Processes
 from torchsoro.design.risk import CVaR, parse_risk
 from torchsoro.design.robot import LANES, Outcome, Robot
@@ -52,7 +53,7 @@ def shares(robot: Robot, values: Tensor) -> Tensor:
 
 
 class Ensemble:
-    """Simulates a robot in its settings' scenarios, by one process or several, with a timing that is designed, too.
+    """Simulates a robot, whose timing and chambers may be designed, too, in its scenarios, by one process or several.
 
     With a least thickness of features, scenarios meet three variants of the design in turn: itself, eroded, dilated.
 
@@ -78,7 +79,9 @@ class Ensemble:
         eroded = threshold_of(robot.settings.filter_radius, feature) if feature else 0.0
         self.thresholds = (0.0, eroded, -eroded) if feature else (0.0,)
         self._variants: list[Tensor] = []  # densities, with their gradient by the design variable
-        self._inputs: tuple[Tensor, ...] = ()  # density, and what is designed of the timing, of each place
+        self._shares = torch.empty(0)  # of designed chambers in each particle [3, N], with their gradient
+        # Density, those shares and what is designed of the timing, of each place.
+        self._inputs: tuple[Tensor, ...] = ()
         self._values = self._all = torch.empty(0)
         self.lost = 0
 
@@ -118,51 +121,65 @@ class Ensemble:
                 raise error
         assert isinstance(outcome, Outcome)
         self._all = self.processes.gather(self._values.detach(), self.parts).requires_grad_()
-        body = robot.filled(gamma)
-        solid, weight = robot.weights(body)
+        member = robot.membership(gamma)
+        if member is not None:
+            self._shares = _stacked(member)
+            member = _unstacked(self._shares, member)
+        body = robot.filled(gamma, member)
+        solid, weight = robot.weights(body, gamma, member)
         none = self._all.new_full((self.count,), math.nan)
         found = {**dict.fromkeys(TURNS, none), **dict(zip(self.judged, self._all.unbind(1), strict=True))}
         return replace(
             outcome,
             **found,
-            intermediate=intermediate_density(gamma, robot.design),
+            intermediate=intermediate_density(gamma, robot.design) if member is None else member.intermediate(gamma),
             mass=total_mass(solid),
             center=center_of_gravity(body.position, weight),
         )
 
     def gradient(self, gamma: Tensor, aims: Tensor) -> list[Tensor]:
-        """Gradient of minus the risk by the design variable and a designed timing, as of the last :meth:`judge`.
+        """Gradient of minus the risk by all that is designed, as of the last :meth:`judge`.
 
-        That of each scenario is limited in norm to its part of ``settings.clip``, by field and timing each: a tumble,
-        whose norm is hundreds of times that of a walk, would be all that is left of the sum. Those that overflow are
-        left out and counted in ``lost``; where they are more than half of the risk, the gradient is not finite.
+        That of each scenario is limited in norm to its part of ``settings.clip``, by field, timing and chambers each: a
+        tumble, whose norm is hundreds of times that of a walk, would be all that is left of the sum. Those that
+        overflow are left out and counted in ``lost``; where they are more than half of the risk, the gradient is not
+        finite.
 
         Args:
             gamma: Density [N], of the robot's field.
             aims: What is maximised, of each scenario [S], made of that outcome.
 
         Returns:
-            By ``phi``, and by each parameter of ``robot.supply.designed()``.
+            By ``phi``, and by each parameter of ``robot.supply.designed()`` and of ``robot.placement.designed()``.
         """
-        phi, clip = self.robot.field.phi, self.robot.settings.clip
-        part = shares(self.robot, aims)
-        by_motion, by_mass = torch.autograd.grad(
-            -(part * aims).sum(), (self._all, gamma), retain_graph=True, allow_unused=True
+        robot, clip = self.robot, self.robot.settings.clip
+        phi, placing = robot.field.phi, robot.placement.designed() if robot.placement is not None else []
+        part = shares(robot, aims)
+        common = [gamma, self._shares] if placing else [gamma]  # what the mass, the same in all scenarios, hangs on
+        by_motion, *by_mass = torch.autograd.grad(
+            -(part * aims).sum(), (self._all, *common), retain_graph=True, allow_unused=True
         )
         _tell(self.processes, _PULL)
         self.processes.broadcast(by_motion)
-        by_gamma, *by_timing = (self.processes.gather(rows, self.parts) for rows in self._pulled(by_motion))
-        totals = [torch.zeros_like(one) for one in (phi, *self._timing.values())]
+        by_gamma, *others = (self.processes.gather(rows, self.parts) for rows in self._pulled(by_motion))
+        by_shares, by_timing = (others[0], others[1:]) if placing else (None, others)
+        units = [1.0, 1.0, robot.domain.spacing]  # chambers count by spacings, as in the loop
+        totals = [torch.zeros_like(one) for one in (phi, *self._timing.values(), *placing)]
         self.lost, missing = 0, 0.0
         for k, weight in enumerate(part.tolist()):
             if weight == 0:
                 continue
-            designs, bars = [self._variants[k % len(self.thresholds)]], [by_gamma[k]]
-            if by_mass is not None:
-                designs, bars = [*designs, gamma], [*bars, weight * by_mass]
-            (by_phi,) = torch.autograd.grad(designs, phi, bars, retain_graph=True)
-            groups = [[by_phi], [rows[k] for rows in by_timing]]
-            norms = [float(torch.cat([one.flatten() for one in group]).norm()) if group else 0.0 for group in groups]
+            made = [self._variants[k % len(self.thresholds)], *common[1:]]
+            bars = [by_gamma[k]] if by_shares is None else [by_gamma[k], by_shares[k]]
+            for one, bar in zip(common, by_mass, strict=True):
+                if bar is not None:
+                    made, bars = [*made, one], [*bars, weight * bar]
+            by_phi, *by_chambers = torch.autograd.grad(made, (phi, *placing), bars, retain_graph=True)
+            groups = [[by_phi], [rows[k] for rows in by_timing], by_chambers]
+            norms = [
+                unit * float(torch.cat([one.flatten() for one in group]).norm()) if group else 0.0
+                for unit, group in zip(units, groups, strict=True)
+            ]
             if not all(map(math.isfinite, norms)):
                 self.lost, missing = self.lost + 1, missing + weight
                 continue
@@ -194,9 +211,12 @@ class Ensemble:
 
     @torch.no_grad()
     def _share(self, variants: Tensor) -> Tensor:
-        """The design of process 0: densities of its variants [V, N]; its timing is put into the robot."""
+        """The design of process 0: densities of its variants [V, N]; timing and chambers are put into the robot."""
         for one in self._timing.values():
             one.copy_(self.processes.broadcast(one.detach()))
+        if (placement := self.robot.placement) is not None:
+            state = placement.state_dict().items()
+            placement.load_state_dict({name: self.processes.broadcast(one.double()) for name, one in state})
         return self.processes.broadcast(variants)
 
     @torch.enable_grad()
@@ -205,13 +225,19 @@ class Ensemble:
     ) -> Outcome | SimulationDiverged:
         """Simulate this process's share; keeps what :meth:`_pulled` goes back through."""
         met = variants[[k % len(variants) for k in self._places]]
-        timed = (one.detach().expand(len(self._places), -1).clone() for one in self._timing.values())
-        self._inputs = tuple(value.requires_grad_() for value in (met, *timed))
-        rows, timing = self._inputs[0], dict(zip(self._timing, self._inputs[1:], strict=True))
-        pressure = self.robot.supply.each(timing) if timing else None
-        how: dict[str, Any] = {"gravity_scale": gravity_scale, "pressure": pressure, "dt": dt}
+        timed = [one.detach().expand(len(self._places), -1).clone() for one in self._timing.values()]
+        how: dict[str, Any] = {"gravity_scale": gravity_scale, "dt": dt}
+        member, placement = self.robot.membership(variants), self.robot.placement
+        placed: list[Tensor] = []
+        if member is not None and placement is not None and placement.designed():
+            placed = [_stacked(member).detach().expand(len(self._places), -1, -1).clone()]
+        self._inputs = tuple(value.requires_grad_() for value in (met, *placed, *timed))
+        if member is not None and placed:
+            how["membership"] = _unstacked(placed[0], member)
+        if timed:
+            how["pressure"] = self.robot.supply.each(dict(zip(self._timing, timed, strict=True)))
         try:
-            outcome = self.robot(rows, scenarios=batch.part(self._places), **how)
+            outcome = self.robot(met, scenarios=batch.part(self._places), **how)
         except SimulationDiverged as error:
             found = {name: getattr(error, name) for name in ("step", "time", "particle", "quantity", "remedy")}
             return SimulationDiverged(**found, batch=self._places[error.batch])
@@ -219,11 +245,26 @@ class Ensemble:
         return outcome
 
     def _pulled(self, bars: Tensor) -> list[Tensor]:
-        """By density and timing of this process's scenarios [own, ...], from the gradient by what is judged [S, n]."""
+        """By density, chambers' shares and timing of this process's scenarios [own, ...].
+
+        Args:
+            bars: Gradient by what is judged [S, n].
+        """
         mine = bars[self.own.start : self.own.stop]
         found = torch.autograd.grad(self._values, self._inputs, mine)
         self._values = self._values.detach()
         return [one[: len(self.own)] for one in found]
+
+
+def _stacked(member: Membership) -> Tensor:
+    """Shares of air, wall and design [..., 3, N]."""
+    return torch.stack([member.air, member.wall, member.design], -2)
+
+
+def _unstacked(shares: Tensor, member: Membership) -> Membership:
+    """Those shares again, with the chambers of another membership."""
+    air, wall, design = shares.unbind(-2)
+    return Membership(air=air, wall=wall, design=design, chamber=member.chamber)
 
 
 def _tell(processes: Processes, *numbers: float) -> None:

@@ -356,7 +356,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             if ensemble is None:
                 (-goal).backward()
             else:
-                for one, gradient in zip((field.phi, *timing), ensemble.gradient(gamma, aims), strict=True):
+                moved = (field.phi, *timing, *placing)
+                for one, gradient in zip(moved, ensemble.gradient(gamma, aims), strict=True):
                     one.grad = gradient
             norm = torch.nn.utils.clip_grad_norm_(field.parameters(), s.clip or math.inf)
             # By itself: a designed timing's few numbers have far larger gradients than each of the field's many.

@@ -55,6 +55,8 @@ def from_command_line(
 ) -> Settings:
     """Read settings from the command line: a preset, and any of its numbers overridden.
 
+    A run that is resumed has its own settings in place of a preset.
+
     Args:
         presets: Named settings; without ``--preset``, "paper" is taken on CUDA and "desk" elsewhere.
         description: Text on top of ``--help``.
@@ -69,6 +71,8 @@ def from_command_line(
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default=None)
     first.add_argument("--device", default="auto")
+    first.add_argument("--out", type=Path)
+    first.add_argument("--resume", action="store_true")
     first.add_argument("-h", "--help", action="store_true")
     known, _ = first.parse_known_args(arguments)
     # The help does not wait for torch to say whether there is a GPU, and shows the desk preset.
@@ -76,6 +80,9 @@ def from_command_line(
     name = known.preset or ("paper" if gpu else "desk")
     # A preset that does not exist is refused by tyro.
     default = presets.get(name, presets["desk"])
+    out = known.out or default.out
+    if known.resume and known.preset is None and (begun := out / "settings.json").is_file():
+        default = _settings(begun, _object(begun), {"out": out, "amend": False, "overwrite": False})
     # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
     text = re.sub(r"\n *(?=(?:python|torchsoro|tensorboard) )", "\n$ ", as_called(description))
     groups = tyro.cli(_grouped(default), args=arguments, description=text, config=(tyro.conf.OmitArgPrefixes,))
@@ -116,17 +123,24 @@ def read_settings(path: Path, **changes: object) -> Settings:
         ValueError: if there is no such file, it is damaged, a name in it is none of the settings, or a value is out of
             its range.
     """
+    delivered = path.with_name(CHAMBERS)
+    return _settings(path, _object(path) | (_object(delivered) if delivered.is_file() else {}), changes)
+
+
+def _object(path: Path) -> dict[str, Any]:
+    """What a file of settings holds."""
     wanted = "wanted the settings.json of a run"
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        delivered = path.with_name(CHAMBERS)
-        chambers = json.loads(delivered.read_text(encoding="utf-8")) if delivered.is_file() else {}
     except (OSError, ValueError) as error:
         raise ValueError(f"path: {path} holds no settings ({error}), {wanted}") from error
-    for held in (found, chambers):
-        if not isinstance(held, dict):
-            raise ValueError(f"path: {path} holds a {type(held).__name__}, {wanted}")
-    found |= chambers
+    if not isinstance(found, dict):
+        raise ValueError(f"path: {path} holds a {type(found).__name__}, {wanted}")
+    return found
+
+
+def _settings(path: Path, found: dict[str, Any], changes: Mapping[str, object]) -> Settings:
+    """Those that were found in a file, with changes."""
     if unknown := sorted(set(found) - {field.name for field in dataclasses.fields(Settings)}):
         raise ValueError(f"path: {path} has {', '.join(unknown)}, wanted names of the settings only")
     try:

@@ -131,7 +131,6 @@ class Robot(nn.Module):
         self.design = self.domain.design.to(s.target)
         self.wall = self.domain.wall.to(s.target)
         self.soles = _outermost(self.domain, planes).to(s.target)
-        self.socket = sockets(self.domain, self.port.direction).to(s.target)
         # Density scales mass and stiffness alike: the step is good for every design, or for none.
         with torch.no_grad():
             everywhere = self.filled(torch.ones(self.domain.count))
@@ -152,6 +151,7 @@ class Robot(nn.Module):
         progress: Callable[[int, int], None] | None = None,
         scenarios: ScenarioBatch | None = None,
         dt: float | None = None,
+        membership: Membership | None = None,
     ) -> Outcome:
         """Simulate a design and judge it.
 
@@ -165,6 +165,7 @@ class Robot(nn.Module):
             progress: See :meth:`Simulator.forward`.
             scenarios: To simulate at once, instead of the settings' own one.
             dt: Substep [s], which is not halved where the simulation breaks down; the settings' if None.
+            membership: What chambers that are designed make of each particle, shares [..., N]; those of now if None.
 
         Returns:
             Travel, intermediate density, mass, centre of gravity, trajectory.
@@ -173,7 +174,7 @@ class Robot(nn.Module):
             SimulationDiverged: if the simulation breaks down.
         """
         s = self.settings
-        member = self.membership(gamma)
+        member = self.membership(gamma) if membership is None else membership
         body = self.filled(gamma, member)
         solid, weight = self.weights(body, gamma, member)
         pressure = self.pressure if pressure is None else pressure
@@ -212,6 +213,11 @@ class Robot(nn.Module):
     def rounded_domain(self) -> Domain:
         """The domain; chambers that are designed lie where they are now, rounded to lattice planes."""
         return self.domain if self.placement is None else replace(self.domain, chambers=self.placement.rounded())
+
+    @property
+    def socket(self) -> Tensor:
+        """Particles of the chambers' walls from which their tubes hang [n], whose places are rounded if designed."""
+        return sockets(self.rounded_domain, self.port.direction).to(self.settings.target)
 
     def membership(self, like: Tensor) -> Membership | None:
         """What chambers that are designed make of each particle, in the type of a tensor; None if they are given."""

@@ -312,7 +312,8 @@ def varied(body: Body, batch: ScenarioBatch) -> Body:
     """The bodies of the scenarios: moduli and masses of the solid [S, N], void and its drag included."""
     import torch
 
-    solid = body.chamber < 0
+    # What is partly air is solid, too: the air's own mass is 0.3 % of a solid's.
+    solid = body.chamber < 0 if body.air_share is None else body.air_share < 1
 
     def factor(values: Tensor) -> Tensor:
         return torch.where(solid, values.to(body.mass)[:, None], torch.ones_like(body.mass))
