@@ -1,0 +1,111 @@
+"""Which searches go on: valleys of pairs on more and more of the trials, and where the finer twin begins."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from torchsoro.sim2real.inference import search
+from torchsoro.sim2real.inference.search import ENDS_PAIR, FINER_ROUNDS, PROMISING
+
+
+@dataclass(frozen=True, eq=False)
+class Effect:
+    """An effect with one number, probed at 1 to 5."""
+
+    name: str
+
+    def probe_points(self, twin: object) -> list[tuple[np.ndarray, float]]:
+        return [(np.array([float(k)]), 1.0) for k in range(1, 6)]
+
+
+def fit(effects: tuple[Any, ...], point: np.ndarray, chi2: float) -> Any:
+    return SimpleNamespace(
+        effects=effects,
+        name=" and ".join(e.name for e in effects),
+        point=point,
+        chi2=chi2,
+        samples=100,
+        errors=np.zeros(2),
+    )
+
+
+class Pairs:
+    """A problem whose searches stay where they begin; part of the trials prefers low numbers, all of them high ones."""
+
+    common = (("modulus", 0.1),)
+    twin = None
+
+    def __init__(self) -> None:
+        self.whole: list[Any] = []
+
+    def early(self, share: float) -> Any:
+        return SimpleNamespace(fit=lambda tasks, **_: [fit(e, x, float(x[1:].sum())) for e, x in tasks])
+
+    def fit(self, tasks: list[Any], **_: Any) -> list[Any]:
+        self.whole += tasks
+        return [fit(e, x, 100 - float(x[1:].sum())) for e, x in tasks]
+
+
+def test_several_valleys_of_a_pair_go_on_to_all_of_the_trials():
+    effects: Any = [Effect("lag"), Effect("drag")]
+    problem: Any = Pairs()
+    (found,) = search._pairs(problem, effects, [fit((effects[0],), np.array([0.0, 3.0]), 50.0)], lambda line: None)
+    kept = [float(x[1:].sum()) for _, x in problem.whole]
+    assert len({x.tobytes() for _, x in problem.whole}) == len(kept) == ENDS_PAIR
+    # The first part of the trials prefers another valley than all of them do.
+    assert found.chi2 == 100 - max(kept) < 100 - min(kept)
+
+
+def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_spread_points(monkeypatch):
+    effects: Any = [Effect("lag"), Effect("drag"), Effect("mass")]
+    a, b, c = effects
+    begun: list[Any] = []
+
+    class Fine:
+        trials = ("first", "second")
+        observation = SimpleNamespace(deviations=np.ones(2))
+
+        def only(self, trials: Any) -> Any:
+            assert trials == ("first",)
+            return self
+
+        def base(self, _: Any) -> str:
+            return "base"
+
+        def probe(self, effects: Any, base: str) -> list[list[tuple[float, np.ndarray]]]:
+            # The third start of each is the best, but only so many are simulated.
+            return [[(float(k), np.array([0.0, 10.0 + k])) for k in range(4)] for _ in effects]
+
+        def fit(self, tasks: Any, *, rounds: int, **_: Any) -> list[Any]:
+            assert rounds == FINER_ROUNDS
+            begun.append(tasks)
+            return [fit(e, np.zeros(1) if x is None else x, 10.0) for e, x in tasks]
+
+    nothing = fit((), np.zeros(1), 500.0)
+    nothing.errors = np.zeros(2)
+    monkeypatch.setattr(search.dataclasses, "replace", lambda one, **_: one)
+    monkeypatch.setattr(search, "null_starts", lambda problem: [])
+    monkeypatch.setattr(
+        search, "screened", lambda *_: [(5.0, a, np.array([0.0, 1.0])), (50.0, b, np.array([0.0, 1.0]))]
+    )
+    looked: list[Any] = []
+
+    def look(problem: Any, started: Any) -> list[Any]:
+        looked.extend(started)
+        return [(abs(float(x[1]) - 11.0) + 2 * (e is c), e, x) for e, x in started]
+
+    monkeypatch.setattr(search, "looked_at", look)
+    problem: Any = SimpleNamespace(fine="twin", by=lambda twin: Fine())
+    ends = [fit((c,), np.array([0.0, 11.0]), 20.0), fit((a, b), np.zeros(3), 1.0)]
+    search._by_finer(problem, effects, nothing, ends, lambda line: None)
+    # A few starts by responses of each effect, and where single effects have ended before.
+    assert [x[1] for e, x in looked if e is a] == [10.0 + k for k in range(PROMISING)]
+    assert [x[1] for e, x in looked if e is c] == [10.0, 11.0, 11.0]
+    starts = {effects[0]: float(point[1]) for effects, point in begun[1]}
+    assert starts == {a: 11.0, b: 11.0, c: 11.0}
+    # Of a, neither the spread point, which leaves 5, nor the first start, which leaves 1.
+    assert [e.name for (e,), _ in begun[1]] == ["lag", "drag", "mass"]
