@@ -1,7 +1,7 @@
 """Show a finished robot: simulate it again, on a CPU too, and write its movie and its printable STL.
 
     python recipes/replay.py                              # the robots there are
-    python recipes/replay.py walker                       # one cycle of the archived walker, a minute or two
+    python recipes/replay.py walker                       # one cycle of the archived walker, half a minute
     python recipes/replay.py climber --cycles 5 --settle 0
     python recipes/replay.py runs/walker                  # one of your own
     python recipes/replay.py --archive runs/walker --name mine    # keep a finished run among the designs

@@ -397,7 +397,8 @@ class Simulator(nn.Module):
             limit = self.dt * most / found.number
             raise ValueError(
                 f"dt = {self.dt:g} s: above the limit of about {limit:.3g} s, set by {found.term} "
-                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {most})"
+                f"(Courant number {found.number:.3g} in cells of {self.cell:g} m, wanted at most {most}); "
+                'dt = "auto" takes one that is stable'
             )
         return self.dt
 
