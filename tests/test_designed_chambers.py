@@ -17,10 +17,11 @@ from torchsoro.design import loop
 from torchsoro.design.loop import optimize
 from torchsoro.design.placement import DESIGNED
 from torchsoro.design.reading import CHAMBERS, read_settings
-from torchsoro.design.robot import build, walker
-from torchsoro.design.rounding import rounded, rounding_line
+from torchsoro.design.robot import Robot, build, walker
+from torchsoro.design.rounding import changes, rounded, rounding_line
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
+from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import find, load_design, load_resampled
 from torchsoro.output.comparison import compare
 from torchsoro.output.delivery import design
@@ -120,6 +121,30 @@ def test_chambers_may_settle_on_the_way_and_the_body_goes_on(tmp_path, among):
     assert torch.equal(optimize(resumed).gamma, one.gamma)
     for row, again in zip(rows, table(tmp_path / "cut"), strict=True):
         assert all(row[c] == again[c] for c in row if not c.startswith("time/"))
+
+
+def test_amended_rates_and_a_late_settling_take_effect(tmp_path):
+    settings = moving(tmp_path / "run", iterations=2)
+    optimize(walker(settings))
+    amended = dataclasses.replace(
+        settings, resume=True, amend=True, iterations=4, chamber_rate=0.0001, learning_rate=0.5, chamber_until=1
+    )
+    robot = walker(amended)
+    optimize(robot)
+    assert robot.placement is not None and bool(robot.placement.settled)
+    groups = torch.load(settings.out / "checkpoint.pt", weights_only=True)["items"]["adam"]["param_groups"]
+    assert [group["lr"] for group in groups] == [0.5, 0.0001 * robot.domain.spacing]
+
+
+def test_an_unrounded_gait_that_breaks_down_costs_only_its_numbers(monkeypatch):
+    robot = walker(moving(Path("unused")))
+
+    def broken(self: Robot, gamma: torch.Tensor, **_: Any) -> None:
+        raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J <= 0", remedy="a smaller step")
+
+    monkeypatch.setattr(Robot, "forward", broken)
+    found = changes(robot, rounded(robot), {})
+    assert "center_x_1" in found and "L_rounded" not in found and rounding_line(found) == ""
 
 
 def test_of_several_starts_the_best_gives_its_chambers(tmp_path):

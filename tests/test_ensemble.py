@@ -276,6 +276,13 @@ def test_parts_of_processes_are_all_scenarios_in_order():
         Processes(world=6).deal(5)
 
 
+def test_processes_agree_on_a_text_by_its_digest(monkeypatch):
+    assert Processes().agree("a")
+    for other, same in ((0, True), (1, False)):
+        monkeypatch.setattr(Processes, "gather", lambda self, mine, parts, other=other: torch.cat([mine, mine ^ other]))
+        assert Processes(world=2).agree("settings") is same
+
+
 def flags(path: Path, **changes: Any) -> list[str]:
     """The flags that make a tiny run in scenarios."""
     listed = []

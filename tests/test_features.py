@@ -121,6 +121,10 @@ def test_settings_want_a_scenario_for_each_variant_and_a_filter_that_is_wide_eno
         dataclasses.replace(TINY, feature=0.001, scenarios=2)
     with pytest.raises(ValueError, match=r"feature = 0\.02 m: wanted above 0 and below twice the filter radius"):
         dataclasses.replace(TINY, feature=0.02, scenarios=3)
+    # A finished robot is simulated and compared without any, but not designed.
+    finished = walker(dataclasses.replace(TINY, feature=0.004, scenarios=0))
+    with pytest.raises(ValueError, match=r"feature = 0\.004 m with scenarios = 0: wanted at least 3 scenarios"):
+        loop.optimize(finished)
 
 
 def test_scenarios_meet_the_design_eroded_and_dilated_in_turn_with_the_gradients_of_single_runs():

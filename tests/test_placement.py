@@ -7,7 +7,7 @@ import math
 
 import pytest
 import torch
-from tiny import tiny
+from tiny import TINY, tiny
 
 from torchsoro import Chamber, DesignField, Domain, Gas, Prony, Simulator, Solid, fill, ground, square_wave
 from torchsoro.design.blending import fill_blended
@@ -238,6 +238,28 @@ def test_what_a_placement_cannot_do_is_refused():
         Placement(TWO, symmetry=("x",))
 
 
+def test_a_least_cavity_is_kept_when_faces_are_rounded():
+    h = ONE.spacing
+    made = Placement(ONE, cavity=1.4 * h)
+    with torch.no_grad():
+        edge = 2 * ONE.chambers[0].wall + 1.4 * h  # 1.4 spacings of air, with one face on a plane
+        made.size.fill_(edge)
+        made.center.copy_(torch.tensor(ONE.origin) + 4 * h + edge / 2)
+    assert all(edge - 2 * one.wall >= 1.4 * h for one in made.rounded() for edge in one.size)
+
+
+def test_a_step_back_takes_back_centers_that_growing_chambers_have_pushed():
+    made = Placement(TWO, designed=("size",), axis="x")
+    before = {name: one.detach().clone() for name, one in made.named_parameters()}
+    with torch.no_grad():
+        made.size += 3 * TWO.spacing
+    made.clamp_()
+    assert not torch.equal(made.center, before["center"])
+    made.blend_(before, 1.0)
+    for name, one in made.named_parameters():
+        torch.testing.assert_close(one.detach(), before[name], rtol=0, atol=1e-12)
+
+
 # Settings -------------------------------------------------------------------------------------------------------------
 
 
@@ -257,6 +279,21 @@ def test_what_a_placement_cannot_do_is_refused():
 def test_settings_that_do_not_fit_a_designed_chamber_are_refused(changes, message, tmp_path):
     with pytest.raises(ValueError, match=message):
         walker(tiny(tmp_path, chamber_design=("place",), **changes))
+
+
+def test_an_air_port_fits_the_smallest_of_the_chambers(tmp_path):
+    h = TINY.size[0] / TINY.particles[0]
+    low = TINY.size[2] / 2
+    centers = ((-1.5 * h, 0.0, low), (1.5 * h, 0.0, low + h / 2))
+    sizes = ((3 * h, 4 * h, 4 * h), (3 * h, 4 * h, 3 * h))
+    made = walker(tiny(tmp_path, chambers=2, chamber_centers=centers, chamber_sizes=sizes, wall=h))
+    assert made.port.diameter == pytest.approx(0.4 * h)
+
+
+def test_a_port_may_change_on_resume_only_where_it_changes_no_number(tmp_path):
+    assert "port" in tiny(tmp_path).free
+    assert "port" not in tiny(tmp_path, chamber_design=("size",)).free
+    assert "port" not in tiny(tmp_path, feature=0.004, scenarios=3).free
 
 
 def test_bounds_are_checked_before_any_work(tmp_path):

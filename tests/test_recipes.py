@@ -35,6 +35,7 @@ from torchsoro.output import delivery
 from torchsoro.output.archive import load_design, load_shape
 
 RECIPES = Path(__file__).parents[1] / "recipes"
+HISTORY = {"iteration": [0.0], "objective/L": [0.0], "constraint/C": [0.2]}
 TAGS = (
     "objective/L",
     "constraint/C",
@@ -193,7 +194,19 @@ def test_a_checkpoint_of_other_settings_is_refused_and_stays_whole(recipes, stra
     assert {file: file.read_bytes() for file in path.rglob("*.*")} == held
 
 
-def test_a_run_is_resumed_with_its_own_settings_but_for_the_flags_given(straight):
+def test_a_design_with_no_body_to_print_leaves_its_numbers(recipes, tmp_path):
+    # Grey everywhere but in the wall, which no design particle touches at one half.
+    settings = tiny(tmp_path / "run", iterations=1, min_wall=1e-3)
+    robot = walker(settings)
+    gamma = 0.1 * torch.ones(robot.domain.count)
+    settings.out.mkdir()
+    with pytest.raises(ValueError, match="no connected body"):
+        delivery.deliver(settings.out, robot, gamma, HISTORY, name="walker", more={})
+    assert json.loads((settings.out / "result.json").read_text())["mass"] > 0
+    assert (settings.out / "motion.html").exists() and not (settings.out / "shape.stl").exists()
+
+
+def test_a_run_is_resumed_with_its_own_settings_but_for_the_flags_given(straight, tmp_path):
     path, _ = straight
     given = json.loads((path / "settings.json").read_text())
     assert given["particles"] != list(WALKER["desk"].particles)
@@ -201,6 +214,10 @@ def test_a_run_is_resumed_with_its_own_settings_but_for_the_flags_given(straight
     read = from_command_line(WALKER, description="walks", arguments=flags)
     told = {**given, "iterations": 7, "resume": True, "device": "cpu"}
     assert json.loads(json.dumps(dataclasses.asdict(read), default=str)) == told
+    # One that was designed on a GPU goes on without, too.
+    (tmp_path / "settings.json").write_text(json.dumps({**given, "device": "cuda"}))
+    elsewhere = ["--resume", "--out", str(tmp_path), "--device", "cpu"]
+    assert from_command_line(WALKER, description="walks", arguments=elsewhere).device == "cpu"
     preset = from_command_line(WALKER, description="walks", arguments=[*flags, "--preset", "desk"])
     assert preset.particles == WALKER["desk"].particles
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from typing import Any
 
 import pytest
@@ -100,6 +101,7 @@ def test_a_cut_off_run_goes_on_and_ends_the_same(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         optimize_starts(walker(settings), interrupted)
     assert any(path.name in ("start-1", "start-2") for path in settings.out.iterdir())
+    assert json.loads((settings.out / "settings.json").read_text())["starts"] == 2  # for a --resume by itself
     resumed = optimize_starts(walker(dataclasses.replace(settings, resume=True)))
     assert torch.equal(whole.gamma, resumed.gamma) and whole.worth == resumed.worth
     with pytest.raises(ValueError, match="already holds a run"):

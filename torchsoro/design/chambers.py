@@ -84,7 +84,7 @@ def placement_of(s: Settings, domain: Domain, symmetry: tuple[str, ...]) -> Plac
     if not s.chamber_design:
         return None
     least, most = s.chamber_edges
-    if s.port:  # has to fit into every cavity
+    if s.port:
         least = max(least, s.port + 2 * s.wall)
     return Placement(
         domain,
@@ -92,6 +92,7 @@ def placement_of(s: Settings, domain: Domain, symmetry: tuple[str, ...]) -> Plac
         symmetry=symmetry,
         axis=s.chamber_axis,
         edges=(least or None, most or None),
+        cavity=s.port,  # which has to fit into every one
         fixed_volume=s.chamber_volume == "fixed",
     )
 
@@ -117,7 +118,7 @@ def port_of(s: Settings, chambers: tuple[Chamber, ...], travel: tuple[float, flo
     direction = _triple(tuple(-d for d in travel))
     if s.chambers > 1 and travel["xyz".index(s.chamber_axis)]:
         direction = (0.0, 1.0, 0.0) if s.chamber_axis == "z" else (0.0, 0.0, 1.0)
-    cavity = min(edge - 2 * s.wall for edge in chambers[0].size)
+    cavity = min(edge - 2 * s.wall for one in chambers for edge in one.size)
     return AirPort(direction=direction, diameter=s.port or 0.4 * cavity)
 
 

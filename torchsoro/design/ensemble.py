@@ -192,6 +192,8 @@ class Ensemble:
     def serve(self) -> None:
         """Simulate what process 0 asks for, until it has no more; of the other processes."""
         like = self.robot.field.phi
+        if like.device.type == "cpu":
+            torch.set_num_threads(1)  # as process 0: the threads of the kernels do the work
         while True:
             task, iteration, gravity_scale, step = self.processes.broadcast(
                 torch.zeros(4, dtype=torch.float64)

@@ -154,6 +154,8 @@ def leaning(travel: torch.Tensor, feet: torch.Tensor, margin: float) -> torch.Te
 def settle(robot: Robot, placement: Placement, gravity_scale: float) -> dict[str, float]:
     """Round the chambers of a design to lattice planes for good, and simulate it before and after.
 
+    That is in the settings' own scenario.
+
     Args:
         robot: The robot.
         placement: Its chambers; changed.
@@ -312,15 +314,20 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             gradients overflow again and again and no design is within the limit on C.
     """
     s, field, supply, others = robot.settings, robot.field, robot.supply, beside(robot)
+    if s.feature and not s.scenarios:
+        raise ValueError(f"feature = {s.feature:g} m with scenarios = 0: wanted at least 3 scenarios")
     timing, placement = supply.designed(), robot.placement
     spacing, chambers = robot.domain.spacing, [] if placement is None else placement.designed()
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
+    rates = {"phi": s.learning_rate, "timing": s.timing_rate, "chambers": s.chamber_rate * spacing}
+
     def new_adam() -> torch.optim.Adam:
-        groups: list[dict[str, Any]] = [{"params": list(field.parameters()), "lr": s.learning_rate}]
-        groups += [{"params": timing, "lr": s.timing_rate}] if timing else []
-        return torch.optim.Adam(groups + ([{"params": chambers, "lr": s.chamber_rate * spacing}] if chambers else []))
+        parts = {"phi": list(field.parameters()), "timing": timing, "chambers": chambers}
+        return torch.optim.Adam(
+            [{"name": name, "params": part, "lr": rates[name]} for name, part in parts.items() if part]
+        )
 
     adam = new_adam()
     lagrangian = _schedule(s)
@@ -334,11 +341,13 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     with folder as run:
         if state := run.load():
             stopped, best, good = restore(state, robot, adam, lagrangian, run.path)
+            lost = state.get("lost", 0)
+            field.beta = s.sharpness(run.start - 1)
         until = s.chamber_until or math.inf  # from where on the chambers stay
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
             told = {}
-            if placement is not None and k == until:
+            if placement is not None and k >= until and not placement.settled:
                 told = settle(robot, placement, s.gravity_scale(k))
                 best = None  # earlier designs would change as they are rounded
             placing = [] if placement is None else placement.designed()
@@ -346,7 +355,9 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             field.beta = s.sharpness(k)
             if isinstance(lagrangian, ExactPenalty):
                 lagrangian.demand(s.sharpened(k))
-            adam.param_groups[0]["lr"] = s.learning_rate * s.beta / field.beta
+            rates["phi"] = s.learning_rate * s.beta / field.beta
+            for group in adam.param_groups:  # those of now, which may be amended
+                group["lr"] = rates[group["name"]]
             among: dict[str, Any] = {} if ensemble is None else {"ensemble": ensemble, "iteration": k}
             gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), **among)
             violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
@@ -434,7 +445,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                 run.log_histogram("scenarios/L", outcome.travel.detach(), k)
             if observe is not None:
                 observe(run, robot, gamma.detach(), k)
-            run.save(k, field=field, adam=adam, lagrangian=lagrangian, stopped=stopped, best=best, good=good, **others)
+            kept = {"stopped": stopped, "lost": lost, "best": best, "good": good, **others}
+            run.save(k, field=field, adam=adam, lagrangian=lagrangian, **kept)
             if stopped or time.perf_counter() > end_at:
                 break
         if best is not None:

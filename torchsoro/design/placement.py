@@ -64,7 +64,7 @@ class Membership:
     def intermediate(self, gamma: Tensor) -> Tensor:
         """C of Eq. 15 over the designed shares [...]; see :func:`torchsoro.design.objective.intermediate_density`."""
         density = self.designed(gamma)
-        return (self.design * density * (1 - density)).sum(-1) / self.design.sum()
+        return (self.design * density * (1 - density)).sum(-1) / self.design.sum(-1)
 
 
 class Placement(nn.Module):
@@ -84,7 +84,8 @@ class Placement(nn.Module):
         designed: What is designed, of "place" and "size".
         symmetry: Axes along which the body has mirror symmetry.
         axis: Along which several chambers follow each other.
-        edges: Least and most outer edge [m]; None for two walls with ``LEAST_CAVITY`` spacings, and the body's edges.
+        edges: Least and most outer edge [m]; None for two walls with a cavity between, and the body's edges.
+        cavity: Least edge of a cavity [m], kept when faces are rounded, too; ``LEAST_CAVITY`` spacings if that is more.
         fixed_volume: Whether the volume of all cavities together stays that of the first ones.
         transition: Width of the smooth steps, in particle spacings.
 
@@ -102,6 +103,7 @@ class Placement(nn.Module):
         symmetry: Sequence[str] = (),
         axis: str = "x",
         edges: tuple[float | None, float | None] = (None, None),
+        cavity: float = 0.0,
         fixed_volume: bool = False,
         transition: float = TRANSITION,
     ) -> None:
@@ -119,6 +121,8 @@ class Placement(nn.Module):
             torch.tensor([getattr(one, name) for one in domain.chambers], dtype=torch.float64)
             for name in ("center", "size")
         )
+        # Of a cavity between lattice planes, in spacings.
+        self._layers = max(LEAST_CAVITY, float(math.ceil(cavity / domain.spacing - _ROUNDING)))
         self.low = torch.tensor(domain.origin, dtype=torch.float64)
         self.high = self.low + torch.tensor(domain.size, dtype=torch.float64)
         self.least, self.most = self._bounds(*edges, size)
@@ -277,7 +281,7 @@ class Placement(nn.Module):
         center, size = self.boxes()
         low, high = (center - size / 2 - origin) / h, (center + size / 2 - origin) / h
         first, last = torch.floor(low + 0.5 + _ROUNDING), torch.ceil(high - 0.5 - _ROUNDING)
-        hollow = last - first > 2 * self.walls / h + LEAST_CAVITY / 2
+        hollow = last - first > 2 * self.walls / h + self._layers - 0.5
         first, last = torch.where(hollow, first, torch.floor(low)), torch.where(hollow, last, torch.ceil(high))
         planes, wanted = torch.stack([first, last], -1), torch.stack([low, high], -1)
         if self.fixed_volume and not self.settled:
@@ -312,7 +316,7 @@ class Placement(nn.Module):
                 goes = torch.tensor(chosen).view(3, 2)
                 found = torch.where(goes, inward[k], nearest)
                 cavity = found[:, 1] - found[:, 0] - walls[k]
-                if bool((goes[tied, 0] != goes[tied, 1]).any()) or bool((cavity < LEAST_CAVITY).any()):
+                if bool((goes[tied, 0] != goes[tied, 1]).any()) or bool((cavity < self._layers).any()):
                     continue
                 off = abs(float(cavity.prod() / volume[k]) - 1)
                 rank = (round(off, 9), float((found - wanted[k]).square().sum()))
@@ -341,9 +345,10 @@ class Placement(nn.Module):
     @torch.no_grad()
     def blend_(self, other: Mapping[str, Tensor], share: float) -> None:
         """Move in place towards another state by a share of the way."""
-        for name, one in self.named_parameters():
-            if one.requires_grad:
-                one.lerp_(other[name].to(one), share)
+        if self.settled:
+            return
+        for name, one in self.named_parameters():  # centres, too, which growing chambers push
+            one.lerp_(other[name].to(one), share)
         self.clamp_()  # between two shapes of a volume that is fixed lies another volume
 
     def extra_repr(self) -> str:

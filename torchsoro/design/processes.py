@@ -6,6 +6,7 @@ Torch is imported where it is used, as a process chooses its GPU before CUDA sta
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 from collections.abc import Iterator, Sequence
@@ -91,6 +92,15 @@ class Processes:
                 torch.distributed.all_gather([torch.zeros(1) for _ in parts], torch.zeros(1))
             torch.distributed.all_gather(found, mine)
         return torch.cat([one[: len(part)] for one, part in zip(found, parts, strict=True)])
+
+    def agree(self, text: str) -> bool:
+        """Whether all processes have the same text."""
+        if self.world == 1:
+            return True
+        import torch
+
+        mine = torch.frombuffer(bytearray(hashlib.sha256(text.encode()).digest()), dtype=torch.uint8)[None]
+        return bool((self.gather(mine, [range(1)] * self.world) == mine).all())
 
     def first_error(self, error: SimulationDiverged | None) -> SimulationDiverged | None:
         """The error of the first process that has one; all get the same."""

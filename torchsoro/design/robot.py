@@ -44,9 +44,9 @@ class Outcome:
         travel: L, Eq. 13 [m].
         feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
         soles: The same with all soles, the less the farther off they are, which has a gradient by what touches [m].
-        inflated: Travel of the centre of gravity when the valve closes for the first time [m].
+        inflated: Travel of the centre of gravity after the first ``settings.duty`` of a cycle [m].
         turn: Angle by which the soles turned about z since the actuation starts, positive to the left [rad].
-        turn_inflated: The same when the valve closes for the first time [rad].
+        turn_inflated: The same after the first ``settings.duty`` of a cycle [rad].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
         fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].

@@ -14,6 +14,7 @@ from torchsoro.design.loop import worth_of
 from torchsoro.design.placement import numbered
 from torchsoro.design.reading import CHAMBERS
 from torchsoro.design.robot import Robot, build
+from torchsoro.errors import SimulationDiverged
 from torchsoro.storage import atomic_write
 
 
@@ -58,10 +59,7 @@ def changes(robot: Robot, sharp: Robot, history: Mapping[str, Sequence[float]]) 
     Returns:
         Centre and outer edges of each chamber [m] as ``center_x_1``, ``size_x_1``, ..., and volume of all cavities
         [m3]; travel [m] and what was maximised, in cells (see :func:`torchsoro.design.loop.worth_of`), before and after
-        they were rounded.
-
-    Raises:
-        SimulationDiverged: if the simulation of one of them breaks down.
+        they were rounded, in the settings' own scenario; without travel if one of these simulations breaks down.
     """
     assert robot.placement is not None
     chambers = sharp.domain.chambers
@@ -72,7 +70,10 @@ def changes(robot: Robot, sharp: Robot, history: Mapping[str, Sequence[float]]) 
     names = [f"{name}_{when}" for name in ("L", "objective") for when in ("unrounded", "rounded")]
     if f"chamber/{names[0]}" in history:
         return found | {name: [v for v in history[f"chamber/{name}"] if not math.isnan(v)][-1] for name in names}
-    before, after = robot(robot.density()), sharp(sharp.density())
+    try:
+        before, after = robot(robot.density()), sharp(sharp.density())
+    except SimulationDiverged:  # in a scenario that the run may not have met
+        return found
     values = float(before.travel), float(after.travel), worth_of(robot, before), worth_of(sharp, after)
     return found | dict(zip(names, values, strict=True))
 

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
 from torchsoro.design.limits import check_pressure, points_across
+from torchsoro.design.processes import world_size
 from torchsoro.design.scenarios import LIMITS, Scenarios, check_friction, check_range
 
 if TYPE_CHECKING:
@@ -361,7 +362,7 @@ class Settings:
             from torchsoro.design.features import threshold_of
 
             threshold_of(self.filter_radius, self.feature)
-            if self.scenarios < 3:
+            if 0 < self.scenarios < 3:
                 raise ValueError(
                     f"feature = {self.feature:g} m: wanted at least 3 scenarios (scenarios = {self.scenarios}), as the "
                     "design, an eroded and a dilated one take turns in them"
@@ -411,6 +412,7 @@ class Settings:
         if self.target.type == "cuda":
             import torch
 
+            need = each * max(1, math.ceil(self.scenarios / world_size()))  # each process has a GPU
             have = torch.cuda.get_device_properties(self.target).total_memory
         else:
             have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else math.inf
@@ -459,5 +461,6 @@ class Settings:
             "follow",
             "offset",
             "min_wall",
-            "port",
+            # Cut out of the body while designing, or what the least chamber has to hold.
+            *(() if self.feature or self.chamber_design else ("port",)),
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import statistics
@@ -34,7 +35,7 @@ from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
-from torchsoro.storage import atomic_write
+from torchsoro.storage import atomic_write, plain_settings
 
 
 def design(robot: Robot, name: str) -> dict[str, float]:
@@ -61,17 +62,22 @@ def design(robot: Robot, name: str) -> dict[str, float]:
             f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or "
             f"beside a slope of {s.slope:g}"
         )
-    if s.start_from and not (s.resume and (s.out / "checkpoint.pt").exists()):
-        begin_with(robot.field, s.start_from)
     if world_size() > 1:
         if s.starts > 1:
             raise ValueError(f"starts = {s.starts}: wanted 1 in several processes, which share scenarios")
         Processes(world=world_size()).deal(s.scenarios)
     with joined(s.target.type == "cuda") as processes:
+        if not processes.agree(json.dumps(numbers_of(s))):
+            raise ValueError(
+                "settings: they differ between processes, wanted the same on all hosts: share the run's folder, or "
+                "give every flag again"
+            )
         if processes.rank:
             Ensemble(robot, processes).serve()
             return {}
         try:
+            if s.start_from and not (s.resume and (s.out / "checkpoint.pt").exists()):
+                begin_with(robot.field, s.start_from)
             optimized = optimize_starts(robot, observe, processes)
         except (ConnectionError, KeyboardInterrupt):  # the others wait for something else, and notice by themselves
             raise
@@ -99,6 +105,11 @@ def design(robot: Robot, name: str) -> dict[str, float]:
     found = deliver(s.out, robot, gamma, history, name=name, chosen=optimized.iteration, more=more)
     print(report(found, s))
     return found
+
+
+def numbers_of(s: Settings) -> dict[str, Any]:
+    """The settings that change the numbers of a run."""
+    return {name: one for name, one in plain_settings(dataclasses.asdict(s)).items() if name not in s.free}
 
 
 def observe(run: RunFolder, robot: Robot, gamma: torch.Tensor, iteration: int) -> None:
@@ -216,11 +227,14 @@ def mended(robot: Robot, gamma: torch.Tensor, part: Part | None = None) -> tuple
         part: The part, if it has been made already.
 
     Returns:
-        None and the design's density, where no least wall is asked for.
+        None and the design's density, where no least wall is asked for, or there is no part.
     """
     if not robot.settings.min_wall:
         return None, gamma
-    part = part or print_part(robot, gamma.cpu().numpy())
+    try:
+        part = part or print_part(robot, gamma.cpu().numpy())
+    except (ValueError, RuntimeError):  # no body to print, which is told at the end
+        return None, gamma
     return part, thickened(gamma, torch.from_numpy(part.added).to(gamma), robot.settings.power)
 
 
@@ -297,10 +311,10 @@ def show(
         with progress_bar(f"simulating {name}, not mended") as progress:
             found |= told_of(part, robot(gamma, void=void, progress=progress))
     found |= more or {}
-    bodiless: ValueError | None = None
+    bodiless: ValueError | RuntimeError | None = None
     try:
         part = part or print_part(robot, density)
-    except ValueError as error:
+    except (ValueError, RuntimeError) as error:
         bodiless = error
     else:
         found["thinnest_wall"] = 1e-3 * part.report.thinnest_wall_mm
