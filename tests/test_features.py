@@ -148,6 +148,20 @@ def test_scenarios_meet_the_design_eroded_and_dilated_in_turn_with_the_gradients
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5 * float(wanted.abs().max()))
 
 
+def test_variants_grow_apart_as_the_projection_sharpens(monkeypatch):
+    made = walker(dataclasses.replace(TINY, **FEATURED, sharpen=(2, 6)))
+    ensemble, seen = Ensemble(made), []
+    monkeypatch.setattr(Ensemble, "_simulated", lambda self, variants, *_: seen.append(variants))
+    for iteration in (6, 8, 10, 13):
+        with pytest.raises(AssertionError):
+            ensemble.judge(made.field(), iteration, 1.0)
+    even, half, sharp, later = seen
+    assert torch.equal(even[0], even[1]) and torch.equal(even[0], even[2])
+    masses = [float(one[1].sum()) for one in seen]
+    assert masses[0] > masses[1] > masses[2] == masses[3] and torch.equal(sharp, later)
+    assert torch.equal(half[0], sharp[0])
+
+
 def test_a_run_tells_how_far_its_variants_go(recipes, tmp_path):
     result = recipes["walker"].main(dataclasses.replace(TINY, out=tmp_path / "run", **{**FEATURED, "clip": 3.0}))
     rows = np.genfromtxt(tmp_path / "run" / "metrics.csv", delimiter=",", names=True)

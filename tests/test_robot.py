@@ -13,6 +13,7 @@ from tiny import TINY
 import torchsoro.design.robot
 from torchsoro import SimulationDiverged, Simulator
 from torchsoro.design.robot import Outcome, Robot, build, climber, walker
+from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.design.settings import Settings
 
 
@@ -157,6 +158,21 @@ def test_the_settings_name_the_robot():
 
 
 @torch.no_grad()
+def test_what_is_free_below_a_body_is_no_fall():
+    robot = walker(TINY)
+    whole = torch.ones(robot.domain.count)
+    h = robot.domain.spacing
+    worn = torch.where(robot.domain.positions[:, 2] < h, 0.0, whole)  # as an eroded design, without its lowest layer
+    assert robot.clearance(torch.stack([whole, worn])).tolist() == pytest.approx([0.0, h])
+    assert float(robot.clearance(0.1 * whole)) == 0.0 == float(climber(tiny(wall_distance=0.04)).clearance(worn))
+    dropped = ScenarioBatch(count=2, drop=torch.tensor([0.0, 0.002], dtype=torch.float64))
+    torch.testing.assert_close(robot.clearance(whole, dropped), torch.tensor([0.0, 0.002]))
+    with torch.no_grad():
+        falls = walker(tiny(settle=0.04, sink=0.0, duration=0.02))(whole, scenarios=dropped).fall
+    # Both sink by their weight alone; what drops, and has its speed to lose, a little more.
+    assert float(falls[0]) <= float(falls[1]) < float(falls[0]) + 0.0005
+
+
 def test_a_share_of_gravity_is_a_smaller_gravity():
     robot = walker(tiny(gravity=8.0))
     half = robot(robot.field(), gravity_scale=0.5)

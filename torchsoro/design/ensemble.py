@@ -56,13 +56,14 @@ class Ensemble:
     """Simulates a robot, whose timing and chambers may be designed, too, in its scenarios, by one process or several.
 
     With a least thickness of features, scenarios meet three variants of the design in turn: itself, eroded, dilated.
+    Their thresholds grow once the projection is sharp, over as many iterations as that took: eroded grey is void.
 
     Args:
         robot: The robot.
         processes: Those of the run.
 
     Attributes:
-        thresholds: Of the projection, for each variant.
+        thresholds: Of the projection in the end, for each variant.
     """
 
     def __init__(self, robot: Robot, processes: Processes | None = None) -> None:
@@ -90,6 +91,13 @@ class Ensemble:
         s = self.robot.settings
         return s.distribution.sample(self.count, s.scenario_seed + (iteration if s.fresh else 0))
 
+    def grown(self, iteration: int) -> float:
+        """What part of their thresholds the variants have in an iteration, 0 to 1; 1 where there are none."""
+        first, last = self.robot.settings.sharpen
+        if len(self.thresholds) == 1 or not last:
+            return 1.0
+        return self.robot.settings.sharpened(iteration - (last - first))
+
     def judge(self, gamma: Tensor, iteration: int, gravity_scale: float) -> Outcome:
         """Simulate a design in the scenarios of an iteration.
 
@@ -108,7 +116,8 @@ class Ensemble:
         robot, s = self.robot, self.robot.settings
         batch = self.sample(iteration)
         dt = robot.step(gamma, batch)
-        self._variants = [gamma, *(robot.field(threshold=one) for one in self.thresholds[1:])]
+        grown = self.grown(iteration)
+        self._variants = [gamma, *(robot.field(threshold=grown * one) for one in self.thresholds[1:])]
         for halving in range(s.halvings + 1):
             step = dt / 2**halving
             _tell(self.processes, _JUDGE, iteration, gravity_scale, step)

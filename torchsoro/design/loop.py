@@ -301,7 +301,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
     Travel is a rough function of the design, so that the last design is seldom the best. Designs count from the first
-    iteration with full gravity on. Where gradients overflow again and again, the run ends with its best design.
+    iteration with full gravity on, and with the whole thickness of features. Where gradients overflow again and again, the run ends with its best design.
 
     Args:
         robot: What to design.
@@ -400,7 +400,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             for one, more in zip((field.phi, *placing), (price, *prices), strict=True):
                 one.grad = more if one.grad is None else one.grad + more
             worth, excess = worth_of(robot, outcome), float(violation.detach())
-            if s.gravity_scale(k) == 1.0 and better(worth, excess, best, lagrangian):
+            counts = s.gravity_scale(k) == 1.0 and (ensemble is None or ensemble.grown(k) == 1.0)
+            if counts and better(worth, excess, best, lagrangian):
                 best = {"iteration": k, "worth": worth, "violation": excess, **design}
             end = time.perf_counter()
             timed = {f"supply/{name}": value for name, value in supply.numbers().items()} if timing else {}
@@ -415,7 +416,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             event = lagrangian.update(loss.item(), excess)
             if event is not None and event.reset_optimizer:
                 adam = new_adam()
-            whole = s.gravity_scale(k) == 1.0 and (until == math.inf or k >= until)
+            whole = counts and (until == math.inf or k >= until)
             stopped = lost > MOST_LOST or (event is not None and event.stop and whole)
             center = outcome.center.detach()
             run.log(

@@ -49,7 +49,8 @@ class Outcome:
         turn_inflated: The same after the first ``settings.duty`` of a cycle [rad].
         intermediate: C, Eq. 15.
         mass: Of solid and chamber wall [kg].
-        fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height [m].
+        fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height and what is free below
+            the body at the start [m].
         center: Centre of gravity of the undeformed design domain [3] m, Eq. 14.
         trajectory: The motion.
         dt: Substep that it took [s]: the settings' or, where that broke down, a half or a quarter of it.
@@ -196,11 +197,29 @@ class Robot(nn.Module):
             turn_inflated=self.turned(trajectory, gamma, s.settle + closes),
             intermediate=intermediate_density(gamma, self.design) if member is None else member.intermediate(gamma),
             mass=total_mass(solid),
-            fall=torch.relu(height[..., 0] - height.amin(-1) - s.sink * s.size[2]),
+            fall=torch.relu(height[..., 0] - self.clearance(gamma, scenarios) - height.amin(-1) - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
             dt=trajectory.dt,
         )
+
+    @torch.no_grad()
+    def clearance(self, gamma: Tensor, scenarios: ScenarioBatch | None = None) -> Tensor:
+        """Height of the solid above the ground at the start [...] m, in whole layers, and a drop; 0 without a ground.
+
+        An eroded design has lost its lowest layers, and lands before it walks.
+
+        Args:
+            gamma: Density [..., N].
+            scenarios: That may begin with a drop.
+        """
+        none = torch.zeros((), dtype=gamma.dtype, device=gamma.device)
+        if not any(plane.axis == 2 and plane.side == 1 for plane in self.planes):
+            return none
+        layer = ((self.domain.positions[:, 2] - self.domain.origin[2]) / self.domain.spacing).floor().to(gamma)
+        solid = torch.where(gamma >= 0.5, layer, math.inf).amin(-1)
+        free = torch.where(solid.isfinite(), solid, 0.0) * self.domain.spacing
+        return free if scenarios is None or scenarios.drop is None else free + scenarios.drop.to(free)
 
     def density(self) -> Tensor:
         """Density of the present design [N], with a gradient by the field and by chambers that are designed."""
