@@ -301,7 +301,8 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     """Run the design loop to the stopping rule, in the folder ``robot.settings.out``.
 
     Travel is a rough function of the design, so that the last design is seldom the best. Designs count from the first
-    iteration with full gravity on, and with the whole thickness of features. Where gradients overflow again and again, the run ends with its best design.
+    iteration with full gravity on, and with the whole thickness of features. Where gradients overflow again and again,
+    the run ends with its best design.
 
     Args:
         robot: What to design.
