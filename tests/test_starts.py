@@ -88,6 +88,7 @@ def test_where_every_start_breaks_down_so_does_the_run(tmp_path, monkeypatch):
     monkeypatch.setattr(starts, "optimize", broken)
     with pytest.raises(SimulationDiverged):
         optimize_starts(walker(tiny(tmp_path / "run", starts=2)))
+    assert not (tmp_path / "run").exists()  # so that it can be started again with other settings
 
 
 def test_a_cut_off_run_goes_on_and_ends_the_same(tmp_path):

@@ -7,6 +7,7 @@ and the metrics of the best.
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import dataclasses
 import json
@@ -24,7 +25,7 @@ from torchsoro.design.robot import Robot
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.threads import thread_count, threads_here
-from torchsoro.storage import atomic_write, plain_settings
+from torchsoro.storage import atomic_write, check_folder, plain_settings
 
 CHANGE = 1e-6  # of the initial field, standard deviation: some ten times the rounding of float32
 
@@ -59,6 +60,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     s = robot.settings
     if s.starts == 1:
         return optimize(robot, observe, processes)
+    check_folder("out", s.out)
     if (s.out / "settings.json").exists() and not (s.resume or s.overwrite):
         raise ValueError(f"out = {s.out}: already holds a run; wanted another folder, or --resume or --overwrite")
     if s.resume and not any(s.out.glob("start-*/settings.json")) and not (s.out / "settings.json").exists():
@@ -96,6 +98,10 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
             raise
     found = {k: one for k, one in enumerate(ended) if isinstance(one, Optimized)}
     if not found:
+        if not any(s.out.glob("start-*/checkpoint.pt")):  # nothing that a resumed run could go on from
+            (s.out / "settings.json").unlink()
+            with contextlib.suppress(OSError):  # where it holds something else
+                s.out.rmdir()
         raise next(one for one in ended if isinstance(one, SimulationDiverged))
     best = max(found, key=lambda k: (-max(found[k].violation, 0.0), found[k].worth))
     robot.field.load_state_dict(robots[best].field.state_dict())
