@@ -322,13 +322,11 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
     if s.target.type == "cpu":
         torch.set_num_threads(1)  # Taichi's threads do the work; torch's would spin beside them
 
-    rates = {"phi": s.learning_rate, "timing": s.timing_rate, "chambers": s.chamber_rate * spacing}
+    beside_field = [(timing, s.timing_rate), (chambers, s.chamber_rate * spacing)]
+    groups = [(list(field.parameters()), s.learning_rate), *(pair for pair in beside_field if pair[0])]
 
     def new_adam() -> torch.optim.Adam:
-        parts = {"phi": list(field.parameters()), "timing": timing, "chambers": chambers}
-        return torch.optim.Adam(
-            [{"name": name, "params": part, "lr": rates[name]} for name, part in parts.items() if part]
-        )
+        return torch.optim.Adam([{"params": part, "lr": rate} for part, rate in groups])
 
     adam = new_adam()
     lagrangian = _schedule(s)
@@ -356,9 +354,9 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             field.beta = s.sharpness(k)
             if isinstance(lagrangian, ExactPenalty):
                 lagrangian.demand(s.sharpened(k))
-            rates["phi"] = s.learning_rate * s.beta / field.beta
-            for group in adam.param_groups:  # those of now, which may be amended
-                group["lr"] = rates[group["name"]]
+            for group, (_, rate) in zip(adam.param_groups, groups, strict=True):  # of now, which may be amended
+                group["lr"] = rate
+            adam.param_groups[0]["lr"] = s.learning_rate * s.beta / field.beta
             among: dict[str, Any] = {} if ensemble is None else {"ensemble": ensemble, "iteration": k}
             gamma, outcome, back = simulate(robot, good[-1], s.gravity_scale(k), **among)
             violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
