@@ -148,7 +148,7 @@ def test_scenarios_meet_the_design_eroded_and_dilated_in_turn_with_the_gradients
     torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5 * float(wanted.abs().max()))
 
 
-def test_variants_grow_apart_as_the_projection_sharpens(monkeypatch):
+def test_variants_grow_apart_once_the_projection_is_sharp(monkeypatch):
     made = walker(dataclasses.replace(TINY, **FEATURED, sharpen=(2, 6)))
     ensemble, seen = Ensemble(made), []
     monkeypatch.setattr(Ensemble, "_simulated", lambda self, variants, *_: seen.append(variants))

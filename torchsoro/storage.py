@@ -194,6 +194,22 @@ def read_json(path: Path, kind: type) -> Any:
     return found
 
 
+def write_json(path: Path, value: Any, *, allow_nan: bool = True) -> None:
+    """Replace a file by a value as indented JSON, atomically.
+
+    Args:
+        path: The file.
+        value: What JSON can hold.
+        allow_nan: Whether numbers may be NaN or infinite.
+
+    Raises:
+        ValueError: for such a number where none may be.
+    """
+    text = json.dumps(value, indent=2, allow_nan=allow_nan) + "\n"
+    with atomic_write(path) as file:
+        file.write(text.encode())
+
+
 def read_checkpoint(path: Path, parts: Mapping[str, type]) -> dict[str, Any]:
     """Read what ``torch.save`` wrote, after a look at the checksums of the zip format, which torch passes over.
 

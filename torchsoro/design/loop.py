@@ -268,9 +268,8 @@ def restore(
 def spread(robot: Robot, outcome: Outcome, lost: int) -> dict[str, float]:
     """How the travel spreads over the scenarios, falls, and gradients that overflowed, by their tags.
 
-    ``tenth`` is the mean of the lowest tenth, as where a finished design is evaluated.
-
-    With a least thickness of features, the mean of the design's variants, too.
+    ``tenth`` is the mean of the lowest tenth, as where a finished design is evaluated. With a least thickness of
+    features, the mean of the design's variants, too.
     """
     travel = outcome.travel.detach().double()
     variants = VARIANTS if robot.settings.feature else ()

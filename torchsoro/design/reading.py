@@ -70,7 +70,7 @@ def from_command_line(
     """
     first = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     first.add_argument("--preset", default=None)
-    first.add_argument("--device", default="auto")  # which a run may change when it goes on
+    first.add_argument("--device", default="auto")
     first.add_argument("--out", type=Path)
     first.add_argument("--resume", action="store_true")
     first.add_argument("-h", "--help", action="store_true")
@@ -82,9 +82,8 @@ def from_command_line(
     default = presets.get(name, presets["desk"])
     out = known.out or default.out
     if known.resume and known.preset is None and (begun := out / "settings.json").is_file():
-        default = _settings(
-            begun, _object(begun), {"out": out, "device": known.device, "amend": False, "overwrite": False}
-        )
+        now = {"out": out, "device": known.device, "amend": False, "overwrite": False}  # of this call, not of the run
+        default = _settings(begun, _object(begun), now)
     # The help joins lines that begin with a letter to paragraphs; commands are to keep theirs.
     text = re.sub(r"\n *(?=(?:python|torchsoro|tensorboard) )", "\n$ ", as_called(description))
     groups = tyro.cli(_grouped(default), args=arguments, description=text, config=(tyro.conf.OmitArgPrefixes,))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +14,7 @@ from torchsoro.design.placement import numbered
 from torchsoro.design.reading import CHAMBERS
 from torchsoro.design.robot import Robot, build
 from torchsoro.errors import SimulationDiverged
-from torchsoro.storage import atomic_write
+from torchsoro.storage import write_json
 
 
 @torch.no_grad()
@@ -42,9 +41,7 @@ def rounded(robot: Robot) -> Robot:
 
 def save_chambers(folder: Path, robot: Robot) -> None:
     """Write the settings of a robot's chambers beside those of its run, as ``read_settings`` takes them up."""
-    with atomic_write(folder / CHAMBERS) as file:
-        held = {"chamber_design": [], **chamber_settings(robot.domain.chambers)}
-        file.write((json.dumps(held, indent=2) + "\n").encode())
+    write_json(folder / CHAMBERS, {"chamber_design": [], **chamber_settings(robot.domain.chambers)})
 
 
 @torch.no_grad()

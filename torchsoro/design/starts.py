@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import copy
 import dataclasses
-import json
 import math
 import sys
 import threading
@@ -25,7 +24,7 @@ from torchsoro.design.robot import Robot
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.threads import thread_count, threads_here
-from torchsoro.storage import atomic_write, check_folder, plain_settings
+from torchsoro.storage import check_folder, plain_settings, write_json
 
 CHANGE = 1e-6  # of the initial field, standard deviation: some ten times the rounding of float32
 
@@ -67,8 +66,7 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
         raise ValueError(f"out = {s.out}: holds no run of several starts; start without --resume")
     robots = [_start(robot, k) for k in range(s.starts)]
     s.out.mkdir(parents=True, exist_ok=True)
-    with atomic_write(s.out / "settings.json") as file:  # what --resume goes on with
-        file.write((json.dumps(plain_settings(dataclasses.asdict(s)), indent=2) + "\n").encode())
+    write_json(s.out / "settings.json", plain_settings(dataclasses.asdict(s)))  # what --resume goes on with
     # Taichi, that is a GPU and the updated form, takes one simulation at a time.
     beside = min(s.starts, thread_count()) if s.target.type == "cpu" and s.formulation == "total" else 1
     threads, over = max(1, thread_count() // beside), threading.Event()

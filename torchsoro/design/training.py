@@ -21,7 +21,6 @@ Tags that every recipe shares: ``objective/L``, ``constraint/C``, ``mass``, ``co
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import signal
 import sys
@@ -46,6 +45,7 @@ from torchsoro.storage import (
     read_checkpoint,
     read_json,
     read_metrics,
+    write_json,
 )
 
 _ABSENT = "absent"
@@ -133,8 +133,7 @@ class RunFolder:
         held = [self.path / file for file in ("settings.json", "amendments.json")] if resume else []
         self._held = {path: path.read_bytes() if path.exists() else None for path in held}
         self._note(changed)
-        with atomic_write(self.path / "settings.json") as file:
-            file.write((json.dumps(self.settings, indent=2, allow_nan=False) + "\n").encode())
+        write_json(self.path / "settings.json", self.settings, allow_nan=False)
         self._metrics = MetricsFile(self.path / "metrics.csv", columns, rows)
         self._saved = self.start - 1
         self._bar: tqdm | None = None
@@ -404,8 +403,7 @@ class RunFolder:
         if changed:
             noted.append({"iteration": self.start, "changes": {name: list(pair) for name, pair in changed.items()}})
         if noted != held:
-            with atomic_write(path) as file:
-                file.write((json.dumps(noted, indent=2) + "\n").encode())
+            write_json(path, noted)
 
 
 def _flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

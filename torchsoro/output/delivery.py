@@ -35,7 +35,7 @@ from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
-from torchsoro.storage import atomic_write, plain_settings
+from torchsoro.storage import plain_settings, write_json
 
 
 def design(robot: Robot, name: str) -> dict[str, float]:
@@ -321,9 +321,8 @@ def show(
         found["thinnest_gap"] = 1e-3 * part.report.thinnest_gap_mm
         save_part(path, part)
     if more is not None:
-        with atomic_write(path / "result.json") as file:
-            plain = {key: None if math.isnan(value) else value for key, value in found.items()}
-            file.write((json.dumps(plain, indent=2) + "\n").encode())
+        plain = {key: None if math.isnan(value) else value for key, value in found.items()}
+        write_json(path / "result.json", plain)
     begin = np.array([np.interp(s.settle, time, component) for component in center.T])
     drawn = np.unique(np.linspace(0, len(time) - 1, min(s.frames, len(time))).round().astype(int))
     supply = mean_pressure(robot, trajectory.time)
@@ -393,8 +392,7 @@ def save_part(path: Path, part: Part) -> None:
     """Write a part into a folder: ``shape.stl``, ``shape.3mf`` and ``shape.json``."""
     part.save(path / "shape.stl")
     part.save(path / "shape.3mf")
-    with atomic_write(path / "shape.json") as file:
-        file.write((json.dumps(part.report.as_dict(), indent=2) + "\n").encode())
+    write_json(path / "shape.json", part.report.as_dict())
 
 
 def told_of(part: Part, plain: Outcome) -> dict[str, float]:

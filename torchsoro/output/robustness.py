@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
-import json
 import math
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +23,7 @@ from torchsoro.output.canvas import canvas_of, pixels
 from torchsoro.output.delivery import spread_line
 from torchsoro.output.page import heading, plain, scenario_panel
 from torchsoro.output.scene import INK, REST
-from torchsoro.storage import atomic_write, check_folder
+from torchsoro.storage import atomic_write, check_folder, write_json
 
 # Of the scenarios beyond the design run's: each of its iterations, of 10^6 at most, may have drawn with the next seed.
 UNSEEN = 2 * 10**6
@@ -96,8 +95,7 @@ def compare_scenarios(
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / TABLE) as file:
         file.write(table(found).encode())
-    with atomic_write(out / NUMBERS) as file:
-        file.write((json.dumps(result, indent=2) + "\n").encode())
+    write_json(out / NUMBERS, result)
     line = spread_line(result, count)
     image = Image.fromarray(picture(found, f"{folder.name}: {line}"))
     with atomic_write(out / PICTURE) as file:

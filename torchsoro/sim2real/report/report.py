@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -41,7 +40,7 @@ from torchsoro.sim2real.report.words import (
     quantity_words,
     with_unit,
 )
-from torchsoro.storage import atomic_write
+from torchsoro.storage import write_json
 
 BARS = 8  # on the first screen, at most
 LEAST_BARS, FAINT = 3, 0.01  # shown always; of the others, those that are at least as probable
@@ -60,8 +59,7 @@ def write(e: Explanation, trials: Sequence[Trial], out: Path, settings: Mapping[
         settings: Of the command line.
     """
     data = as_json(e, settings)
-    with atomic_write(out / "explanation.json") as file:
-        file.write((json.dumps(data, indent=2) + "\n").encode())
+    write_json(out / "explanation.json", data)
     page = Document(e.problem.experiment.setup.title or "Explanation", verdict_sentence(e))
     _at_first(page, e, trials)
     page.points(evidence(e))
