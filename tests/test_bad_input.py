@@ -95,6 +95,12 @@ WRONG = [
     ("walker", ["--frequency", "1e9"], "frequency = 1e+09 Hz: wanted at most 200 Hz"),
     ("walker", ["--port", "1"], "port = 1 m: wanted 0, or"),
     ("walker", ["--port", "1e-9"], "port = 1e-09 m: wanted 0, or"),
+    ("walker", ["--chamber-until", "5"], "chamber_until = 5: without chamber_design, wanted place or size there"),
+    (
+        "walker",
+        ["--chambers", "2", "--chamber-axis", "y", *"--chamber-centers -0.008 0 0.0175 0.008 0 0.0175".split()],
+        r"the port of 'chamber 2' runs into chamber 'chamber 1'",
+    ),
     ("walker", ["--offset", "1"], "offset = 1 m: wanted at most a quarter"),
     ("walker", ["--air-density", "-3"], "air_density = -3.0: wanted finite and positive or 'auto'"),
     ("walker", ["--particles", "6000", "6000", "6000"], "GiB"),

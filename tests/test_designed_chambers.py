@@ -69,6 +69,13 @@ def test_a_fixed_volume_stays_and_edges_keep_their_bounds(tmp_path):
     assert min(edges) >= 0.015 and max(edges) <= 0.019 and len(set(edges)) > 3
 
 
+def test_a_narrow_port_leaves_a_designed_chamber_its_layer_of_air(tmp_path):
+    robot = walker(moving(tmp_path, port=1e-3))
+    assert robot.placement is not None and robot.domain.spacing > 1e-3
+    least = robot.settings.wall * 2 + robot.domain.spacing
+    assert robot.placement.least == pytest.approx(torch.full((1, 3), least, dtype=torch.float64))
+
+
 def test_a_resumed_run_keeps_the_chambers_to_the_bit(tmp_path):
     settings = moving(tmp_path / "whole", iterations=4)
     whole = walker(settings)

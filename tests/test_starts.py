@@ -38,6 +38,16 @@ def test_the_best_start_is_what_the_run_ends_with(tmp_path):
     assert (settings.out / "settings.json").exists()
 
 
+def test_a_run_that_starts_again_leaves_no_start_of_the_former(tmp_path):
+    (tmp_path / "run" / "start-mine").mkdir(parents=True)
+    optimize_starts(walker(tiny(tmp_path / "run", starts=3)))
+    (tmp_path / "run" / "start-4").mkdir()  # nobody's run
+    for count, left in ((2, {"start-1", "start-2"}), (1, set())):
+        optimize_starts(walker(tiny(tmp_path / "run", starts=count, overwrite=True)))
+        found = {folder.name for folder in (tmp_path / "run").glob("start-*")}
+        assert found == left | {"start-mine", "start-4"}
+
+
 def test_starts_one_after_the_other_end_as_side_by_side(tmp_path):
     beside = optimize_starts(walker(tiny(tmp_path / "beside", starts=2)))
     with threads_here(1):

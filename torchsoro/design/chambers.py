@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.mesh import UNITS, read_surface
-from torchsoro.design.placement import Placement
+from torchsoro.design.placement import LEAST_CAVITY, Placement
 from torchsoro.design.port import AirPort
 from torchsoro.design.settings import Settings
 
@@ -60,6 +60,21 @@ def _check(s: Settings) -> None:
         )
 
 
+def check_designed(s: Settings) -> None:
+    """Refuse settings of chambers that are designed where none are.
+
+    Raises:
+        ValueError: saying which.
+    """
+    names = ("chamber_edges", "chamber_volume", "chamber_until", "chamber_rate")
+    usual = {one.name: one.default for one in dataclasses.fields(Settings)}
+    for name in names:
+        if getattr(s, name) != usual[name] and not s.chamber_design:
+            raise ValueError(
+                f"{name} = {getattr(s, name)}: without chamber_design, wanted place or size there, or this left out"
+            )
+
+
 def _given(s: Settings, chambers: tuple[Chamber, ...]) -> tuple[Chamber, ...]:
     """The same where the settings say that they lie, and as large as they say."""
     centers = s.chamber_centers or tuple(one.center for one in chambers)
@@ -85,7 +100,7 @@ def placement_of(s: Settings, domain: Domain, symmetry: tuple[str, ...]) -> Plac
         return None
     least, most = s.chamber_edges
     if s.port:
-        least = max(least, s.port + 2 * s.wall)
+        least = max(least, max(s.port, LEAST_CAVITY * domain.spacing) + 2 * s.wall)
     return Placement(
         domain,
         designed=s.chamber_design,

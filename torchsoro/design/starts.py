@@ -11,9 +11,11 @@ import contextlib
 import copy
 import dataclasses
 import math
+import shutil
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import torch
 
@@ -57,6 +59,8 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
         SimulationDiverged: if the simulation of every start breaks down.
     """
     s = robot.settings
+    if s.overwrite:
+        _forget(s.out, s.starts if s.starts > 1 else 0)
     if s.starts == 1:
         return optimize(robot, observe, processes)
     check_folder("out", s.out)
@@ -111,6 +115,14 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
         for row in _rows(found[best].metrics):
             run.log(int(row.pop("iteration")), row)
     return found[best]
+
+
+def _forget(folder: Path, kept: int) -> None:
+    """Delete the runs of an earlier run's starts, but for the first ones, which begin again in their folders."""
+    for start in folder.glob("start-*"):
+        number = start.name.removeprefix("start-")
+        if number.isdecimal() and int(number) > kept and (start / "settings.json").exists():
+            shutil.rmtree(start)
 
 
 def _start(robot: Robot, index: int) -> Robot:
