@@ -12,6 +12,7 @@ check of a design at the paper's size takes five to fifteen minutes, one at half
 
 With ``--scenarios`` it is simulated in so many scenarios instead, drawn from the ranges of its settings by a seed that
 its design run did not use: ``scenarios.csv``, a line for each, ``scenarios.json`` and ``scenarios.png``.
+Robots that were designed for different times are compared with the same ``--settle`` and ``--duration``.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any, Literal
 
 import tyro
 
-from torchsoro.command_line import Count, CountOrZero, Positive, options, program
+from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, options, program
 
 
 @options
@@ -46,6 +47,10 @@ class Options:
     """Simulate it on another lattice in the scenarios: particles along the edges."""
     wall: Positive | None = None
     """Thickness of the chamber wall there [m], a whole number of spacings; as designed if left out."""
+    settle: AtLeastZero | None = None
+    """Time before the actuation starts there [s]; as designed if left out."""
+    duration: Positive | None = None
+    """Time of actuation there, in which the travel is measured [s]; as designed if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
 
@@ -66,11 +71,16 @@ def main(chosen: Options) -> dict[str, dict[str, Any]]:
                 void=chosen.void,
                 particles=chosen.particles,
                 wall=chosen.wall,
+                settle=chosen.settle,
+                duration=chosen.duration,
                 device=chosen.device,
             )
         }
-    if chosen.particles is not None or chosen.wall is not None:
-        raise ValueError("particles, wall: wanted with --scenarios only; the check half_cell has a lattice of its own")
+    alone = [name for name in ("particles", "wall", "settle", "duration") if getattr(chosen, name) is not None]
+    if alone:
+        raise ValueError(
+            f"{', '.join(alone)}: wanted with --scenarios only; the checks have times and lattices of their own"
+        )
     how = {"only": chosen.only, "iterations": chosen.iterations, "device": chosen.device}
     return compare(chosen.robot, chosen.out, **how)
 

@@ -267,6 +267,19 @@ def test_a_finished_robot_is_compared_in_scenarios_it_has_not_seen(designed, tmp
     assert "lowest tenth" in printed and "0 falls" in printed
 
 
+def test_robots_are_compared_in_times_that_are_not_those_of_their_design(designed, tmp_path, capsys):
+    path, _ = designed
+    times = {"settle": 0.015, "duration": 0.04}
+    found = compare_scenarios(str(path), tmp_path / "out", count=2, device="cpu", **times)
+    assert {name: found[name] for name in times} == times
+    assert "; in 0.04 s" in capsys.readouterr().out
+    robot = walker(tiny(path, **{**MANY, **times, "scenarios": 0}))
+    gamma = load_design(path / "design.npz", robot.domain)
+    with torch.no_grad():
+        alone = robot(gamma, scenarios=robot.settings.distribution.sample(2, UNSEEN))
+    assert [found["L_min"], found["L_max"]] == pytest.approx(alone.travel.sort().values.tolist(), abs=2e-8)
+
+
 def test_parts_of_processes_are_all_scenarios_in_order():
     for world in (1, 2, 3, 5):
         parts = Processes(world=world).deal(5)

@@ -53,6 +53,8 @@ def compare_scenarios(
     void: bool = True,
     particles: tuple[int, int, int] | None = None,
     wall: float | None = None,
+    settle: float | None = None,
+    duration: float | None = None,
     device: Literal["auto", "cpu", "cuda"] = "auto",
 ) -> dict[str, Any]:
     """Simulate a finished robot in scenarios drawn from the ranges of its settings, and write what it does.
@@ -65,10 +67,12 @@ def compare_scenarios(
         void: Simulate void, too.
         particles: Along the edges, instead of the design's.
         wall: Thickness of the chamber wall [m], instead of the design's; a whole number of spacings.
+        settle: Time before the actuation starts [s], instead of the design's.
+        duration: Time of actuation [s], in which the travel is measured, instead of the design's.
         device: Where to compute.
 
     Returns:
-        Spread of the travel [m], numbers of falls and of breakdowns, seed; also in ``scenarios.json``.
+        Spread of the travel [m], numbers of falls and of breakdowns, seed and times; also in ``scenarios.json``.
 
     Raises:
         ValueError: for a robot that does not exist, a wall that does not fit the particles, or a folder that cannot be
@@ -79,8 +83,8 @@ def compare_scenarios(
     s = dataclasses.replace(read_settings(folder / "settings.json", device=device, resume=False), scenarios=0)
     check_folder("out", out, (TABLE, PICTURE, NUMBERS))
     changes: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
-    changes |= {name: one for name, one in (("particles", particles), ("wall", wall)) if one is not None}
-    built = build(dataclasses.replace(s, **changes))
+    other = {"particles": particles, "wall": wall, "settle": settle, "duration": duration}
+    built = build(dataclasses.replace(s, **changes, **{name: one for name, one in other.items() if one is not None}))
     gamma = load_resampled(folder, built.domain).to(s.target)
     load_supply(folder / "design.npz", built.supply)
     if s.target.type == "cpu":
@@ -89,14 +93,15 @@ def compare_scenarios(
     batch = s.distribution.sample(count, chosen)
     with progress_bar(f"{count} scenarios of {folder.name}") as progress:
         found = evaluate(built, gamma, batch, void=void, progress=progress)
-    result = {"robot": folder.name, "count": count, "seed": chosen, "duration": s.duration, **found.numbers()}
+    times = {"settle": built.settings.settle, "duration": built.settings.duration}
+    result = {"robot": folder.name, "count": count, "seed": chosen, **times, **found.numbers()}
     if particles is not None:
         result["particles"] = list(particles)
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / TABLE) as file:
         file.write(table(found).encode())
     write_json(out / NUMBERS, result)
-    line = spread_line(result, count)
+    line = f"{spread_line(result, count)}; in {built.settings.duration:g} s"
     image = Image.fromarray(picture(found, f"{folder.name}: {line}"))
     with atomic_write(out / PICTURE) as file:
         image.save(file, format="PNG")
