@@ -120,7 +120,9 @@ class Problem:
         """
         if name == "planes":
             free = torch.ones_like(t, dtype=torch.bool)
-            free[..., layout.PLANE_NORMAL :] = (self.scene.plane_kind[:, layout.PLANE_AXIS] < 0).unsqueeze(-1)
+            free[..., layout.PLANE_NORMAL : layout.PLANE_NORMAL + 3] = (
+                self.scene.plane_kind[:, layout.PLANE_AXIS] < 0
+            ).unsqueeze(-1)
             return torch.where(free, t, self.tensors[name])
         if name != "coefficients":
             return t
@@ -190,7 +192,8 @@ def problem(
     share[:, kind == layout.ABSENT] = 0
     # The ground sticks or slides, and holds a little; a wall is adhesive and slides, another holds what is near it.
     planes = torch.tensor([[5.0, 0.3, 0.1 * total], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
-    planes = torch.cat([planes, torch.zeros(3, 1), torch.eye(3)[[2, 0, 1]]], 1).double()
+    at_rest = torch.tensor([[0.2 * total, 0.3]] * 3)  # in the total form it slides the better the faster
+    planes = torch.cat([planes, torch.zeros(3, 1), torch.eye(3)[[2, 0, 1]], at_rest], 1).double()
     tensors = {
         "coefficients": coefficients,
         "prony": rand(batch, elements, layout.PRONY),

@@ -10,6 +10,7 @@ import torch
 from problems import DT, WAYS, H, block, simulator, ways
 
 from torchsoro import Plane, Prony, ground
+from torchsoro.simulation.formulation import Total
 from torchsoro.simulation.ops.lattice import Lattice
 
 G = 9.81
@@ -233,6 +234,44 @@ def test_a_normal_has_a_gradient():
     assert float(by) == pytest.approx(float(difference), rel=1e-5)
 
 
+def test_a_block_slides_by_the_stribeck_curve_and_holds_below_its_static_friction():
+    def slide(start, pull):
+        floor = ground(friction=0.2, static_friction=0.6, stribeck_speed=0.2)
+        gravity = (pull * G, 0.0, -G)
+        return run(gravity=gravity, planes=[floor], velocity=vector(start, 0.0, 0.0), formulation="total")[1]
+
+    sliding = slide(0.5, 0.0)
+    v, dt, vz = 0.5, 1e-5, sliding.center_velocity[:, 2]
+    found = [v]
+    for _ in range(10):  # the law itself, of a point; in the mean the plane bears the weight
+        for _ in range(500):
+            v -= dt * G * (0.2 + 0.4 / (1 + (v / 0.2) ** 2))
+        found.append(v)
+    assert float(vz.abs().max()) < 2e-3
+    torch.testing.assert_close(sliding.center_velocity[:, 0], vector(*found), rtol=0, atol=4e-3)
+    assert abs(float(slide(0.0, 0.4).center_of_gravity[-1, 0] - 2 * H)) < 2e-5  # between both coefficients: at rest
+    assert float(slide(0.5, 0.4).center_velocity[-1, 0]) > 0.5  # and on the move
+
+
+@pytest.mark.parametrize("lanes", [True, False])
+def test_static_friction_and_stribeck_speed_have_gradients(lanes):
+    def end(numbers):
+        _, body = block(velocity=vector(0.1, 0.05, -0.2))
+        plane = Plane(axis=2, friction=numbers[0], static_friction=numbers[1], stribeck_speed=numbers[2])
+        return simulator(formulation=Total(lanes=lanes))(
+            body, duration=60 * DT, gravity=(0.0, 0.0, -G), planes=[plane], prony=Prony.paper(1)
+        ).center_of_gravity[-1] @ vector(1.0, 0.3, 0.2)
+
+    numbers = vector(0.2, 0.5, 0.08).requires_grad_()
+    (by,) = torch.autograd.grad(end(numbers), numbers)
+    assert bool((by != 0).all())
+    for k in range(3):
+        move = 1e-6 * torch.eye(3, dtype=torch.float64)[k]
+        with torch.no_grad():
+            difference = (end(numbers + move) - end(numbers - move)) / 2e-6
+        assert float(by[k]) == pytest.approx(float(difference), rel=1e-5)
+
+
 @ways("apic", "flip")
 @pytest.mark.parametrize(
     ("settings", "name"),
@@ -240,6 +279,7 @@ def test_a_normal_has_a_gradient():
         ({"normal": (1.0, 0.0, 1.0)}, "normal"),
         ({"axis": 2, "landing": "elastic"}, "landing"),
         ({"axis": 2, "reach": 1e-3}, "reach"),
+        ({"axis": 2, "friction": 0.2, "static_friction": 0.3}, "static_friction"),
     ],
 )
 def test_the_updated_form_refuses_planes_that_it_has_not(settings, name, way):
@@ -264,6 +304,12 @@ def test_the_updated_form_refuses_planes_that_it_has_not(settings, name, way):
         ({"friction": -0.1}, r"friction = -0\.1: wanted finite and at least 0"),
         ({"friction": math.nan}, r"friction = nan: wanted finite and at least 0"),
         ({"friction": torch.tensor([0.1, -0.1])}, r"friction = .*: wanted finite and at least 0"),
+        ({"static_friction": 0.3}, r"static_friction = 0\.3: of a plane that sticks, wanted a coefficient"),
+        (
+            {"friction": 0.3, "static_friction": 0.2},
+            r"static_friction = 0\.2: wanted finite and at least friction = 0\.3",
+        ),
+        ({"friction": 0.3, "stribeck_speed": 0.0}, r"stribeck_speed = 0\.0: wanted finite and positive, in m/s"),
         ({"adhesion": -1.0}, r"adhesion = -1\.0: wanted finite and at least 0"),
         ({"adhesion": math.inf}, r"adhesion = inf: wanted finite and at least 0"),
         ({"offset": math.nan}, r"offset = nan: wanted finite"),

@@ -34,13 +34,13 @@ def arguments(name: str) -> np.ndarray:
             column = rng.integers(0, 2, STATES)
         elif argument == "push":
             column = rng.choice([0.0, 0.5], STATES)
-        elif argument in ("dt", "reach", "sink", "depth", "span"):
+        elif argument in ("dt", "reach", "sink", "depth", "span", "slow"):
             column = rng.uniform(0.2, 1, STATES)
         elif argument == "touch":
             column = rng.uniform(0.05, 0.2, STATES)
         elif argument in ("square", "a", "b"):
             column = rng.uniform(-0.1, 1, STATES)
-        elif argument in ("friction", "hold"):
+        elif argument in ("friction", "more", "hold"):
             column = rng.uniform(0, 1, STATES) * rng.integers(0, 2, STATES)
         else:
             column = rng.normal(size=STATES)

@@ -28,6 +28,10 @@ class Plane:
             axis has none.
         side: +1 if the body lies on the positive side of an axis, else -1.
         friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
+        static_friction: Coulomb coefficient mu_s at rest, at least ``friction``, which is then the mu_k of what slides
+            fast, number or tensor [...]; the same if None. At a speed v, with the Stribeck speed v_s, it is
+            mu_k + (mu_s - mu_k) / (1 + (v / v_s)^2); total formulation only.
+        stribeck_speed: Speed at which half of that difference is left [m/s], number or tensor [...].
         adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
             [...].
         reach: Distance within which adhesion also pulls surfaces that do not touch [m], number or tensor [...] without
@@ -38,7 +42,8 @@ class Plane:
             adhesion; under a load they stand a little behind the plane, and without damping they do not come to rest.
 
     Raises:
-        ValueError: for an axis, normal, side, friction, adhesion, reach or landing out of range.
+        ValueError: for an axis, normal, side, friction, adhesion, reach or landing out of range, or a static friction
+            below friction or of a plane that sticks.
     """
 
     axis: int | None = None
@@ -46,6 +51,8 @@ class Plane:
     offset: float | Tensor = 0.0
     side: int = 1
     friction: str | float | Tensor = "stick"
+    static_friction: float | Tensor | None = None
+    stribeck_speed: float | Tensor = 0.05
     adhesion: float | Tensor = 0.0
     reach: float | Tensor = 0.0
     landing: Literal["inelastic", "elastic"] = "inelastic"
@@ -76,8 +83,23 @@ class Plane:
                 number = torch.as_tensor(value).detach()
                 if not bool((torch.isfinite(number) & (number >= least)).all()):
                     raise ValueError(f"{name} = {value}: wanted finite{'' if name == 'offset' else ' and at least 0'}")
+        self._check_static()
         if isinstance(self.reach, Tensor) and self.reach.requires_grad:
             raise ValueError("reach: requires a gradient, but adhesion begins at once within its reach; wanted none")
+
+    def _check_static(self) -> None:
+        slow = torch.as_tensor(self.stribeck_speed).detach()
+        if not bool((torch.isfinite(slow) & (slow > 0)).all()):
+            raise ValueError(f"stribeck_speed = {self.stribeck_speed}: wanted finite and positive, in m/s")
+        if self.static_friction is None:
+            return
+        if isinstance(self.friction, str):
+            raise ValueError(f"static_friction = {self.static_friction}: of a plane that sticks, wanted a coefficient")
+        static, sliding = (torch.as_tensor(v).detach() for v in (self.static_friction, self.friction))
+        if not bool((torch.isfinite(static) & (static >= sliding)).all()):
+            raise ValueError(
+                f"static_friction = {self.static_friction}: wanted finite and at least friction = {self.friction}"
+            )
 
     @property
     def sticks(self) -> bool:
@@ -104,7 +126,8 @@ class Plane:
             n = n if n.is_floating_point() else n.double()
             normal = (n / torch.linalg.vector_norm(n, dim=-1, keepdim=True)).unbind(-1)
         friction = 0.0 if isinstance(self.friction, str) else self.friction
-        return self.offset, friction, self.adhesion, self.reach, *normal
+        more = 0.0 if self.static_friction is None else self.static_friction - friction
+        return self.offset, friction, self.adhesion, self.reach, *normal, more, self.stribeck_speed
 
     def integers(self) -> list[int]:
         """The ``PLANE_INTEGERS`` integers, likewise; the axis of a plane with a normal is -1."""
@@ -121,6 +144,8 @@ def ground(
     height: float | Tensor = 0.0,
     *,
     friction: str | float | Tensor = "stick",
+    static_friction: float | Tensor | None = None,
+    stribeck_speed: float | Tensor = 0.05,
     landing: Literal["inelastic", "elastic"] = "inelastic",
 ) -> Plane:
     """A floor with its normal upward (z).
@@ -128,28 +153,32 @@ def ground(
     Args:
         height: Its height [m].
         friction: See :class:`Plane`.
+        static_friction: See :class:`Plane`.
+        stribeck_speed: See :class:`Plane`.
         landing: See :class:`Plane`.
     """
-    return Plane(axis=2, offset=height, friction=friction, landing=landing)
+    grip = {"friction": friction, "static_friction": static_friction, "stribeck_speed": stribeck_speed}
+    return Plane(axis=2, offset=height, landing=landing, **grip)
 
 
 def check_updated(planes: Sequence[Plane]) -> None:
-    """Refuse what the updated formulation does not have: oblique or elastic planes, reach, and some gradients.
+    """Refuse what the updated formulation does not have: of planes normals, reach and the like, and some gradients.
 
     Raises:
-        ValueError: for a plane with a normal, a reach or an elastic landing; or if the offset of a plane requires a
-            gradient, and a plane before it has the same axis.
+        ValueError: for a plane with a normal, reach, static friction or elastic landing; or if the offset of a plane
+            requires a gradient, and a plane before it has the same axis.
     """
     for k, plane in enumerate(planes):
         given = {
             "normal": plane.normal is not None,
             "landing": plane.landing != "inelastic",
             "reach": plane.pulls_from_afar,
+            "static_friction": plane.static_friction is not None,
         }
         for name in (name for name, there in given.items() if there):
             raise ValueError(
                 f"planes: plane {k} has {name} = {getattr(plane, name)}, which the updated formulation has not; wanted "
-                "an axis, inelastic landing and no reach, or the total-Lagrangian formulation"
+                "an axis, inelastic landing, one friction and no reach, or the total-Lagrangian formulation"
             )
         shifts = all(other.axis != plane.axis for other in planes[:k])
         if not shifts and isinstance(plane.offset, Tensor) and plane.offset.requires_grad:

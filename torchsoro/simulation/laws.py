@@ -127,14 +127,20 @@ def plane_approach_adjoint(v, gap, dt, push, way_bar, gain_bar):
     return v_bar, gap_bar
 
 
-def plane_pressure(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push):
+def grip(friction, more, slow, speed):
+    """Coulomb coefficient at a speed along the plane: ``more`` is added at rest, half of it at a speed of ``slow``."""
+    fast = speed / slow
+    return friction + more / (1 + fast * fast)
+
+
+def plane_pressure(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push):
     """What presses a node on a plane in a step, and what that leaves of its sliding; see :func:`plane_contact`.
 
     Returns:
         Velocity along the normal before; velocity along the plane, three numbers; the normal velocity with what
         adhesion pulls from afar, and with the plane's push; the way over dt; by how much adhesion holds the node, and
-        holds it back; what presses it; its speed along the plane; the share of that which it keeps; 1 if it slides;
-        1 if it lands.
+        holds it back; what presses it; its speed along the plane; the coefficient at that speed; the share of its
+        speed that it keeps; 1 if it slides; 1 if it lands.
     """
     along = u0 * n0 + u1 * n1 + u2 * n2
     t0, t1, t2 = u0 - along * n0, u1 - along * n1, u2 - along * n2
@@ -150,21 +156,23 @@ def plane_pressure(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach
     back = min(max(after, after * 0), held)
     pressed = gain + held - back
     speed = sqrt(t0 * t0 + t1 * t1 + t2 * t2)
+    coefficient = grip(friction, more, slow, speed)
     rest, slides = v * 0 + 1, v * 0
     if pressed > 0:
         rest = v * 0
-        if stick == 0 and speed > friction * pressed:
-            rest = 1 - friction * pressed / speed
+        if stick == 0 and speed > coefficient * pressed:
+            rest = 1 - coefficient * pressed / speed
             slides = v * 0 + 1
-    return along, t0, t1, t2, v, after, way, held, back, pressed, speed, rest, slides, lands
+    return along, t0, t1, t2, v, after, way, held, back, pressed, speed, coefficient, rest, slides, lands
 
 
-def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push):
+def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push):
     """Velocity of a node after a step towards, on or off a plane, and what else it moves by in this step.
 
-    What presses the node on the plane, the plane's push and adhesion, makes it stick, or takes at most ``friction``
-    times that from what slides. Adhesion holds a node that touches until it is torn off, and pulls one that is within
-    reach. What a node loses along the plane it loses from when it arrives.
+    What presses the node on the plane, the plane's push and adhesion, makes it stick, or takes at most the coefficient
+    times that from what slides, which may be larger the slower that is (see :func:`grip`). Adhesion holds a node that
+    touches until it is torn off, and pulls one that is within reach. What a node loses along the plane it loses from
+    when it arrives.
 
     Args:
         u0: Velocity before, x [m/s].
@@ -176,7 +184,9 @@ def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach,
         gap: Distance from the plane, negative behind it [m].
         dt: Step [s].
         stick: 1 if nothing slides that is pressed on.
-        friction: Coulomb coefficient.
+        friction: Coulomb coefficient of what slides fast.
+        more: What is added to it at rest.
+        slow: Speed at which half of that is left [m/s].
         hold: Largest pull-off speed that adhesion cancels in a step [m/s].
         reach: Distance within which adhesion pulls [m].
         touch: Distance within which it holds [m].
@@ -185,8 +195,8 @@ def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach,
     Returns:
         The velocity after, and what is added to it for this step's motion only, three numbers each [m/s].
     """
-    _, t0, t1, t2, v, after, way, _, back, _, speed, rest, _, lands = plane_pressure(
-        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push
+    _, t0, t1, t2, v, after, way, _, back, _, speed, _, rest, _, lands = plane_pressure(
+        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push
     )
     early = v * 0
     if lands > 0 and gap > 0:
@@ -203,12 +213,15 @@ def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach,
 
 
 def plane_contact_adjoint(
-    u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push,
+    u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push,
     r0_bar, r1_bar, r2_bar, o0_bar, o1_bar, o2_bar,
 ):  # fmt: skip
-    """Adjoint of :func:`plane_contact`: gradients by velocity (three), normal (three), gap, friction and hold."""
-    along, t0, t1, t2, v, after, way, held, back, pressed, speed, rest, slides, lands = plane_pressure(
-        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, hold, reach, touch, push
+    """Adjoint of :func:`plane_contact`.
+
+    Gradients by velocity (three), normal (three), gap, friction, what is added at rest, the speed that halves it, hold.
+    """
+    along, t0, t1, t2, v, after, way, held, back, pressed, speed, coefficient, rest, slides, lands = plane_pressure(
+        u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push
     )
     lost, pace, share = speed * (1 - rest), v * 0 + 1, v * 0
     if lands > 0 and gap > 0:
@@ -231,12 +244,17 @@ def plane_contact_adjoint(
         else:
             speed_bar = pace_bar * (1 - rest) / STEEPEST
             rest_bar -= pace_bar * speed / STEEPEST
-    pressed_bar, friction_bar = v * 0, v * 0
+    pressed_bar, friction_bar, more_bar, slow_bar = v * 0, v * 0, v * 0, v * 0
     if slides > 0:
         loss_bar = -rest_bar / speed
-        speed_bar += rest_bar * (1 - rest) / speed
-        pressed_bar = loss_bar * friction
+        pressed_bar = loss_bar * coefficient
         friction_bar = loss_bar * pressed
+        fast = speed / slow
+        left = 1 / (1 + fast * fast)
+        more_bar = friction_bar * left
+        fast_bar = -2 * more_bar * more * left * fast
+        slow_bar = -fast_bar * fast / slow
+        speed_bar += rest_bar * (1 - rest) / speed + fast_bar / slow
     after_bar, held_bar = normal_bar - extra_bar, pressed_bar
     back_bar = -normal_bar - pressed_bar
     if after > held:
@@ -267,6 +285,8 @@ def plane_contact_adjoint(
         along_bar * u2 - along * t2_bar + normal * r2_bar + extra * o2_bar,
         gap_bar,
         friction_bar,
+        more_bar,
+        slow_bar,
         hold_bar,
     )
 

@@ -84,19 +84,22 @@ def contact(planes: ti.template(), plane_kind: ti.template(), at, count, x, mass
 
 
 @ti.func
-def plane_contact(u, n, gap, dt, stick, friction, hold, reach, touch, push):
+def plane_contact(u, n, gap, dt, stick, friction, more, slow, hold, reach, touch, push):
     """``laws.plane_contact`` of vectors."""
     r0, r1, r2, o0, o1, o2 = laws.plane_contact(
-        u[0], u[1], u[2], n[0], n[1], n[2], gap, dt, stick, friction, hold, reach, touch, push
+        u[0], u[1], u[2], n[0], n[1], n[2], gap, dt, stick, friction, more, slow, hold, reach, touch, push
     )
     return ti.Vector([r0, r1, r2]), ti.Vector([o0, o1, o2])
 
 
 @ti.func
-def plane_contact_adjoint(u, n, gap, dt, stick, friction, hold, reach, touch, push, r_bar, onto_bar):
-    """``laws.plane_contact_adjoint`` of vectors: gradients by u, n, gap, friction and hold."""
-    u0_bar, u1_bar, u2_bar, n0_bar, n1_bar, n2_bar, gap_bar, friction_bar, hold_bar = laws.plane_contact_adjoint(
-        *(u[0], u[1], u[2], n[0], n[1], n[2], gap, dt, stick, friction, hold, reach, touch, push),
-        *(r_bar[0], r_bar[1], r_bar[2], onto_bar[0], onto_bar[1], onto_bar[2]),
+def plane_contact_adjoint(u, n, gap, dt, stick, friction, more, slow, hold, reach, touch, push, r_bar, onto_bar):
+    """``laws.plane_contact_adjoint`` of vectors: gradients by u, n, gap, friction (three numbers of it) and hold."""
+    u0_bar, u1_bar, u2_bar, n0_bar, n1_bar, n2_bar, gap_bar, friction_bar, more_bar, slow_bar, hold_bar = (
+        laws.plane_contact_adjoint(
+            *(u[0], u[1], u[2], n[0], n[1], n[2], gap, dt, stick, friction, more, slow, hold, reach, touch, push),
+            *(r_bar[0], r_bar[1], r_bar[2], onto_bar[0], onto_bar[1], onto_bar[2]),
+        )
     )
-    return ti.Vector([u0_bar, u1_bar, u2_bar]), ti.Vector([n0_bar, n1_bar, n2_bar]), gap_bar, friction_bar, hold_bar
+    by_u, by_n = ti.Vector([u0_bar, u1_bar, u2_bar]), ti.Vector([n0_bar, n1_bar, n2_bar])
+    return by_u, by_n, gap_bar, ti.Vector([friction_bar, more_bar, slow_bar]), hold_bar

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torchsoro.simulation.kernels.lanes import any_lane, law, load, magnitude, select, square_root, store
 from torchsoro.simulation.kernels.laws_lanes import laws
 
-NORMAL, OFFSET, FRICTION, ADHESION, REACH, PLANE = 0, 3, 4, 5, 6, 7  # numbers of a plane
+NORMAL, OFFSET, FRICTION, ADHESION, REACH, AT_REST, SLOW, PLANE = 0, 3, 4, 5, 6, 7, 8, 9  # numbers of a plane
 LOOK, TOUCH, PUSH = laws.LOOK, laws.TOUCH, laws.PUSH
 plane_contact, plane_contact_adjoint = laws.plane_contact, laws.plane_contact_adjoint
 
@@ -114,7 +114,7 @@ def surface(mesh, case, d, state, g, i):
 
 @law
 def contact_numbers(mesh, case, g, k, i, light):
-    """What ``plane_contact`` takes of plane k: stick, friction, hold, reach, touch, push; and hold by adhesion."""
+    """What ``plane_contact`` takes of plane k, from stick to push; and hold by adhesion."""
     planes = len(case.plane_stick)
     q, s = 16 * PLANE * (g * planes + k), (g * planes + k) * mesh.component + i
     zero = 0 * light
@@ -125,6 +125,8 @@ def contact_numbers(mesh, case, g, k, i, light):
     return (
         stick,
         load(case.plane_numbers, q + 16 * FRICTION),
+        load(case.plane_numbers, q + 16 * AT_REST),
+        load(case.plane_numbers, q + 16 * SLOW),
         hold,
         reach,
         zero + TOUCH * case.spacing,
@@ -147,9 +149,9 @@ def meets(mesh, case, d, state, g, i, count, light, u):
         near = touching & (dot(x, n) - level < LOOK * case.spacing + load(case.plane_numbers, q + 16 * REACH))
         if any_lane(near):
             gap = dot(surface(mesh, case, d, state, g, i), n) - level
-            stick, friction, hold, reach, touch, push, _ = contact_numbers(mesh, case, g, k, i, light)
+            stick, friction, more, slow, hold, reach, touch, push, _ = contact_numbers(mesh, case, g, k, i, light)
             r0, r1, r2, p0, p1, p2 = plane_contact(
-                u0, u1, u2, n[0], n[1], n[2], gap, case.dt, stick, friction, hold, reach, touch, push
+                u0, u1, u2, n[0], n[1], n[2], gap, case.dt, stick, friction, more, slow, hold, reach, touch, push
             )
             u0, u1, u2 = select(near, r0, u0), select(near, r1, u1), select(near, r2, u2)
             o0, o1, o2 = o0 + select(near, p0, zero), o1 + select(near, p1, zero), o2 + select(near, p2, zero)
@@ -173,10 +175,12 @@ def meets_adjoint(mesh, case, d, state, sums, g, i, light, moves, u, b, o):
         if any_lane(near):
             s0, s1, s2 = surface(mesh, case, d, state, g, i)
             gap = dot((s0, s1, s2), m) - level
-            stick, friction, hold, reach, touch, push, per_adhesion = contact_numbers(mesh, case, g, k, i, light)
+            stick, friction, more, slow, hold, reach, touch, push, per_adhesion = contact_numbers(
+                mesh, case, g, k, i, light
+            )
             r0, r1, r2, _, _, _ = meets(mesh, case, d, state, g, i, k, light, u)
-            h0, h1, h2, m0, m1, m2, gap_bar, friction_bar, hold_bar = plane_contact_adjoint(
-                r0, r1, r2, m[0], m[1], m[2], gap, case.dt, stick, friction, hold, reach, touch, push,
+            h0, h1, h2, m0, m1, m2, gap_bar, friction_bar, more_bar, slow_bar, hold_bar = plane_contact_adjoint(
+                r0, r1, r2, m[0], m[1], m[2], gap, case.dt, stick, friction, more, slow, hold, reach, touch, push,
                 b0, b1, b2, o[0], o[1], o[2],
             )  # fmt: skip
             b0, b1, b2 = select(near, h0, b0), select(near, h1, b1), select(near, h2, b2)
@@ -189,6 +193,9 @@ def meets_adjoint(mesh, case, d, state, sums, g, i, light, moves, u, b, o):
             s = (g * planes + k) * PLANE * n + i
             add_vector(sums.planes, s, n, by_normal)
             add_vector(sums.planes, s + OFFSET * n, n, (-gap_bar, friction_bar, hold_bar * per_adhesion))
+            more_at, slow_at = s + AT_REST * n, s + SLOW * n
+            store(sums.planes, more_at, load(sums.planes, more_at) + select(near, more_bar, zero))
+            store(sums.planes, slow_at, load(sums.planes, slow_at) + select(near, slow_bar, zero))
             mass_bar = mass_bar - hold_bar * hold * light
             c0, c1, c2 = c0 + gap_bar * m[0], c1 + gap_bar * m[1], c2 + gap_bar * m[2]
             for c in range(3):

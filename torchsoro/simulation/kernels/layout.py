@@ -38,9 +38,10 @@ PRONY_DECAY, PRONY_GAIN, PRONY_MODULUS = 0, 1, 2
 PRONY = 3
 
 # Per-plane numbers: offset along its axis or normal, Coulomb coefficient, adhesive traction and its reach, unit normal
-# (three); and its integers: the normal counts with the sign, and the axis is of the updated form.
-PLANE_OFFSET, PLANE_FRICTION, PLANE_ADHESION, PLANE_REACH, PLANE_NORMAL = 0, 1, 2, 3, 4
-PLANE = 7
+# (three), what is added to the coefficient at rest and the speed that halves it; and its integers: the normal counts
+# with the sign, and the axis is of the updated form.
+PLANE_OFFSET, PLANE_FRICTION, PLANE_ADHESION, PLANE_REACH, PLANE_NORMAL, PLANE_AT_REST, PLANE_SLOW = 0, 1, 2, 3, 4, 7, 8
+PLANE = 9
 PLANE_AXIS, PLANE_SIGN, PLANE_STICK, PLANE_ELASTIC = 0, 1, 2, 3
 PLANE_INTEGERS = 4
 

@@ -25,6 +25,7 @@ from torchsoro.simulation.kernels.layout import (
     NODES_BAR,
     PLANE,
     PLANE_ADHESION,
+    PLANE_AT_REST,
     PLANE_BAR,
     PLANE_ELASTIC,
     PLANE_FRICTION,
@@ -35,6 +36,7 @@ from torchsoro.simulation.kernels.layout import (
     PLANE_OFFSET,
     PLANE_REACH,
     PLANE_SIGN,
+    PLANE_SLOW,
     PLANE_STICK,
     PLANES,
     STEP_SIZE,
@@ -145,18 +147,20 @@ def surface_place(ints: ti.template(), fixed: ti.template(), state: ti.template(
 def plane_of(ints: ti.template(), fixed: ti.template(), b, k, reaches):
     """Of plane k: unit normal to the free side, distance from the origin along it, and what ``plane_contact`` takes.
 
-    These are: stick, friction, reach of adhesion, push. Adhesion reaches to the nodes whose matter faces the plane.
+    These are: stick, friction (three numbers), reach of adhesion, push. Adhesion reaches to the nodes whose matter
+    faces the plane.
     """
     plane = ints[PLANE_NUMBERS] + (b * ints[PLANES] + k) * PLANE
     kind = ints[PLANE_KIND] + k * PLANE_INTEGERS
     edge, sign = fixed[EDGE], ints[kind + PLANE_SIGN]
     n, level = sign * load_vector(fixed, plane + PLANE_NORMAL, 1), sign * fixed[plane + PLANE_OFFSET]
     stick, friction = ints[kind + PLANE_STICK], fixed[plane + PLANE_FRICTION]
+    more, slow = fixed[plane + PLANE_AT_REST], fixed[plane + PLANE_SLOW]
     reach = fixed[plane + PLANE_REACH]
     if ints[FACED] == 0 and not reaches.dot(n) > 0:
         reach = reach * 0
     push = edge * 0 + laws.PUSH * ints[kind + PLANE_ELASTIC]
-    return n, level, stick, friction, reach, push
+    return n, level, stick, friction, more, slow, reach, push
 
 
 @ti.func
@@ -181,11 +185,13 @@ def surface_response(ints: ti.template(), fixed: ti.template(), state: ti.templa
     node = current_place(ints, fixed, state, at, i, m)
     reaches = reaches_of(ints, fixed, b, i, product(m))
     for k in range(count):
-        normal, level, stick, friction, reach, push = plane_of(ints, fixed, b, k, reaches)
+        normal, level, stick, friction, more, slow, reach, push = plane_of(ints, fixed, b, k, reaches)
         hold, per_adhesion = adhesion_speed(ints, fixed, b, k, i, mass)
         if per_adhesion >= 0 and node.dot(normal) - level < laws.LOOK * edge + reach:
             gap = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps).dot(normal) - level
-            after, way = plane_contact(r, normal, gap, dt, stick, friction, hold, reach, laws.TOUCH * edge, push)
+            after, way = plane_contact(
+                r, normal, gap, dt, stick, friction, more, slow, hold, reach, laws.TOUCH * edge, push
+            )
             r = after
             onto += way
     return r, onto
@@ -219,21 +225,24 @@ def surface_response_adjoint(
     reaches = reaches_of(ints, fixed, b, i, nodes)
     for back in range(ints[PLANES]):
         k = ints[PLANES] - 1 - back
-        normal, level, stick, friction, reach, push = plane_of(ints, fixed, b, k, reaches)
+        normal, level, stick, friction, more, slow, reach, push = plane_of(ints, fixed, b, k, reaches)
         hold, per_adhesion = adhesion_speed(ints, fixed, b, k, i, mass)
         if per_adhesion >= 0 and node.dot(normal) - level < laws.LOOK * edge + reach:
             surface = surface_place(ints, fixed, state, at, i, m, node, reaches, keeps)
             gap = surface.dot(normal) - level
             arriving, _ = surface_response(ints, fixed, state, at, b, i, k, mass, u)
             by_u, by_normal, gap_bar, by_friction, hold_bar = plane_contact_adjoint(
-                arriving, normal, gap, dt, stick, friction, hold, reach, laws.TOUCH * edge, push, u_bar, onto_bar
+                *(arriving, normal, gap, dt, stick, friction, more, slow, hold, reach, laws.TOUCH * edge, push),
+                *(u_bar, onto_bar),
             )
             u_bar = by_u
             by_normal += gap_bar * surface
             sign = ints[ints[PLANE_KIND] + k * PLANE_INTEGERS + PLANE_SIGN]
             bar = ints[PLANE_BAR] + (b * ints[PLANES] + k) * PLANE * nodes + i
             add(False, sums, bar + PLANE_OFFSET * nodes, -sign * gap_bar)
-            add(False, sums, bar + PLANE_FRICTION * nodes, by_friction)
+            add(False, sums, bar + PLANE_FRICTION * nodes, by_friction[0])
+            add(False, sums, bar + PLANE_AT_REST * nodes, by_friction[1])
+            add(False, sums, bar + PLANE_SLOW * nodes, by_friction[2])
             add(False, sums, bar + PLANE_ADHESION * nodes, hold_bar * per_adhesion)
             mass_bar -= hold_bar * hold / mass
             for c in ti.static(range(3)):

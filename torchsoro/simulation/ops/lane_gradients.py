@@ -37,13 +37,14 @@ PRONY = [layout.PRONY_MODULUS, layout.PRONY_GAIN, layout.PRONY_DECAY]  # of an e
 PLANE_NUMBERS = [
     *(layout.PLANE_NORMAL + c for c in range(3)),
     *(layout.PLANE_OFFSET, layout.PLANE_FRICTION, layout.PLANE_ADHESION, layout.PLANE_REACH),
+    *(layout.PLANE_AT_REST, layout.PLANE_SLOW),
 ]
 
 
 def signs(scene: Scene, like: Tensor) -> Tensor:
     """By which the numbers of planes count: normal and offset with the plane's sign [planes, PLANE]."""
     sign = scene.plane_kind[:, layout.PLANE_SIGN, None].to(like)
-    return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 3, 1)
+    return torch.cat([sign] * 4 + [torch.ones_like(sign)] * 5, 1)
 
 
 def node_shares(scene: Scene, lattice: Lattice, like: Tensor) -> Tensor:

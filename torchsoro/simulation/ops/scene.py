@@ -163,7 +163,8 @@ class Inputs:
         pressure: [T + 1, B, chambers] supply pressure at each substep and after the last [Pa].
         gravity: [T, B, 3] [m/s2].
         force: [T, B, forces, 3] [N], those on particles, then those on nodes; see also ``Scene.force_start``.
-        planes: [B, planes, PLANE]: offset [m], Coulomb coefficient, adhesive traction [Pa], its reach [m], normal.
+        planes: [B, planes, PLANE]: offset [m], Coulomb coefficient, adhesive traction [Pa], its reach [m], normal, what
+            is added to the coefficient at rest, speed that halves it [m/s].
         origin: [B, 3] a grid node [m].
         softening: [B, 2] depth d and range r of the shear modulus' factor 1 - d u / (u + r), where u is by how much
             x = I1b - 3 is less than its largest so far.
