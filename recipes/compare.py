@@ -48,9 +48,9 @@ class Options:
     wall: Positive | None = None
     """Thickness of the chamber wall there [m], a whole number of spacings; as designed if left out."""
     settle: AtLeastZero | None = None
-    """Time before the actuation starts there [s]; as designed if left out."""
+    """Time before the actuation starts in the scenarios [s]; as designed if left out."""
     duration: Positive | None = None
-    """Time of actuation there, in which the travel is measured [s]; as designed if left out."""
+    """Time of actuation in the scenarios, over which the travel is measured [s]; as designed if left out."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to compute; auto takes CUDA if there is one."""
 

@@ -50,6 +50,12 @@ def simulator(*, dt: float = DT, reach: float = 0.1, **settings) -> Simulator:
     return Simulator(**{"cell": 2 * H, "dt": dt, "low": (-reach,) * 3, "high": (reach,) * 3, **settings})
 
 
+def without_normals(planes: Tensor) -> Tensor:
+    """Numbers of planes without the normals, which are constants of planes with an axis."""
+    first = layout.PLANE_NORMAL
+    return torch.cat([planes[..., :first], planes[..., first + 3 :]], -1)
+
+
 def ways(*names: str):
     """Parametrise a test by ``way``: what :func:`simulator` takes for each of these names."""
     return pytest.mark.parametrize("way", [WAYS[name] for name in names], ids=names)

@@ -98,7 +98,7 @@ WRONG = [
     ("walker", ["--chamber-until", "5"], "chamber_until = 5: without chamber_design, wanted place or size there"),
     (
         "walker",
-        ["--chambers", "2", "--chamber-axis", "y", *"--chamber-centers -0.008 0 0.0175 0.008 0 0.0175".split()],
+        ["--chambers", "2", "--chamber-axis", "y", *"--chamber-centers -0.00875 0 0.0175 0.00875 0 0.0175".split()],
         r"the port of 'chamber 2' runs into chamber 'chamber 1'",
     ),
     ("walker", ["--offset", "1"], "offset = 1 m: wanted at most a quarter"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from typing import Any
 
 import pytest
@@ -39,13 +40,16 @@ def test_the_best_start_is_what_the_run_ends_with(tmp_path):
 
 
 def test_a_run_that_starts_again_leaves_no_start_of_the_former(tmp_path):
-    (tmp_path / "run" / "start-mine").mkdir(parents=True)
-    optimize_starts(walker(tiny(tmp_path / "run", starts=3)))
-    (tmp_path / "run" / "start-4").mkdir()  # nobody's run
+    path = tmp_path / "run"
+    optimize_starts(walker(tiny(path, starts=3)))
+    for other in ("start-mine", "start-4"):  # another run, beyond the former's starts
+        shutil.copytree(path / "start-1", path / other)
+    with pytest.raises(ValueError, match="feature"):
+        optimize_starts(walker(tiny(path, feature=5e-3, overwrite=True)))
+    assert len(list(path.glob("start-*"))) == 5  # refused, so that nothing is deleted
     for count, left in ((2, {"start-1", "start-2"}), (1, set())):
-        optimize_starts(walker(tiny(tmp_path / "run", starts=count, overwrite=True)))
-        found = {folder.name for folder in (tmp_path / "run").glob("start-*")}
-        assert found == left | {"start-mine", "start-4"}
+        optimize_starts(walker(tiny(path, starts=count, overwrite=True)))
+        assert {folder.name for folder in path.glob("start-*")} == left | {"start-mine", "start-4"}
 
 
 def test_starts_one_after_the_other_end_as_side_by_side(tmp_path):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.domain import Chamber, Domain, check_port
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.placement import LEAST_CAVITY, Placement
 from torchsoro.design.port import AirPort
@@ -60,19 +60,26 @@ def _check(s: Settings) -> None:
         )
 
 
-def check_designed(s: Settings) -> None:
-    """Refuse settings of chambers that are designed where none are.
+def check_new(s: Settings, chambers: Sequence[Chamber], port: AirPort) -> None:
+    """Refuse of a run that begins what it would tell at its end, or never.
 
     Raises:
-        ValueError: saying which.
+        ValueError: for settings of designed chambers where none are, or a port that runs into another chamber.
     """
-    names = ("chamber_edges", "chamber_volume", "chamber_until", "chamber_rate")
+    if s.chamber_design:
+        return
     usual = {one.name: one.default for one in dataclasses.fields(Settings)}
-    for name in names:
-        if getattr(s, name) != usual[name] and not s.chamber_design:
+    for name in ("chamber_edges", "chamber_volume", "chamber_until", "chamber_rate"):
+        if getattr(s, name) != usual[name]:
             raise ValueError(
                 f"{name} = {getattr(s, name)}: without chamber_design, wanted place or size there, or this left out"
             )
+    if s.chamber_mesh is None:
+        try:
+            check_port(chambers, port)
+        except ValueError as error:
+            way = "wanted chambers along chamber_axis, which decides on its direction"
+            raise ValueError(f"{error}; {way}") from error
 
 
 def _given(s: Settings, chambers: tuple[Chamber, ...]) -> tuple[Chamber, ...]:

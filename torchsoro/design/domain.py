@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoro.design.limits import ROUNDING
 from torchsoro.design.mesh import Surface, check_fit, lined
 from torchsoro.design.port import AirPort
 
@@ -400,7 +401,7 @@ def check_port(chambers: Sequence[Chamber], port: AirPort) -> None:
     across = [a for a in range(3) if a != port.axis]
     for chamber in chambers:
         room = min(chamber.size[a] for a in across) - 2 * chamber.wall
-        if port.diameter > room:
+        if port.diameter > (1 + ROUNDING) * room:
             raise ValueError(
                 f"port.diameter: got {port.diameter} m, want at most {room:.4g} m, the cavity of {chamber.name!r}"
             )

@@ -8,6 +8,7 @@ _LEAST_STRAIN = 1e-3  # pressure over modulus, below which nothing moves that co
 # Grid points across the least wall of a printed part, at least: with fewer a rod would lose a tenth of its diameter.
 _ACROSS = 4
 _FINEST = 320  # such points along the longest edge: of a cube some gigabytes, and minutes
+ROUNDING = 1e-9  # relative difference of two lengths that are the same but for rounding
 
 
 def points_across(min_wall: float, spacing: float, particles: int) -> int:

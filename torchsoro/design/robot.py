@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torchsoro.design.blending import fill_blended, solid_shares
 from torchsoro.design.chambers import chambers_of, placement_of, port_of, sockets
 from torchsoro.design.density import fill, without_void
-from torchsoro.design.domain import Domain, check_port
+from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel, yaw
@@ -104,8 +104,6 @@ class Robot(nn.Module):
         half = (s.size[0] / 2, s.size[1] / 2)
         chambers = chambers_of(s, (0.0, 0.0, s.size[2] / 2))
         self.port = port_of(s, chambers, direction)
-        if not s.chamber_design and s.chamber_mesh is None:
-            check_port(chambers, self.port)
         self.domain = Domain(
             size=s.size,
             particles=s.particles,
@@ -388,7 +386,8 @@ class Robot(nn.Module):
         if b.tilt_x is not None or b.tilt_y is not None:
             found["gravity"] = leaning_gravity(gravity_scale * s.gravity, s.slope, b)
         if b.friction is not None:
-            found["planes"] = tuple(replace(plane, friction=b.friction) for plane in self.planes)
+            one = {"friction": b.friction, "static_friction": None}  # a scenario has a single coefficient
+            found["planes"] = tuple(replace(plane, **one) for plane in self.planes)
         if b.tube_mass is not None:
             found["loads"] = (PointMass(particles=socket, mass=b.tube_mass),)
         pose = [t for t in (b.pitch, b.roll, b.drop) if t is not None]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from pydantic import Field
 
 from torchsoro.command_line import AtLeastZero, Count, CountOrZero, Positive, Share, options, parse_resolution
-from torchsoro.design.limits import check_pressure, points_across
+from torchsoro.design.limits import ROUNDING, check_pressure, points_across
 from torchsoro.design.processes import world_size
 from torchsoro.design.scenarios import LIMITS, Scenarios, check_friction, check_range
 
@@ -299,8 +299,8 @@ class Settings:
         edges = [edge - 2 * self.wall for edge in self.chamber]
         edges["xyz".index(self.chamber_axis)] /= self.chambers
         cavity = min(edges) if not self.chamber_sizes else min(map(min, self.chamber_sizes)) - 2 * self.wall
-        if self.chamber_mesh is None and self.port > 0 and not 0.05 * cavity <= self.port <= cavity:
-            low = 0.05 * cavity
+        low = 0.0 if self.chamber_sizes else 0.05 * cavity  # one that was designed may have grown
+        if self.chamber_mesh is None and self.port > 0 and not low <= self.port <= (1 + ROUNDING) * cavity:
             raise ValueError(f"port = {self.port:g} m: wanted 0, or {low:.3g} m to the cavity's edge, {cavity:.3g} m")
         if self.sharpen != (0, 0) and not self.sharpen[0] < self.sharpen[1]:
             raise ValueError(f"sharpen = {self.sharpen}: wanted two increasing iterations, or 0 0")

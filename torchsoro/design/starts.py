@@ -26,7 +26,7 @@ from torchsoro.design.robot import Robot
 from torchsoro.design.training import RunFolder
 from torchsoro.errors import SimulationDiverged
 from torchsoro.simulation.threads import thread_count, threads_here
-from torchsoro.storage import check_folder, plain_settings, write_json
+from torchsoro.storage import check_folder, plain_settings, read_json, write_json
 
 CHANGE = 1e-6  # of the initial field, standard deviation: some ten times the rounding of float32
 
@@ -59,16 +59,18 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
         SimulationDiverged: if the simulation of every start breaks down.
     """
     s = robot.settings
-    if s.overwrite:
-        _forget(s.out, s.starts if s.starts > 1 else 0)
+    former = _starts_of(s.out) if s.overwrite else 0
     if s.starts == 1:
-        return optimize(robot, observe, processes)
+        found = optimize(robot, observe, processes)
+        _forget(s.out, 1, former)
+        return found
     check_folder("out", s.out)
     if (s.out / "settings.json").exists() and not (s.resume or s.overwrite):
         raise ValueError(f"out = {s.out}: already holds a run; wanted another folder, or --resume or --overwrite")
     if s.resume and not any(s.out.glob("start-*/settings.json")) and not (s.out / "settings.json").exists():
         raise ValueError(f"out = {s.out}: holds no run of several starts; start without --resume")
     robots = [_start(robot, k) for k in range(s.starts)]
+    _forget(s.out, s.starts + 1, former)
     s.out.mkdir(parents=True, exist_ok=True)
     write_json(s.out / "settings.json", plain_settings(dataclasses.asdict(s)))  # what --resume goes on with
     # Taichi, that is a GPU and the updated form, takes one simulation at a time.
@@ -117,11 +119,17 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
     return found[best]
 
 
-def _forget(folder: Path, kept: int) -> None:
-    """Delete the runs of an earlier run's starts, but for the first ones, which begin again in their folders."""
-    for start in folder.glob("start-*"):
-        number = start.name.removeprefix("start-")
-        if number.isdecimal() and int(number) > kept and (start / "settings.json").exists():
+def _starts_of(folder: Path) -> int:
+    """Of how many starts a folder's run is; 0 of one, or without a run."""
+    path = folder / "settings.json"
+    starts = read_json(path, dict).get("starts", 1) if path.is_file() else 1
+    return starts if isinstance(starts, int) and starts > 1 else 0
+
+
+def _forget(folder: Path, first: int, last: int) -> None:
+    """Delete the runs of an earlier run's starts from one number to another."""
+    for start in (folder / f"start-{k}" for k in range(first, last + 1)):
+        if (start / "settings.json").is_file() and not start.is_symlink():
             shutil.rmtree(start)
 
 

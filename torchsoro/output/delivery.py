@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
-from torchsoro.design.chambers import check_designed
+from torchsoro.design.chambers import check_new
 from torchsoro.design.density import thickened
 from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import intermediate_density, mean_stride
@@ -58,7 +58,8 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         ConnectionError: if another process ends before this one.
     """
     s = robot.settings
-    check_designed(s)
+    if not s.resume:
+        check_new(s, robot.domain.chambers, robot.port)
     if s.slopes and (s.scenarios < len(s.slopes) or s.slope or s.robot == "climber"):
         raise ValueError(
             f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or "

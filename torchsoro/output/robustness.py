@@ -84,6 +84,8 @@ def compare_scenarios(
     check_folder("out", out, (TABLE, PICTURE, NUMBERS))
     changes: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
     other = {"particles": particles, "wall": wall, "settle": settle, "duration": duration}
+    if duration is not None and duration > s.duration:  # a longer walk leaves the box of the design run
+        changes["room"] = max(s.room, 0.5)
     built = build(dataclasses.replace(s, **changes, **{name: one for name, one in other.items() if one is not None}))
     gamma = load_resampled(folder, built.domain).to(s.target)
     load_supply(folder / "design.npz", built.supply)
@@ -95,8 +97,7 @@ def compare_scenarios(
         found = evaluate(built, gamma, batch, void=void, progress=progress)
     times = {"settle": built.settings.settle, "duration": built.settings.duration}
     result = {"robot": folder.name, "count": count, "seed": chosen, **times, **found.numbers()}
-    if particles is not None:
-        result["particles"] = list(particles)
+    result |= {name: one for name, one in (("particles", particles), ("wall", wall)) if one is not None}
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / TABLE) as file:
         file.write(table(found).encode())

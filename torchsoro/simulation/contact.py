@@ -28,9 +28,9 @@ class Plane:
             axis has none.
         side: +1 if the body lies on the positive side of an axis, else -1.
         friction: "stick" (no slip while pressed on, the paper's rule) or Coulomb coefficient, number or tensor [...].
-        static_friction: Coulomb coefficient mu_s at rest, at least ``friction``, which is then the mu_k of what slides
-            fast, number or tensor [...]; the same if None. At a speed v, with the Stribeck speed v_s, it is
-            mu_k + (mu_s - mu_k) / (1 + (v / v_s)^2); total formulation only.
+        static_friction: Coulomb coefficient mu_s at rest, number or tensor [...]; None: no other than ``friction``. If
+            given, ``friction`` is mu_k, that of fast sliding, and at a speed v it is
+            mu_k + (mu_s - mu_k) / (1 + (v / v_s)^2) with the Stribeck speed v_s; total formulation only.
         stribeck_speed: Speed at which half of that difference is left [m/s], number or tensor [...].
         adhesion: Traction that must be overcome to lift off [Pa], which also presses on for friction; number or tensor
             [...].
@@ -93,6 +93,8 @@ class Plane:
             raise ValueError(f"stribeck_speed = {self.stribeck_speed}: wanted finite and positive, in m/s")
         if self.static_friction is None:
             return
+        if isinstance(self.static_friction, str):
+            raise ValueError(f"static_friction = {self.static_friction!r}: wanted a coefficient")
         if isinstance(self.friction, str):
             raise ValueError(f"static_friction = {self.static_friction}: of a plane that sticks, wanted a coefficient")
         static, sliding = (torch.as_tensor(v).detach() for v in (self.static_friction, self.friction))

@@ -169,8 +169,8 @@ def plane_pressure(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow,
 def plane_contact(u0, u1, u2, n0, n1, n2, gap, dt, stick, friction, more, slow, hold, reach, touch, push):
     """Velocity of a node after a step towards, on or off a plane, and what else it moves by in this step.
 
-    What presses the node on the plane, the plane's push and adhesion, makes it stick, or takes at most the coefficient
-    times that from what slides, which may be larger the slower that is (see :func:`grip`). Adhesion holds a node that
+    What presses the node on the plane, the plane's push and adhesion, makes it stick, or slows its sliding by at most
+    the coefficient times that. The coefficient may depend on the speed (see :func:`grip`). Adhesion holds a node that
     touches until it is torn off, and pulls one that is within reach. What a node loses along the plane it loses from
     when it arrives.
 

@@ -114,7 +114,7 @@ def surface(mesh, case, d, state, g, i):
 
 @law
 def contact_numbers(mesh, case, g, k, i, light):
-    """What ``plane_contact`` takes of plane k, from stick to push; and hold by adhesion."""
+    """What ``plane_contact`` takes of plane k, from stick to push, and the hold per unit of adhesion."""
     planes = len(case.plane_stick)
     q, s = 16 * PLANE * (g * planes + k), (g * planes + k) * mesh.component + i
     zero = 0 * light
