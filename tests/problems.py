@@ -198,7 +198,7 @@ def problem(
     share[:, kind == layout.ABSENT] = 0
     # The ground sticks or slides, and holds a little; a wall is adhesive and slides, another holds what is near it.
     planes = torch.tensor([[5.0, 0.3, 0.1 * total], [7.0, 0.4, 0.2], [5.0, 0.1, 0.5]], dtype=torch.float64)
-    at_rest = torch.tensor([[0.2 * total, 0.3]] * 3)  # in the total form it slides the better the faster
+    at_rest = torch.tensor([[0.1 * total, 0.2]] * 3)  # in the total form it slides the better the faster
     planes = torch.cat([planes, torch.zeros(3, 1), torch.eye(3)[[2, 0, 1]], at_rest], 1).double()
     tensors = {
         "coefficients": coefficients,

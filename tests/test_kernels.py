@@ -5,10 +5,12 @@ import taichi as ti
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba import config
 from problems import rotations
 
 import torchsoro
 from torchsoro.simulation.kernels import contact, spline, stress, tensor, total, total_adjoint
+from torchsoro.simulation.kernels.compiled import remove_stale_code
 
 # The annotations of kernels must be values: no ``from __future__ import annotations`` here.
 Reals = ti.types.ndarray(dtype=ti.f64, ndim=1)
@@ -448,3 +450,16 @@ def test_marches_of_a_gpu_are_understood_by_taichi_without_one(march, features, 
     monkeypatch.setattr(ti.simt.block, "sync", nothing)
     reals = [torch.zeros(1)] * (len(march._primal.arguments) - 8)
     march._primal.ensure_compiled(ti.f32, 4, features, shape, 0, 0, 0, torch.zeros(1, dtype=torch.int32), *reals)
+
+
+def test_compiled_code_of_other_sources_is_removed_from_a_folder_of_the_users_choice_too(tmp_path, monkeypatch):
+    folder, other = tmp_path / "kernels_0123", tmp_path / "mine_0123"
+    for one in (folder, other):
+        one.mkdir()
+        (one / "march.nbi").touch()
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path))
+    remove_stale_code.__wrapped__()
+    assert not list(folder.glob("*.nbi")) and (other / "march.nbi").exists()
+    (folder / "march.nbi").touch()  # compiled from these sources
+    remove_stale_code.__wrapped__()
+    assert (folder / "march.nbi").exists()

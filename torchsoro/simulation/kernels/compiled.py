@@ -7,6 +7,8 @@ import functools
 import hashlib
 from pathlib import Path
 
+from numba import config
+
 from torchsoro.simulation import laws
 from torchsoro.storage import atomic_write
 
@@ -21,11 +23,15 @@ def remove_stale_code() -> None:
     digest = hashlib.sha256()
     for source in [*sorted(here.glob("*.py")), Path(str(laws.__file__))]:
         digest.update(source.read_bytes())
+    folders = [here / "__pycache__"]
+    if config.CACHE_DIR:  # Numba names folders there by that of the source
+        folders += Path(config.CACHE_DIR).glob(f"{here.name}_*")
     # A folder that cannot be written has no compiled code either: Numba then keeps it elsewhere, by the user.
-    with contextlib.suppress(OSError):
-        stamp = here / "__pycache__" / "sources.sha256"
-        if not stamp.exists() or stamp.read_text() != digest.hexdigest():
-            for index in stamp.parent.glob("*.nbi"):
-                index.unlink()
-            with atomic_write(stamp) as file:
-                file.write(digest.hexdigest().encode())
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            stamp = folder / "sources.sha256"
+            if not stamp.exists() or stamp.read_text() != digest.hexdigest():
+                for index in folder.glob("*.nbi"):
+                    index.unlink()
+                with atomic_write(stamp) as file:
+                    file.write(digest.hexdigest().encode())
