@@ -117,6 +117,8 @@ NO_NUMBERS = {
 OBLIQUE = {"Plane.normal"}
 # Of the total-Lagrangian form: test_nodes compares their gradients.
 OF_NODES = {"Body.softening", "Body.air_stiffness"}
+# Likewise: test_contact compares their gradients.
+OF_SLIDING = {"Plane.static_friction", "Plane.stribeck_speed"}
 # Of solids that are air in part: test_shared_air compares their gradients.
 OF_SHARES = {"Body.air_share", "Body.share_stiffness"}
 REFUSED = {"Force.share", "Plane.reach"}
@@ -247,7 +249,7 @@ def test_every_field_is_differentiated_or_refused_or_no_number():
         for kind in (Solid, Gas, Prony, Force, PointMass, Spring, Drag, Plane, Waveform, Body)
         for f in fields(kind)
     }
-    compared = {name for name in NUMBERS if name[0].isupper()} | OBLIQUE | OF_NODES | OF_SHARES
+    compared = {name for name in NUMBERS if name[0].isupper()} | OBLIQUE | OF_NODES | OF_SLIDING | OF_SHARES
     assert names == compared | NO_NUMBERS | REFUSED
 
 

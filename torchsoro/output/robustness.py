@@ -97,7 +97,8 @@ def compare_scenarios(
         found = evaluate(built, gamma, batch, void=void, progress=progress)
     times = {"settle": built.settings.settle, "duration": built.settings.duration}
     result = {"robot": folder.name, "count": count, "seed": chosen, **times, **found.numbers()}
-    result |= {name: one for name, one in (("particles", particles), ("wall", wall)) if one is not None}
+    result |= {} if particles is None else {"particles": list(particles)}
+    result |= {} if wall is None else {"wall": wall}
     out.mkdir(parents=True, exist_ok=True)
     with atomic_write(out / TABLE) as file:
         file.write(table(found).encode())
