@@ -7,6 +7,7 @@ import csv
 import importlib
 import json
 import math
+import os
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -396,6 +397,45 @@ def test_ask_runs_the_tool_on_a_copy_and_once(judge, batch, tmp_path):
     assert judge.ask.ask(batch, answers=tmp_path / "answers", tool="false") == digest
     verdicts = [json.loads(p.read_text())["verdict"] for p in sorted((tmp_path / "answers").rglob("explanation.json"))]
     assert verdicts == ["failed"] + ["nothing_missing"] * 5
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the service of the test is a shell script")
+def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge, tmp_path, monkeypatch):
+    setups = {"case-0": "", "case-1": "[[chamber]]", "case-2": "[[plane]]\n[[chamber]]", "case-3": "[[plane]]"}
+    for name, setup in setups.items():
+        (tmp_path / "batch" / "cases" / name).mkdir(parents=True)
+        (tmp_path / "batch" / "cases" / name / "setup.toml").write_text(setup)
+    tool, order = tmp_path / "tool.py", tmp_path / "order"
+    tool.write_text(
+        "import json, os, pathlib, sys, time\n"
+        f"with open({str(order)!r}, 'a') as order: print(pathlib.Path(sys.argv[1]).name, file=order)\n"
+        "time.sleep(0.2)\n"
+        "out = pathlib.Path(sys.argv[3])\n"
+        "out.mkdir()\n"
+        "seen = {'gpu': os.environ['CUDA_VISIBLE_DEVICES'], 'pipe': os.environ['CUDA_MPS_PIPE_DIRECTORY']}\n"
+        "(out / 'explanation.json').write_text(json.dumps({'verdict': 'nothing_missing', 'effects': [], **seen}))\n"
+    )
+    service = tmp_path / "bin" / judge.ask.SHARING
+    service.parent.mkdir()
+    service.write_text(f'#!/bin/sh\n[ "$1" = -d ] && echo start >> {tmp_path}/calls || cat >> {tmp_path}/calls\n')
+    service.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
+    command, answers = f"{sys.executable} {tool}", tmp_path / "answers"
+    judge.ask.ask(tmp_path / "batch", answers=answers, tool=command, workers=4, gpus=2)
+    told = [json.loads(path.read_text()) for path in sorted(answers.rglob("explanation.json"))]
+    assert sorted(found["gpu"] for found in told) == ["3", "3", "5", "5"]
+    assert len({found["pipe"] for found in told}) == 1
+    assert (tmp_path / "calls").read_text().split() == ["start", "quit"]
+    order.unlink()
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "")
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "one", tool=command)
+    assert order.read_text().split() == ["case-2", "case-1", "case-3", "case-0"]
+    with pytest.raises(ValueError, match=r"gpus = 4: .* has 3"):
+        judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, workers=4, gpus=4)
+    with pytest.raises(ValueError, match="gpus = 2: wanted 0 to workers = 1"):
+        judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, gpus=2)
+    assert not (tmp_path / "none").exists()
 
 
 def test_intervals_are_those_of_clopper_and_pearson(judge):

@@ -1,6 +1,7 @@
 """Have every case of a batch explained, in a copy that holds nothing else, and note the hashes of the answers.
 
     python recipes/judge/ask.py runs/judge/test --answers runs/judge/answers --tool "python recipes/explain.py"
+    python recipes/judge/ask.py BATCH --answers ANSWERS --gpus 4 --workers 32 --extra="--device cuda --threads 2"
 
 Runs ``TOOL CASE --out DIR`` and then, where it left a model.toml, ``TOOL --predict DIR/model.toml --trial TRIAL.toml
 --out CSV`` for the trial whose markers stay sealed. Interrupted, the same command goes on; an answer is never asked
@@ -10,36 +11,93 @@ for twice.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import hashlib
 import json
+import os
+import queue
 import shlex
 import shutil
 import subprocess
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import tyro
 from tqdm import tqdm
 
+SHARING = "nvidia-cuda-mps-control"
+"""NVIDIA's multi-process service; without it the processes on a GPU take turns, and small kernels leave it idle."""
 
-def _call(command: list[str], timeout: float) -> str:
+
+def _call(command: list[str], timeout: float, variables: dict[str, str]) -> str:
     """Run; returns what went wrong, or nothing."""
+    surroundings = {**os.environ, **variables}
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, env=surroundings)
     except subprocess.TimeoutExpired:
         return f"took more than {timeout:.0f} s"
     return "" if done.returncode == 0 else f"exit {done.returncode}: {(done.stderr or done.stdout)[-800:]}"
 
 
-def answer(case: Path, tool: list[str], answers: Path, timeout: float, extra: list[str]) -> dict[str, Any]:
+@contextlib.contextmanager
+def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
+    """The multi-process service, where several workers share a GPU; yields the variables by which they find it."""
+    if workers <= gpus or not gpus:
+        yield {}
+        return
+    if shutil.which(SHARING) is None:
+        print(f"{SHARING} is not installed: the workers on a GPU take turns, which is several times slower", flush=True)
+        yield {}
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        variables = {"CUDA_MPS_PIPE_DIRECTORY": f"{folder}/pipe", "CUDA_MPS_LOG_DIRECTORY": f"{folder}/log"}
+        surroundings = {**os.environ, **variables}
+        for name in variables.values():
+            Path(name).mkdir()
+        # A daemon keeps what it is given as its output, so that nobody may wait for the end of that.
+        subprocess.run(
+            [SHARING, "-d"], env=surroundings, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        try:
+            yield variables
+        finally:
+            subprocess.run([SHARING], input="quit\n", text=True, env=surroundings, check=False)
+
+
+def _devices(gpus: int, workers: int) -> list[str]:
+    """Which GPU each of the workers uses, as ``CUDA_VISIBLE_DEVICES``; empty where the tool is left to choose."""
+    if gpus < 0 or gpus > workers:
+        raise ValueError(f"gpus = {gpus}: wanted 0 to workers = {workers}")
+    names = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(str(gpu) for gpu in range(gpus))).split(",")
+    if gpus > len(names):
+        raise ValueError(f"gpus = {gpus}: CUDA_VISIBLE_DEVICES = {','.join(names)} has {len(names)}")
+    return [names[worker % gpus] for worker in range(workers)] if gpus else [""] * workers
+
+
+def _long(case: Path) -> int:
+    """How long an answer may take, by rank: a robot's mesh, a chamber and a plane each make it longer."""
+    setup = (case / "setup.toml").read_text() if (case / "setup.toml").exists() else ""
+    return ("[[plane]]" in setup) + ("[[chamber]]" in setup) + (case / "body.stl").exists()
+
+
+def answer(
+    case: Path,
+    tool: list[str],
+    answers: Path,
+    timeout: float,
+    extra: list[str],
+    variables: dict[str, str] | None = None,
+) -> dict[str, Any]:
     """One case; returns its explanation, or the verdict "failed" with the reason."""
+    variables = variables or {}
     with tempfile.TemporaryDirectory() as folder:
         copy, out = Path(folder) / case.name, Path(folder) / "answer"
         shutil.copytree(case, copy)
         started = time.perf_counter()
-        wrong = _call([*tool, str(copy), "--out", str(out), *extra], timeout)
+        wrong = _call([*tool, str(copy), "--out", str(out), *extra], timeout, variables)
         path = out / "explanation.json"
         if not wrong and not path.exists():
             wrong = "wrote no explanation.json"
@@ -57,7 +115,7 @@ def answer(case: Path, tool: list[str], answers: Path, timeout: float, extra: li
             for trial in trials[:1]:
                 csv = part / "predicted.csv"
                 model = str(out / "model.toml")
-                wrong = _call([*tool, "--predict", model, "--trial", str(trial), "--out", str(csv)], timeout)
+                wrong = _call([*tool, "--predict", model, "--trial", str(trial), "--out", str(csv)], timeout, variables)
                 if wrong:
                     found["prediction_error"] = wrong
         (part / "explanation.json").write_text(json.dumps(found, indent=1))
@@ -73,6 +131,7 @@ def ask(
     tool: str = "python recipes/explain.py",
     extra: str = "",
     workers: int = 1,
+    gpus: int = 0,
     timeout: float = 3600,
 ) -> str:
     """Ask for what has no answer yet.
@@ -82,23 +141,40 @@ def ask(
         answers: Folder for the answers, one for each tool or baseline.
         tool: Command line.
         extra: Further arguments.
-        workers: Cases side by side; with more than one, tell the tool to use one thread (``--extra``).
+        workers: Cases side by side; with more than one, tell the tool to use one thread (``--extra``). What may
+            take longest is begun first.
+        gpus: Share the workers out to so many GPUs of this machine, and let those on one GPU compute side by side by
+            NVIDIA's multi-process service (started and ended here) where it is installed; tell the tool to use
+            them (``--extra="--device cuda"``).
         timeout: For one command [s].
 
     Returns:
         SHA-256 over all answers.
+
+    Raises:
+        ValueError: If the batch is none, or there are fewer workers or visible GPUs than ``gpus``.
     """
     if not (batch / "cases").is_dir():
         raise ValueError(f"batch = {batch}: wanted a folder with cases/, made by seal.py")
     cases = sorted((batch / "cases").iterdir())
     todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
+    todo.sort(key=_long, reverse=True)
+    free: queue.SimpleQueue[str] = queue.SimpleQueue()
+    for device in _devices(gpus, workers):
+        free.put(device)
     answers.mkdir(parents=True, exist_ok=True)
     print(f"{len(cases)} cases, {len(cases) - len(todo)} of them answered already", flush=True)
-    with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-        jobs = {
-            pool.submit(answer, case, shlex.split(tool), answers, timeout, shlex.split(extra)): case.name
-            for case in todo
-        }
+    with _shared(gpus, workers) as sharing, concurrent.futures.ThreadPoolExecutor(workers) as pool:
+
+        def answered(case: Path) -> dict[str, Any]:
+            device = free.get()
+            variables = {**sharing, **({"CUDA_VISIBLE_DEVICES": device} if device else {})}
+            try:
+                return answer(case, shlex.split(tool), answers, timeout, shlex.split(extra), variables)
+            finally:
+                free.put(device)
+
+        jobs = {pool.submit(answered, case): case.name for case in todo}
         with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
             for job in concurrent.futures.as_completed(jobs):
                 found = job.result()
