@@ -25,7 +25,6 @@ from torchsoro.design.mesh import Surface, check_fit, lined
 from torchsoro.design.port import AirPort
 
 _ON_PLANE = 1e-6  # how far a chamber face may be from a lattice plane, in particle spacings
-_CUBIC = 1e-9  # relative difference allowed between the spacings along the three axes
 _AXES = ("x", "y", "z")
 _NOT_GIVEN = (math.nan, math.nan, math.nan)
 
@@ -139,7 +138,7 @@ class Domain:
         object.__setattr__(self, "chambers", tuple(self.chambers))
 
         spacings = [length / count for length, count in zip(self.size, counts, strict=True)]
-        if max(spacings) - min(spacings) > _CUBIC * max(spacings):
+        if max(spacings) - min(spacings) > ROUNDING * max(spacings):
             raise ValueError(
                 f"particles: got {counts} on a body of {self.size} m, a spacing of "
                 f"{tuple(float(f'{h:.6g}') for h in spacings)} m, want the same spacing along the three axes"
@@ -333,7 +332,7 @@ class Domain:
             cavity[_slices(self._cavity(chamber))] = True
         else:
             check_fit(f"{where}: shape", chamber.shape, self.origin, self.size, self.spacing)
-            if chamber.wall < self.spacing * (1 - _CUBIC):
+            if chamber.wall < self.spacing * (1 - ROUNDING):
                 raise ValueError(
                     f"{where}: wall: got {chamber.wall} m, want at least one spacing ({self.spacing:.6g} m)"
                 )

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from torchsoro.design.domain import Domain
+from torchsoro.design.limits import ROUNDING
 from torchsoro.errors import refuse_gradients
 
 _AXES = ("x", "y", "z")
@@ -225,7 +226,7 @@ class _Convolution(torch.autograd.Function):
 
 def _filter_kernel(radius: float) -> Tensor:
     """Weights (1 - d/R)^3 for a radius in particle spacings, half of them: [r + 1, 1, 2 r + 1, 2 r + 1], float64."""
-    reach = max(math.ceil(radius - 1e-9) - 1, 0)  # neighbours at distance R itself have weight 0
+    reach = max(math.ceil(radius - ROUNDING) - 1, 0)  # neighbours at distance R itself have weight 0
     offsets = torch.arange(-reach, reach + 1, dtype=torch.float64)
     x, y, z = torch.meshgrid(offsets[reach:], offsets, offsets, indexing="ij")
     distance = (x.square() + y.square() + z.square()).sqrt()

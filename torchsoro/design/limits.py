@@ -8,7 +8,7 @@ _LEAST_STRAIN = 1e-3  # pressure over modulus, below which nothing moves that co
 # Grid points across the least wall of a printed part, at least: with fewer a rod would lose a tenth of its diameter.
 _ACROSS = 4
 _FINEST = 320  # such points along the longest edge: of a cube some gigabytes, and minutes
-ROUNDING = 1e-9  # relative difference of two lengths that are the same but for rounding
+ROUNDING = 1e-9  # difference of two lengths that are the same but for rounding, relative or in particle spacings
 
 
 def points_across(min_wall: float, spacing: float, particles: int) -> int:
@@ -22,7 +22,7 @@ def points_across(min_wall: float, spacing: float, particles: int) -> int:
     Raises:
         ValueError: if the grid would be too fine.
     """
-    refine = math.ceil(_ACROSS * spacing / min_wall - 1e-9)
+    refine = math.ceil(_ACROSS * spacing / min_wall - ROUNDING)
     if refine * particles > _FINEST:
         least = _ACROSS * spacing / max(1, _FINEST // particles)
         raise ValueError(f"min_wall = {min_wall:g} m: wanted 0, or at least {least:.3g} m for a body of this size")

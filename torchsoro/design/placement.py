@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from torchsoro.design.domain import Chamber, Domain
+from torchsoro.design.limits import ROUNDING
 
 # Width of the transition at a face, in particle spacings. With one or less, a chamber on lattice planes has a gradient
 # of zero, as all particles are half a spacing from its faces; with two, walls of one spacing would take 7 % of one from
@@ -25,7 +26,6 @@ SETTLED = 0.5  # the same of chambers that stay on lattice planes: any up to 1 g
 LEAST_CAVITY = 1.0  # edge of a cavity, in particle spacings: the layer of air that a lattice needs
 DESIGNED = ("place", "size")
 _AXES = ("x", "y", "z")
-_ROUNDING = 1e-9  # of a place in spacings, within which it lies half-way between two planes, or a size at its bound
 _HALVINGS = 80  # of the factor by which edges reach a volume: a double's 53 bits, from a factor of e^20
 _WIDEST = 20.0  # logarithm of that factor, at most
 
@@ -122,13 +122,13 @@ class Placement(nn.Module):
             for name in ("center", "size")
         )
         # Of a cavity between lattice planes, in spacings.
-        self._layers = max(LEAST_CAVITY, float(math.ceil(cavity / domain.spacing - _ROUNDING)))
+        self._layers = max(LEAST_CAVITY, float(math.ceil(cavity / domain.spacing - ROUNDING)))
         self.low = torch.tensor(domain.origin, dtype=torch.float64)
         self.high = self.low + torch.tensor(domain.size, dtype=torch.float64)
         self.least, self.most = self._bounds(*edges, size)
         self.images = tuple((_AXES.index(a), self._images(_AXES.index(a), center, size)) for a in symmetry)
         faces = torch.stack([center - size / 2, center + size / 2], -1)[:, self.axis]
-        if bool((faces[:-1, 1] > faces[1:, 0] + _ROUNDING * domain.spacing).any()):
+        if bool((faces[:-1, 1] > faces[1:, 0] + ROUNDING * domain.spacing).any()):
             raise ValueError(f"axis: got {axis!r}, want one along which the chambers follow each other without overlap")
         self.register_parameter("center", nn.Parameter(center, requires_grad="place" in designed))
         self.register_parameter("size", nn.Parameter(size, requires_grad="size" in designed))
@@ -147,7 +147,7 @@ class Placement(nn.Module):
         lows = found.expand(-1, 3).contiguous()
         highs = (self.high - self.low).expand(len(size), 3).contiguous()
         highs = highs if most is None else highs.clamp(max=most)
-        slack = _ROUNDING * h
+        slack = ROUNDING * h
         if bool((lows < 2 * self.walls + LEAST_CAVITY * h - slack).any()) or bool((lows > highs + slack).any()):
             raise ValueError(
                 f"edges: got {(least, most)} m, want at least two walls and {LEAST_CAVITY:g} particle spacing "
@@ -280,7 +280,7 @@ class Placement(nn.Module):
         h, origin = self.domain.spacing, torch.tensor(self.domain.origin, dtype=torch.float64)
         center, size = self.boxes()
         low, high = (center - size / 2 - origin) / h, (center + size / 2 - origin) / h
-        first, last = torch.floor(low + 0.5 + _ROUNDING), torch.ceil(high - 0.5 - _ROUNDING)
+        first, last = torch.floor(low + 0.5 + ROUNDING), torch.ceil(high - 0.5 - ROUNDING)
         hollow = last - first > 2 * self.walls / h + self._layers - 0.5
         first, last = torch.where(hollow, first, torch.floor(low)), torch.where(hollow, last, torch.ceil(high))
         planes, wanted = torch.stack([first, last], -1), torch.stack([low, high], -1)
@@ -300,7 +300,7 @@ class Placement(nn.Module):
             planes: Of the faces, in spacings [chambers, 3, 2].
             wanted: The same of the chambers before they are rounded.
         """
-        inward = torch.stack([torch.ceil(wanted[..., 0] - _ROUNDING), torch.floor(wanted[..., 1] + _ROUNDING)], -1)
+        inward = torch.stack([torch.ceil(wanted[..., 0] - ROUNDING), torch.floor(wanted[..., 1] + ROUNDING)], -1)
         walls = torch.round(2 * self.walls / self.domain.spacing)
         volume = (wanted[..., 1] - wanted[..., 0] - walls).prod(-1)
         for k, nearest in enumerate(planes.clone()):

@@ -17,6 +17,7 @@ from torchsoro.design.processes import take_gpu
 from torchsoro.design.settings import Settings, cuda_available
 
 CHAMBERS = "chambers.json"  # settings of the chambers that a run has designed, beside those that it began with
+ROAM = 0.5  # m around a body that is watched for longer than its design run took
 # Flags by theme, for --help: each group begins with a field and goes on to the next that is named here.
 GROUPS = {
     "robot": "run",
@@ -126,6 +127,12 @@ def read_settings(path: Path, **changes: object) -> Settings:
     """
     delivered = path.with_name(CHAMBERS)
     return _settings(path, _object(path) | (_object(delivered) if delivered.is_file() else {}), changes)
+
+
+def lasting(s: Settings, duration: float) -> Settings:
+    """The settings with another time of actuation [s]; a walk that lasts longer leaves the box of the design run."""
+    room = max(s.room, ROAM) if duration > s.duration else s.room
+    return dataclasses.replace(s, duration=duration, room=room)
 
 
 def _object(path: Path) -> dict[str, Any]:

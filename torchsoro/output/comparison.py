@@ -15,7 +15,7 @@ import torch
 
 from torchsoro.command_line import progress_bar
 from torchsoro.design.objective import mean_stride
-from torchsoro.design.reading import CHAMBERS, read_settings
+from torchsoro.design.reading import CHAMBERS, lasting, read_settings
 from torchsoro.design.robot import Outcome, Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
@@ -107,12 +107,11 @@ def perform(folder: Path, base: Settings, check: Check, stage: str) -> tuple[Rob
         ValueError: if the folder lacks the design of the check's iteration.
         SimulationDiverged: if the simulation breaks down.
     """
-    # A long walk leaves the box of the design run.
-    long = {"duration": LONG, "room": 0.5} if check.long else {}
     particles = tuple(check.finer * n for n in base.particles)
     # What is stiffer or finer needs a smaller step.
     step = {"dt": "auto"} if check.changes or check.finer > 1 else {}
-    s = dataclasses.replace(base, **{"particles": particles, **long, **step, **check.changes})
+    timed = lasting(base, LONG) if check.long else base
+    s = dataclasses.replace(timed, **{"particles": particles, **step, **check.changes})
     robot, coarse = build(s), build(dataclasses.replace(base, device="cpu")).domain
     at = check.iteration
     gamma = load_design(folder / "design.npz", coarse) if at is None else load_shape(folder, coarse, at)

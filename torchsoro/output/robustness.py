@@ -15,7 +15,7 @@ from PIL import Image
 
 from torchsoro.command_line import progress_bar
 from torchsoro.design.ensemble import Evaluation, evaluate
-from torchsoro.design.reading import read_settings
+from torchsoro.design.reading import lasting, read_settings
 from torchsoro.design.robot import build
 from torchsoro.design.scenarios import LIMITS, NOMINAL
 from torchsoro.output.archive import find, load_resampled, load_supply
@@ -83,9 +83,8 @@ def compare_scenarios(
     s = dataclasses.replace(read_settings(folder / "settings.json", device=device, resume=False), scenarios=0)
     check_folder("out", out, (TABLE, PICTURE, NUMBERS))
     changes: dict[str, Any] = {"dt": "auto"} if s.dt != "auto" else {}  # what is stiffer needs a smaller step
-    other = {"particles": particles, "wall": wall, "settle": settle, "duration": duration}
-    if duration is not None and duration > s.duration:  # a longer walk leaves the box of the design run
-        changes["room"] = max(s.room, 0.5)
+    other = {"particles": particles, "wall": wall, "settle": settle}
+    s = s if duration is None else lasting(s, duration)
     built = build(dataclasses.replace(s, **changes, **{name: one for name, one in other.items() if one is not None}))
     gamma = load_resampled(folder, built.domain).to(s.target)
     load_supply(folder / "design.npz", built.supply)
