@@ -421,6 +421,7 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
     service.chmod(0o755)
     monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
+    monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
     command, answers = f"{sys.executable} {tool}", tmp_path / "answers"
     judge.ask.ask(tmp_path / "batch", answers=answers, tool=command, workers=4, gpus=2)
     told = [json.loads(path.read_text()) for path in sorted(answers.rglob("explanation.json"))]
@@ -428,8 +429,11 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
     assert len({found["pipe"] for found in told}) == 1
     assert (tmp_path / "calls").read_text().split() == ["start", "quit"]
     order.unlink()
-    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "")
-    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "one", tool=command)
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "served already")
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "served", tool=command, workers=2, gpus=1)
+    assert (tmp_path / "calls").read_text().split() == ["start", "quit"]
+    order.unlink()
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "one", tool=command, workers=1, gpus=1)
     assert order.read_text().split() == ["case-2", "case-1", "case-3", "case-0"]
     with pytest.raises(ValueError, match=r"gpus = 4: .* has 3"):
         judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, workers=4, gpus=4)

@@ -45,7 +45,8 @@ def _call(command: list[str], timeout: float, variables: dict[str, str]) -> str:
 @contextlib.contextmanager
 def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
     """The multi-process service, where several workers share a GPU; yields the variables by which they find it."""
-    if workers <= gpus or not gpus:
+    served = "CUDA_MPS_PIPE_DIRECTORY" in os.environ or Path("/tmp/nvidia-mps/control").exists()
+    if workers <= gpus or not gpus or served:
         yield {}
         return
     if shutil.which(SHARING) is None:
@@ -144,8 +145,8 @@ def ask(
         workers: Cases side by side; with more than one, tell the tool to use one thread (``--extra``). What may
             take longest is begun first.
         gpus: Share the workers out to so many GPUs of this machine, and let those on one GPU compute side by side by
-            NVIDIA's multi-process service (started and ended here) where it is installed; tell the tool to use
-            them (``--extra="--device cuda"``).
+            NVIDIA's multi-process service where it is installed (started and ended here, unless it runs); tell the
+            tool to use them (``--extra="--device cuda"``).
         timeout: For one command [s].
 
     Returns:
