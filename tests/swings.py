@@ -56,3 +56,14 @@ def recorded(share, seed, trials=2, count=60, effect=0.0):
         numerics=EXACT,
     )
     return data, nothing, effects
+
+
+def draws(data, count, size, seed, time=0.1):
+    """Motions that differ as contact makes them: by a process that all markers share."""
+    rng = np.random.default_rng(seed)
+    times = data.trials[0].time
+    root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / time) + 1e-9 * np.eye(len(times)))
+    return [
+        tuple(size * (root @ rng.normal(size=(len(times), 2)))[:, None] * np.ones((1, 3, 1)) for _ in data.trials)
+        for _ in range(count)
+    ]

@@ -6,9 +6,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from swings import EXACT, recorded
+from swings import EXACT, draws, recorded
 
 from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude, remainder
+from torchsoro.sim2real.inference.confirmation import compared
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
@@ -20,101 +21,9 @@ from torchsoro.sim2real.inference.evidence import (
 from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
+from torchsoro.sim2real.inference.remaining_error import by_spread
+from torchsoro.sim2real.inference.verdict import _moved
 from torchsoro.sim2real.inference.visible import limit, remedies
-
-# The twin's own error ------------------------------------------------------------------------------------------------
-
-SHIFTS = np.linspace(-1.0, 1.0, 7)
-
-
-def test_richardson_finds_an_error_that_falls_with_the_square_of_the_edge():
-    data, nothing, _ = recorded(0.0, 1)
-    time = data.trials[0].time
-    error = 0.03 * np.sin(40 * time)[:, None, None] * np.ones((1, 3, 2))
-    finer = tuple(r + error for r in nothing.residuals)
-    coarser = tuple(r + 1.5**2 * error for r in nothing.residuals)
-    priced = by_richardson(data, dataclasses.replace(nothing, residuals=finer), coarser, 1.5)
-    assert priced.numerics.amplitude == pytest.approx(float(np.sqrt((error**2).mean())), rel=1e-6)
-    assert np.abs(priced.numerics.draws[0][0]) == pytest.approx(np.abs(error), abs=1e-12)
-
-
-def test_richardson_refuses_a_twin_that_is_no_coarser():
-    data, nothing, _ = recorded(0.0, 1)
-    with pytest.raises(ValueError, match=r"ratio = 1, wanted one above 1"):
-        by_richardson(data, nothing, nothing.residuals, 1.0)
-
-
-def draws(data, count, size, seed, time=0.1):
-    """Motions that differ as contact makes them: by a process that all markers share."""
-    rng = np.random.default_rng(seed)
-    times = data.trials[0].time
-    root = np.linalg.cholesky(np.exp(-np.abs(times[:, None] - times) / time) + 1e-9 * np.eye(len(times)))
-    return [
-        tuple(size * (root @ rng.normal(size=(len(times), 2)))[:, None] * np.ones((1, 3, 1)) for _ in data.trials)
-        for _ in range(count)
-    ]
-
-
-def test_spread_of_equally_good_twins_is_priced_within_a_third_of_the_error_of_their_mean():
-    data, nothing, _ = recorded(0.0, 2)
-    off = draws(data, 7, 0.05, 3)
-    variants = [tuple(r + d for r, d in zip(nothing.residuals, one, strict=True)) for one in off]
-    priced = by_spread(data, nothing, variants, SHIFTS)
-    mean = tuple(np.mean(same, 0) for same in zip(*off, strict=True))
-    for r, m, n in zip(priced.residuals, mean, nothing.residuals, strict=True):
-        assert r - m == pytest.approx(n, abs=1e-12, nan_ok=True)
-    truth = draws(data, 40, 0.05, 4)
-    real = np.sqrt(np.mean([(t - m) ** 2 for one in truth for t, m in zip(one, mean, strict=True)]))
-    assert float(np.sqrt((priced.numerics.amplitude**2).mean())) == pytest.approx(real, rel=0.33)
-    assert 0.03 < priced.numerics.time < 0.3
-
-
-def test_what_grows_with_the_shift_of_planes_is_no_error():
-    data, nothing, _ = recorded(0.0, 2)
-    (way,) = draws(data, 1, 0.05, 3)
-    variants = [tuple(r + s * d for r, d in zip(nothing.residuals, way, strict=True)) for s in SHIFTS]
-    priced = by_spread(data, nothing, variants, SHIFTS)
-    assert priced.numerics.amplitude.max() < 1e-12
-    for r, n in zip(priced.residuals, nothing.residuals, strict=True):
-        assert r == pytest.approx(n, abs=1e-12, nan_ok=True)
-
-
-def test_errors_of_other_twins_add_up():
-    data, nothing, _ = recorded(0.0, 2)
-    one, other = draws(data, 2, 0.05, 3)
-    priced = by_spread(data, nothing, [nothing.residuals] * 7, SHIFTS, others=(one, other))
-    left = [size_of(cleared(data, nothing, o)) for o in (one, other)]
-    assert priced.numerics.size == pytest.approx(float(np.hypot(*left)), rel=1e-6)
-    assert priced.numerics.modes[0].shape[-1] == 7 + 2
-
-
-def test_two_twins_have_no_spread_and_shifts_are_theirs():
-    data, nothing, _ = recorded(0.0, 2)
-    with pytest.raises(ValueError, match="variants: 2, wanted three or more"):
-        by_spread(data, nothing, [nothing.residuals] * 2, SHIFTS[:2])
-    with pytest.raises(ValueError, match="wanted 3 that sum to zero"):
-        by_spread(data, nothing, [nothing.residuals] * 3, SHIFTS[:3])
-
-
-def test_a_difference_that_a_measurement_error_makes_is_no_error_of_the_twin():
-    data, _, drag = recorded(0.0, 3)
-    difference = tuple(0.2 * J[..., 0] for J in drag.slopes)
-    clock = dataclasses.replace(drag, model=dataclasses.replace(drag.model, own=()))
-    assert max(np.abs(c).max() for c in cleared(data, clock, difference)) < 1e-3
-    for kept, whole in zip(cleared(data, drag, difference), difference, strict=True):
-        assert kept == pytest.approx(whole)
-
-
-def test_a_modulus_takes_up_the_same_error_of_the_twin_as_a_belief_and_as_an_effect():
-    data, _, drag = recorded(0.0, 3)
-    difference = tuple(0.2 * J[..., 0] for J in drag.slopes)
-    belief, effect = (
-        dataclasses.replace(drag, model=dataclasses.replace(drag.model, own=own, released=own)) for own in ((), (0,))
-    )
-    for one, other in zip(cleared(data, belief, difference), cleared(data, effect, difference), strict=True):
-        assert one == pytest.approx(other)
-
 
 # Conclusions ---------------------------------------------------------------------------------------------------------
 
@@ -221,8 +130,9 @@ def test_an_effect_beside_something_else_is_told_as_most_of_the_difference():
     assert not conclude(weighed(data, nothing, drag), limit=0.0).partly
 
 
-def test_where_no_model_is_right_the_one_that_leaves_less_is_told():
-    # One leaves a smooth difference, which is easily foretold from sample to sample, the other a smaller rough one.
+@pytest.fixture
+def wrong():
+    """Two ends, none of them right: a smooth one, easily foretold from sample to sample, and a smaller rough one."""
     data, nothing, _ = recorded(0.0, 18)
     time = data.trials[0].time
     everywhere = np.ones((1, 3, 2))
@@ -231,17 +141,52 @@ def test_where_no_model_is_right_the_one_that_leaves_less_is_told():
     rough = tuple(0.1 * rng.normal(size=(len(time), 3, 2)) for _ in data.trials)
     start = tuple(1.0 * np.sin(9 * time)[:, None, None] * everywhere for _ in data.trials)
 
-    def ending(name, left):
-        slopes = tuple((a - b)[..., None] for a, b in zip(start, left, strict=True))
+    def ending(name, left, at):
+        slopes = tuple((a - b)[..., None] / at for a, b in zip(start, left, strict=True))
         model = Model(effects=(name,), priors=(Prior(1.0),), own=(0,))
         return Linearised(model=model, at=np.zeros(1), residuals=start, slopes=slopes, numerics=EXACT)
 
     nothing = dataclasses.replace(nothing, residuals=start)
-    weighing = weighed(data, nothing, ending("drag", smooth), ending("leak", rough))
+    return data, nothing, lambda name, at=1.0: ending(name, smooth, at), lambda name, at=1.0: ending(name, rough, at)
+
+
+def test_where_no_model_is_right_the_one_that_leaves_less_is_told(wrong):
+    data, nothing, smooth, rough = wrong
+    weighing = weighed(data, nothing, smooth("drag"), rough("leak"))
     evidence = {p.near.model.name: p.ln_evidence for p in weighing.effects}
     found = conclude(weighing, limit=0.0)
     assert evidence["drag"] > evidence["leak"]
     assert (found.chosen, found.partly) == (("leak",), True)
+
+
+def test_where_no_mode_of_a_name_is_right_the_one_that_leaves_less_is_told(wrong):
+    data, nothing, smooth, rough = wrong
+    weighing = weighed(data, nothing, smooth("drag"), rough("drag", -1.0))
+    likely, small = weighing.effects
+    assert likely.ln_evidence > small.ln_evidence
+    assert weighing.groups["drag"] == (small, likely)
+    (candidate,) = conclude(weighing, limit=0.0).candidates
+    assert candidate.best.mode.at[0] < 0
+
+
+def test_where_no_model_is_right_trials_left_out_are_compared_by_size(wrong):
+    data, nothing, _, rough = wrong
+    one, other = (infer(data, near) for near in (rough("drag"), nothing))
+    gain, error = compared(data, one, other, 1.0)
+    assert gain > 0
+    assert compared(data, one, other, 80.0) == (gain, error)
+    assert compared(data, one, one, 1.0) == (0.0, 0.0)
+
+
+def test_where_no_model_is_right_it_is_linearised_again_where_its_numbers_are_told():
+    data, _, drag = recorded(0.3, 16, effect=0.6)
+    at = told(data, infer(data, drag)).at
+    moved = dataclasses.replace(drag, at=at, residuals=drag.left(at))
+    found, kappa = infer(data, moved), 0.25
+    off, sigma = np.abs(found.mode.at - at), np.sqrt(np.diag(found.mode.covariance))
+    assert (off > np.sqrt(kappa) * sigma).all()  # evidence would go on
+    assert not _moved(data, found, kappa)
+    assert _moved(data, infer(data, drag), kappa)
 
 
 def test_residuals_that_last_and_move_together_are_worth_few_values():

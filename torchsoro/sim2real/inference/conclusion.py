@@ -32,12 +32,12 @@ from functools import cached_property
 
 import numpy as np
 
+from torchsoro.sim2real.inference.confirmation import compared
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
-    leave_one_out,
     mode_of,
     products,
 )
@@ -55,7 +55,7 @@ class Candidate:
     """One name, by all modes that were found of it.
 
     Attributes:
-        modes: Distinct ones, adjusted, most probable first.
+        modes: Distinct ones, adjusted, see :attr:`Weighing.modes`.
         size: Root mean square of the change of the motion by it, from what is believed, within tolerances [m].
         left: What it leaves of the recordings, see :func:`remainder` [m].
         ln_evidence: Summed over modes, adjusted.
@@ -75,7 +75,7 @@ class Candidate:
 
     @property
     def best(self) -> Posterior:
-        """Its most probable mode."""
+        """The first of its modes."""
         return self.modes[0]
 
 
@@ -214,17 +214,28 @@ class Weighing:
         return self.scatter if self.scattered else self.by_error
 
     @cached_property
+    def modes(self) -> tuple[Posterior, ...]:
+        """Distinct modes of all names, that first which counts first, as of names themselves.
+
+        The most probable; but of those that leave a discrepancy that matters none is right, and they go by its size.
+        """
+        distinct = [self._one_of(looks) for looks in self._looks_at_effects]
+        if self.best.matters:
+            return tuple(sorted(distinct, key=lambda p: remainder(self.data, p)))
+        return tuple(sorted(distinct, key=lambda p: -p.ln_evidence))
+
+    @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
-        """Distinct modes of each name, most probable first."""
+        """The same of each name."""
         found: dict[str, list[Posterior]] = {}
-        for p in sorted(map(self._one_of, self._looks_at_effects), key=lambda p: -p.ln_evidence):
+        for p in self.modes:
             found.setdefault(p.near.model.name, []).append(p)
         return {name: tuple(modes) for name, modes in found.items()}
 
     @cached_property
     def best(self) -> Posterior:
         """The most probable of all."""
-        return max((*(p for modes in self.groups.values() for p in modes), self.null), key=lambda p: p.ln_evidence)
+        return max((*map(self._one_of, self._looks_at_effects), self.null), key=lambda p: p.ln_evidence)
 
     @cached_property
     def unexplained(self) -> float:
@@ -461,17 +472,3 @@ def within(null: Posterior) -> Posterior:
     bounded = [dataclasses.replace(p, low=-1.0, high=1.0) for p in model.priors[: model.beliefs]]
     model = dataclasses.replace(model, priors=(*bounded, *model.priors[model.beliefs :]))
     return dataclasses.replace(null, near=dataclasses.replace(null.near, model=model))
-
-
-def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tuple[float, float]:
-    """Gain in ln predictive density of trials left out, and its standard error over trials.
-
-    Args:
-        data: Recordings.
-        one: The one that may be better.
-        other: The other.
-        kappa: Of whose inverse the likelihood is taken to the power.
-    """
-    gain = leave_one_out(data, one, kappa) - leave_one_out(data, other, kappa)
-    n = len(gain)
-    return float(gain.sum()), float(math.sqrt(n * gain.var(ddof=1))) if n > 1 else math.inf

@@ -146,7 +146,7 @@ def weighed(
     known = weigh(problem, [null_model, *strained, *_as_beliefs(problem, null_model, ends), *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.best
-    leading = at_mode(problem, _fit_of(known, best), best.mode)
+    leading = at_mode(problem, _fit_of(known, best), told(data, best))
     moved = {}
     if problem.touches and not problem.rough and best.near.model.effects:
         moved = planes_moved(problem, leading)
@@ -157,7 +157,7 @@ def weighed(
         far = _looked_at_again(weighing, behind, k) if problem.rough else _far(weighing, behind)
         if not far:
             break
-        ends = [leading if p is best else at_mode(problem, _fit_of(known, p), p.mode) for p in far]
+        ends = [leading if p is best else at_mode(problem, _fit_of(known, p), told(data, p)) for p in far]
         again = weigh(problem, ends, closely=True, moved=moved)
         sound = {p.near.model.name for _, p in again}
         if not problem.rough:  # what breaks down there stays as it was
@@ -212,7 +212,7 @@ def _far(weighing: Weighing, behind: float) -> list[Posterior]:
     """Of what may still be told, modes that are far from where they were linearised."""
     leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)[:POLISHED]
     asked = (weighing.null, *_within(weighing, leading, behind))
-    return [p for p in asked if _moved(p, weighing.kappa)]
+    return [p for p in asked if _moved(weighing.data, p, weighing.kappa)]
 
 
 def _within(weighing: Weighing, found: Sequence[Posterior], behind: float) -> list[Posterior]:
@@ -243,9 +243,9 @@ def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
     return next(fit for fit, p in known if p.near is found.near)
 
 
-def _moved(found: Posterior, kappa: float) -> bool:
-    """Whether a mode is more than a standard deviation, which is worth kappa, from where its model was linearised."""
-    off = np.abs(found.mode.at - found.near.at)
+def _moved(data: Data, found: Posterior, kappa: float) -> bool:
+    """Whether what is told is more than a standard deviation, worth kappa, from where its model was linearised."""
+    off = np.abs(told(data, found).at - found.near.at)
     return bool((off > np.sqrt(kappa * np.diag(found.mode.covariance))).any())
 
 
