@@ -22,7 +22,7 @@ from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
-from torchsoro.sim2real.inference.verdict import _moved
+from torchsoro.sim2real.inference.verdict import _looked_at_again, _moved
 from torchsoro.sim2real.inference.visible import limit, remedies
 
 # Conclusions ---------------------------------------------------------------------------------------------------------
@@ -179,7 +179,7 @@ def test_where_no_model_is_right_trials_left_out_are_compared_by_size(wrong):
 
 
 def test_where_no_model_is_right_it_is_linearised_again_where_its_numbers_are_told():
-    data, _, drag = recorded(0.3, 16, effect=0.6)
+    data, nothing, drag = recorded(0.3, 16, effect=0.6)
     at = told(data, infer(data, drag)).at
     moved = dataclasses.replace(drag, at=at, residuals=drag.left(at))
     found, kappa = infer(data, moved), 0.25
@@ -187,6 +187,11 @@ def test_where_no_model_is_right_it_is_linearised_again_where_its_numbers_are_to
     assert (off > np.sqrt(kappa) * sigma).all()  # evidence would go on
     assert not _moved(data, found, kappa)
     assert _moved(data, infer(data, drag), kappa)
+    # Not there once more, as that would be the same simulation, whose evidence scatters by nothing.
+    nothing = infer(data, nothing)
+    for one, again in ((found, []), (infer(data, drag), [0])):
+        weighing = Weighing(data=data, nothing=(nothing,), effects=(one,), names=10)
+        assert _looked_at_again(weighing, np.inf, 1) == [(one,)[k] for k in again]
 
 
 def test_residuals_that_last_and_move_together_are_worth_few_values():

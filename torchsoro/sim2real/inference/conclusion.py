@@ -367,7 +367,7 @@ def _same(one: Posterior, other: Posterior) -> bool:
 
     They are if they are near by the narrower of them, or by what is noticeable: that of rough motions is too narrow.
     """
-    own = [*range(one.near.model.beliefs), *one.near.model.own]
+    own = one.near.model.simulated
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
     return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())

@@ -112,6 +112,11 @@ class Model:
         """Of the effects."""
         return " + ".join(sorted(self.effects)) or "nothing"
 
+    @property
+    def simulated(self) -> list[int]:
+        """Numbers of the unknowns that simulations depend on: beliefs, and those of the effects."""
+        return [*range(self.beliefs), *self.own]
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Linearised:

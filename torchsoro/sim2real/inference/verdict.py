@@ -29,6 +29,7 @@ HOPELESS = 40.0  # in ln evidence, behind the best: by more than that (up to 30)
 ROUNDS = 3  # of that, at most
 CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
+SAME_LOOK = 1e-3  # of a scale, by which all unknowns of two looks differ, below which they are one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -234,8 +235,11 @@ def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Pos
     if not _within(weighing, nothing[:1], behind):
         nothing = () if before else nothing[:1]  # what is left without an effect is shown in any case
     asked = [*nothing[:NOTHING], *_within(weighing, modes[: CLOSELY[before]], behind)]
-    # From where the last look leads, as the one in the middle has been followed before.
-    return [weighing.latest(p) for p in asked] if before else asked
+    if not before:
+        return asked
+    # From where the last look leads, as the one in the middle has been followed before; the same again tells nothing.
+    latest = [weighing.latest(p) for p in asked]
+    return [p for p in latest if _off(weighing.data, p)[p.near.model.simulated].max(initial=0.0) > SAME_LOOK]
 
 
 def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
@@ -245,8 +249,12 @@ def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
 
 def _moved(data: Data, found: Posterior, kappa: float) -> bool:
     """Whether what is told is more than a standard deviation, worth kappa, from where its model was linearised."""
-    off = np.abs(told(data, found).at - found.near.at)
-    return bool((off > np.sqrt(kappa * np.diag(found.mode.covariance))).any())
+    return bool((_off(data, found) > np.sqrt(kappa * np.diag(found.mode.covariance))).any())
+
+
+def _off(data: Data, found: Posterior) -> np.ndarray:
+    """How far what is told is from where its model was linearised [K]."""
+    return np.abs(told(data, found).at - found.near.at)
 
 
 def number(value: float, unit: str) -> str:
