@@ -301,20 +301,26 @@ def test_samples_that_count_as_few_numbers_tell_no_more_than_all_of_them():
     assert every > gained[1] > gained[2] > gained[3]
 
 
-def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_moves_the_body():
+@pytest.mark.parametrize("fits_the_error", [False, True])
+def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_moves_the_body(fits_the_error):
     data, nothing, drag = recorded(0.0, 7, effect=0.3)
     moved = size_of(tuple(0.3 * J[..., 0] for J in drag.slopes))
     numerics = TwinError(amplitude=np.full_like(data.amplitudes[0], 0.15 * moved))
     error = 0.15 * moved * np.sqrt(2) * np.sin(60 * data.trials[0].time)[:, None, None]
-    # What drag does a belief does as well, at eight deviations of its own.
+    # What drag does a belief does as well, at eight deviations of its own; the effect beside it does next to nothing,
+    # or what the twin errs by, so that evidence is for it.
     belief = Model(effects=("leak",), priors=(Prior(0.3 / 8), Prior(1.0)), own=(1,), beliefs=1)
-    other = tuple(np.concatenate([J, 1e-3 * np.ones_like(J)], -1) for J in drag.slopes)
+    own = error[..., None] if fits_the_error else np.array(1e-3)
+    other = tuple(np.concatenate([J, own * np.ones_like(J)], -1) for J in drag.slopes)
     leak = Linearised(model=belief, at=np.zeros(2), residuals=drag.residuals, slopes=other, numerics=numerics)
     models = [
         dataclasses.replace(m, residuals=tuple(r + error for r in m.residuals), numerics=numerics)
         for m in (nothing, drag, leak)
     ]
-    found = conclude(weighed(data, *models), limit=0.0)
+    weighing = weighed(data, *models)
+    evidence = {p.near.model.name: p.ln_evidence for p in weighing.effects}
+    assert (evidence["leak"] > evidence["drag"] + 30) == fits_the_error
+    found = conclude(weighing, limit=0.0)
     assert found.chosen == ("drag",)
     assert found.probabilities["leak"] < 0.02
 

@@ -19,7 +19,8 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
-name is as probable as it is at least, and at most as the first.
+name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs
+and measurement errors: that a stated number is off by many tolerances is improbable whatever the twin errs by.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
+    ln_strained,
     mode_of,
     products,
 )
@@ -263,10 +265,12 @@ class Weighing:
             name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
             for name, (p, *_) in self.groups.items()
         }
+        strained = {name: ln_strained(mode.near.model, mode.mode) for name, (mode, *_) in self.groups.items()}
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
-                ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], 0.0))
+                most = max(strained[name] - strained[first], 0.0)
+                ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], most))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 
