@@ -16,6 +16,8 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
 
     ln p = -N ln r - K/2 ln N.
 
+So it does between modes of one name, and in the comparison with nothing on trials that are left out.
+
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
