@@ -219,10 +219,7 @@ class Weighing:
 
     @cached_property
     def modes(self) -> tuple[Posterior, ...]:
-        """Distinct modes of all names, that first which counts first, as of names themselves.
-
-        The most probable; but of those that leave a discrepancy that matters none is right, and they go by its size.
-        """
+        """Distinct modes of all names: the most probable first, or where none is right, the one that leaves the least."""
         distinct = [self._one_of(looks) for looks in self._looks_at_effects]
         if self.best.matters:
             return tuple(sorted(distinct, key=lambda p: remainder(self.data, p)))
@@ -230,7 +227,7 @@ class Weighing:
 
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
-        """The same of each name."""
+        """The same of each name, in the order of their first ones."""
         found: dict[str, list[Posterior]] = {}
         for p in self.modes:
             found.setdefault(p.near.model.name, []).append(p)

@@ -23,11 +23,7 @@ def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tupl
         kappa: Of whose inverse the likelihood is taken to the power.
     """
     if one.matters:
-        left = [
-            [p.near.left(closest(data, p.near, but=i).at)[i] for p in (one, other)] for i in range(len(data.trials))
-        ]
-        size = np.array([[math.hypot(size_of((r,)), data.noise) for r in own] for own in left])
-        gain = np.array([independent((own[0],)) for own in left]) * np.log(size[:, 1] / size[:, 0])
+        gain = np.array([_gain_by_size(data, one, other, trial) for trial in range(len(data.trials))])
     else:
         gain = leave_one_out(data, one, kappa) - leave_one_out(data, other, kappa)
     n = len(gain)

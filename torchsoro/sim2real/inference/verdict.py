@@ -211,7 +211,7 @@ def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> li
 
 def _far(weighing: Weighing, behind: float) -> list[Posterior]:
     """Of what may still be told, modes that are far from where they were linearised."""
-    leading = sorted((modes[0] for modes in weighing.groups.values()), key=lambda p: -p.ln_evidence)[:POLISHED]
+    leading = [modes[0] for modes in weighing.groups.values()][:POLISHED]
     asked = (weighing.null, *_within(weighing, leading, behind))
     return [p for p in asked if _moved(weighing.data, p, weighing.kappa)]
 
@@ -229,12 +229,11 @@ def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Pos
     """
     if before > 1 and not weighing.scattered:
         return []
-    modes = sorted((p for own in weighing.groups.values() for p in own), key=lambda p: -p.ln_evidence)
     # At first, few effects have been looked at more than once, so that the best look at nothing counts, too.
     nothing = weighing.nulls if before else weighing.valleys
     if not _within(weighing, nothing[:1], behind):
         nothing = () if before else nothing[:1]  # what is left without an effect is shown in any case
-    asked = [*nothing[:NOTHING], *_within(weighing, modes[: CLOSELY[before]], behind)]
+    asked = [*nothing[:NOTHING], *_within(weighing, weighing.modes[: CLOSELY[before]], behind)]
     if not before:
         return asked
     # From where the last look leads, as the one in the middle has been followed before; the same again tells nothing.
