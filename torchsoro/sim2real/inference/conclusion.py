@@ -219,7 +219,7 @@ class Weighing:
 
     @cached_property
     def modes(self) -> tuple[Posterior, ...]:
-        """Distinct modes of all names: the most probable first, or the one that leaves the least where none is right."""
+        """Distinct modes of all names: the most probable first, or what leaves the least where none is right."""
         distinct = [self._one_of(looks) for looks in self._looks_at_effects]
         if self.best.matters:
             return tuple(sorted(distinct, key=lambda p: remainder(self.data, p)))
