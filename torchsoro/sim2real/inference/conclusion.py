@@ -21,8 +21,8 @@ So it does between modes of one name, and in the comparison with nothing on tria
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
-name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs
-and measurement errors: that a stated number is off by many tolerances is improbable whatever the twin errs by.
+name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
+that a stated number is off by many tolerances is improbable whatever the twin errs by.
 """
 
 from __future__ import annotations
@@ -41,7 +41,6 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
-    ln_strained,
     mode_of,
     products,
 )
@@ -264,11 +263,11 @@ class Weighing:
             name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
             for name, (p, *_) in self.groups.items()
         }
-        strained = {name: ln_strained(mode.near.model, mode.mode) for name, (mode, *_) in self.groups.items()}
+        stated = {name: _ln_stated(mode) for name, (mode, *_) in self.groups.items()}
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
-                most = max(strained[name] - strained[first], 0.0)
+                most = max(stated[name] - stated[first], 0.0)
                 ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], most))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
@@ -374,6 +373,14 @@ def _same(one: Posterior, other: Posterior) -> bool:
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
     return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())
+
+
+def _ln_stated(found: Posterior) -> float:
+    """Ln of the prior density of beliefs at a mode, over that at the stated numbers."""
+    model, at = found.near.model, found.mode.at
+    return sum(
+        p.ln_density(float(x)) - p.ln_density(0.0) for p, x in zip(model.priors[: model.beliefs], at, strict=False)
+    )
 
 
 def apart(one: Posterior, other: Posterior) -> float:

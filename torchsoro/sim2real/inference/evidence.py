@@ -309,7 +309,7 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     def again(branch: Branch) -> Branch:
         mode, model = branch.mode, found.near.model
         before, after = (_ln_own_occam(model, mode, k) for k in (1.0, kappa))
-        strained = ln_strained(model, mode)
+        strained = _ln_strained(model, mode)
         ln_evidence = (mode.ln_evidence - before - strained) / kappa + after + strained
         wider = mode_of(data, found.near, branch.discrepancy, kappa)
         return dataclasses.replace(branch, mode=dataclasses.replace(wider, ln_evidence=ln_evidence))
@@ -319,7 +319,7 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     return dataclasses.replace(found, some=again(found.some), none=again(found.none))
 
 
-def ln_strained(model: Model, mode: Mode) -> float:
+def _ln_strained(model: Model, mode: Mode) -> float:
     """Ln of the prior density of beliefs and measurement errors at a mode, over that at their most probable values."""
     others = (k for k in range(len(model.priors)) if k not in model.own)
     return sum(model.priors[k].ln_density(float(mode.at[k])) - model.priors[k].ln_density(0.0) for k in others)
