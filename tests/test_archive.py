@@ -14,7 +14,7 @@ import torch
 from tiny import TINY
 
 from torchsoro.design.domain import Domain
-from torchsoro.design.reading import read_settings
+from torchsoro.design.reading import lasting, read_settings
 from torchsoro.design.settings import Settings
 from torchsoro.output.archive import archive, load_design, load_shape, save_design
 from torchsoro.storage import plain_settings
@@ -243,3 +243,10 @@ def test_a_bad_value_in_the_file_is_refused_by_name(tmp_path):
     for name, value in (("gravity", -9.8), ("c_max", 0.3), ("duration", math.pi)):
         with pytest.raises(ValueError, match=name):
             read_settings(written(tmp_path / "settings.json", TINY, **{name: value}))
+
+
+def test_a_robot_that_is_watched_for_longer_has_room_to_walk():
+    short = Settings(device="cpu", duration=0.4, room=0.07)
+    assert (lasting(short, 2.0).duration, lasting(short, 2.0).room) == (2.0, 0.5)
+    assert lasting(short, 0.2).room == 0.07
+    assert lasting(Settings(device="cpu", duration=0.4, room=0.8), 2.0).room == 0.8

@@ -417,21 +417,25 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
     )
     service = tmp_path / "bin" / judge.ask.SHARING
     service.parent.mkdir()
-    service.write_text(f'#!/bin/sh\n[ "$1" = -d ] && echo start >> {tmp_path}/calls || cat >> {tmp_path}/calls\n')
+    calls = tmp_path / "calls"
+    service.write_text(
+        f'#!/bin/sh\n[ "$1" = -d ] && echo start${{CUDA_VISIBLE_DEVICES}} >> {calls} || cat >> {calls}\n'
+    )
     service.chmod(0o755)
     monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
     monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
+    monkeypatch.setattr(judge.ask, "SERVED", tmp_path / "none")
     command, answers = f"{sys.executable} {tool}", tmp_path / "answers"
     judge.ask.ask(tmp_path / "batch", answers=answers, tool=command, workers=4, gpus=2)
     told = [json.loads(path.read_text()) for path in sorted(answers.rglob("explanation.json"))]
     assert sorted(found["gpu"] for found in told) == ["3", "3", "5", "5"]
     assert len({found["pipe"] for found in told}) == 1
-    assert (tmp_path / "calls").read_text().split() == ["start", "quit"]
+    assert calls.read_text().split() == ["start", "quit"]
     order.unlink()
     monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "served already")
     judge.ask.ask(tmp_path / "batch", answers=tmp_path / "served", tool=command, workers=2, gpus=1)
-    assert (tmp_path / "calls").read_text().split() == ["start", "quit"]
+    assert calls.read_text().split() == ["start", "quit"]
     order.unlink()
     judge.ask.ask(tmp_path / "batch", answers=tmp_path / "one", tool=command, workers=1, gpus=1)
     assert order.read_text().split() == ["case-2", "case-1", "case-3", "case-0"]

@@ -32,6 +32,10 @@ SHARING = "nvidia-cuda-mps-control"
 """NVIDIA's multi-process service; without it the processes on a GPU take turns, and small kernels leave it idle."""
 
 
+SERVED = Path("/tmp/nvidia-mps/control")
+"""Where it is while somebody else's runs, unless told otherwise."""
+
+
 def _call(command: list[str], timeout: float, variables: dict[str, str]) -> str:
     """Run; returns what went wrong, or nothing."""
     surroundings = {**os.environ, **variables}
@@ -45,7 +49,7 @@ def _call(command: list[str], timeout: float, variables: dict[str, str]) -> str:
 @contextlib.contextmanager
 def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
     """The multi-process service, where several workers share a GPU; yields the variables by which they find it."""
-    served = "CUDA_MPS_PIPE_DIRECTORY" in os.environ or Path("/tmp/nvidia-mps/control").exists()
+    served = "CUDA_MPS_PIPE_DIRECTORY" in os.environ or SERVED.exists()
     if workers <= gpus or not gpus or served:
         yield {}
         return
@@ -53,32 +57,38 @@ def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
         print(f"{SHARING} is not installed: the workers on a GPU take turns, which is several times slower", flush=True)
         yield {}
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         variables = {"CUDA_MPS_PIPE_DIRECTORY": f"{folder}/pipe", "CUDA_MPS_LOG_DIRECTORY": f"{folder}/log"}
         surroundings = {**os.environ, **variables}
+        surroundings.pop("CUDA_VISIBLE_DEVICES", None)  # by which it would number the GPUs anew
         for name in variables.values():
             Path(name).mkdir()
         # A daemon keeps what it is given as its output, so that nobody may wait for the end of that.
-        subprocess.run(
-            [SHARING, "-d"], env=surroundings, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        begun = subprocess.run([SHARING, "-d"], env=surroundings, check=False, **quiet)
+        if begun.returncode:
+            print(f"{SHARING} -d: exit {begun.returncode}, so that the workers on a GPU take turns", flush=True)
+            yield {}
+            return
         try:
             yield variables
         finally:
-            subprocess.run([SHARING], input="quit\n", text=True, env=surroundings, check=False)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                subprocess.run([SHARING], input="quit\n", text=True, env=surroundings, check=False, timeout=60)
 
 
 def _devices(gpus: int, workers: int) -> list[str]:
     """Which GPU each of the workers uses, as ``CUDA_VISIBLE_DEVICES``; empty where the tool is left to choose."""
     if gpus < 0 or gpus > workers:
         raise ValueError(f"gpus = {gpus}: wanted 0 to workers = {workers}")
-    names = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(str(gpu) for gpu in range(gpus))).split(",")
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = [str(gpu) for gpu in range(gpus)] if given is None else [name for name in given.split(",") if name.strip()]
     if gpus > len(names):
-        raise ValueError(f"gpus = {gpus}: CUDA_VISIBLE_DEVICES = {','.join(names)} has {len(names)}")
+        raise ValueError(f"gpus = {gpus}: CUDA_VISIBLE_DEVICES = {given} has {len(names)}")
     return [names[worker % gpus] for worker in range(workers)] if gpus else [""] * workers
 
 
-def _long(case: Path) -> int:
+def _rank(case: Path) -> int:
     """How long an answer may take, by rank: a robot's mesh, a chamber and a plane each make it longer."""
     setup = (case / "setup.toml").read_text() if (case / "setup.toml").exists() else ""
     return ("[[plane]]" in setup) + ("[[chamber]]" in setup) + (case / "body.stl").exists()
@@ -153,13 +163,13 @@ def ask(
         SHA-256 over all answers.
 
     Raises:
-        ValueError: If the batch is none, or there are fewer workers or visible GPUs than ``gpus``.
+        ValueError: If the batch is none, or there are fewer workers than ``gpus``, or fewer in CUDA_VISIBLE_DEVICES.
     """
     if not (batch / "cases").is_dir():
         raise ValueError(f"batch = {batch}: wanted a folder with cases/, made by seal.py")
     cases = sorted((batch / "cases").iterdir())
     todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
-    todo.sort(key=_long, reverse=True)
+    todo.sort(key=_rank, reverse=True)
     free: queue.SimpleQueue[str] = queue.SimpleQueue()
     for device in _devices(gpus, workers):
         free.put(device)

@@ -16,7 +16,7 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
 
     ln p = -N ln r - K/2 ln N.
 
-So it does between modes of one name, and in the comparison with nothing on trials that are left out.
+So it does between modes of one name; and a name that leaves one is compared by sizes with nothing, on trials left out.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
@@ -44,7 +44,7 @@ from torchsoro.sim2real.inference.evidence import (
     mode_of,
     products,
 )
-from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within
+from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
 
@@ -98,7 +98,8 @@ class Conclusion:
         matters: Change of the motion that has to be seen [m].
         motion: Root mean square of the motion over markers and axes [m].
         partly: Whether the best candidate leaves a discrepancy that matters.
-        predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
+        predictive: Gain of the best candidate on trials left out, and its standard error, see
+            :func:`~torchsoro.sim2real.inference.confirmation.compared`.
         remedies: For "cannot_tell": what would make it tellable.
     """
 
@@ -224,6 +225,20 @@ class Weighing:
             return tuple(sorted(distinct, key=lambda p: remainder(self.data, p)))
         return tuple(sorted(distinct, key=lambda p: -p.ln_evidence))
 
+    @property
+    def leading(self) -> Posterior:
+        """The first of the modes with an effect where none is right, else the most probable of all."""
+        return self.modes[0] if self.best.matters and self.modes else self.best
+
+    def within_reach(self, found: Sequence[Posterior], behind: float) -> list[Posterior]:
+        """Of modes, those that another look may make what is told: no farther behind, in ln of evidence or of size."""
+        if not self.best.matters or not self.modes:
+            return [p for p in found if p.ln_evidence > self.best.ln_evidence - behind]
+        count = independent(self.modes[0].left)
+        size = {id(p): math.hypot(remainder(self.data, p), self.data.noise) for p in (*found, self.modes[0])}
+        least = size[id(self.modes[0])]
+        return [p for p in found if count * math.log(size[id(p)] / least) < behind]
+
     @cached_property
     def groups(self) -> dict[str, tuple[Posterior, ...]]:
         """The same of each name, in the order of their first ones."""
@@ -263,7 +278,7 @@ class Weighing:
             name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
             for name, (p, *_) in self.groups.items()
         }
-        stated = {name: _ln_stated(mode) for name, (mode, *_) in self.groups.items()}
+        stated = {name: _ln_stated(self.data, mode) for name, (mode, *_) in self.groups.items()}
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
@@ -375,12 +390,11 @@ def _same(one: Posterior, other: Posterior) -> bool:
     return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())
 
 
-def _ln_stated(found: Posterior) -> float:
-    """Ln of the prior density of beliefs at a mode, over that at the stated numbers."""
-    model, at = found.near.model, found.mode.at
-    return sum(
-        p.ln_density(float(x)) - p.ln_density(0.0) for p, x in zip(model.priors[: model.beliefs], at, strict=False)
-    )
+def _ln_stated(data: Data, found: Posterior) -> float:
+    """Ln of the prior density of beliefs as they are told, over that at the stated numbers."""
+    at, count = told(data, found).at, found.near.model.beliefs
+    priors = found.near.model.priors[:count]
+    return sum(p.ln_density(float(x)) - p.ln_density(0.0) for p, x in zip(priors, at[:count], strict=True))
 
 
 def apart(one: Posterior, other: Posterior) -> float:
@@ -416,9 +430,9 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
     # What does not matter is nothing; what leaves much, more than noise and than the twin may err, is not missing.
-    told = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
-    told[NOTHING] = probabilities[NOTHING]
-    told[UNKNOWN] = probabilities[UNKNOWN]
+    shares = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
+    shares[NOTHING] = probabilities[NOTHING]
+    shares[UNKNOWN] = probabilities[UNKNOWN]
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
     faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
     for c in candidates:
@@ -431,21 +445,21 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
             if apart(c.best, d.best) < (least if sure else tells):
                 plain.append(d)
         if c.size < tells:
-            told[NOTHING] += c.probability
+            shares[NOTHING] += c.probability
         elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
-            told[UNKNOWN] += c.probability
+            shares[UNKNOWN] += c.probability
         elif c.left > max(c.size, c.best.near.numerics.size):
             # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.
-            told[UNKNOWN if left > data.noise else NOTHING] += c.probability
+            shares[UNKNOWN if left > data.noise else NOTHING] += c.probability
         elif plain:
             name = max(plain, key=lambda d: d.ln_evidence).name
-            told[name] = told.get(name, 0.0) + c.probability
+            shares[name] = shares.get(name, 0.0) + c.probability
         else:
-            told[c.name] = told.get(c.name, 0.0) + c.probability
+            shares[c.name] = shares.get(c.name, 0.0) + c.probability
     chosen: list[str] = []
-    for name in sorted(told, key=lambda name: -told[name]):
+    for name in sorted(shares, key=lambda name: -shares[name]):
         chosen.append(name)
-        if sum(told[n] for n in chosen) >= CREDIBLE:
+        if sum(shares[n] for n in chosen) >= CREDIBLE:
             break
     predictive = (0.0, math.inf)
     first = next((c for c in candidates if c.name == chosen[0]), None)
@@ -462,7 +476,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     return Conclusion(
         kind=kind,
         chosen=tuple(n for n in chosen if n not in (NOTHING, UNKNOWN)),
-        probabilities=told,
+        probabilities=shares,
         candidates=tuple(candidates),
         nothing=null,
         left=left,

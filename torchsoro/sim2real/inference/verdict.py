@@ -29,7 +29,7 @@ HOPELESS = 40.0  # in ln evidence, behind the best: by more than that (up to 30)
 ROUNDS = 3  # of that, at most
 CLOSELY = (6, 3, 3)  # of rough motions, modes with an effect that are looked at closely, round by round
 NOTHING = 2  # modes without an effect beside them
-SAME_LOOK = 1e-3  # of a scale, by which all unknowns of two looks differ, below which they are one
+SAME_LOOK = 1e-3  # of a scale: looks whose simulated unknowns all differ by less are one
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -146,7 +146,7 @@ def weighed(
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     known = weigh(problem, [null_model, *strained, *_as_beliefs(problem, null_model, ends), *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
-    best = weighing.best
+    best = weighing.leading
     leading = at_mode(problem, _fit_of(known, best), told(data, best))
     moved = {}
     if problem.touches and not problem.rough and best.near.model.effects:
@@ -212,13 +212,8 @@ def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> li
 def _far(weighing: Weighing, behind: float) -> list[Posterior]:
     """Of what may still be told, modes that are far from where they were linearised."""
     leading = [modes[0] for modes in weighing.groups.values()][:POLISHED]
-    asked = (weighing.null, *_within(weighing, leading, behind))
+    asked = (weighing.null, *weighing.within_reach(leading, behind))
     return [p for p in asked if _moved(weighing.data, p, weighing.kappa)]
-
-
-def _within(weighing: Weighing, found: Sequence[Posterior], behind: float) -> list[Posterior]:
-    """Modes that are so far behind the best at most, which another look may make what is told."""
-    return [p for p in found if p.ln_evidence > weighing.best.ln_evidence - behind]
 
 
 def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Posterior]:
@@ -231,9 +226,11 @@ def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Pos
         return []
     # At first, few effects have been looked at more than once, so that the best look at nothing counts, too.
     nothing = weighing.nulls if before else weighing.valleys
-    if not _within(weighing, nothing[:1], behind):
+    if not weighing.within_reach(nothing[:1], behind):
         nothing = () if before else nothing[:1]  # what is left without an effect is shown in any case
-    asked = [*nothing[:NOTHING], *_within(weighing, weighing.modes[: CLOSELY[before]], behind)]
+    asked = [*nothing[:NOTHING], *weighing.within_reach(weighing.modes[: CLOSELY[before]], behind)]
+    if weighing.best.near.model.effects and weighing.best not in asked:
+        asked.append(weighing.best)  # which says whether sizes decide
     if not before:
         return asked
     # From where the last look leads, as the one in the middle has been followed before; the same again tells nothing.
@@ -252,7 +249,7 @@ def _moved(data: Data, found: Posterior, kappa: float) -> bool:
 
 
 def _off(data: Data, found: Posterior) -> np.ndarray:
-    """How far what is told is from where its model was linearised [K]."""
+    """How far what is told is from where its model was linearised, by unknown."""
     return np.abs(told(data, found).at - found.near.at)
 
 
