@@ -64,8 +64,9 @@ def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
         for name in variables.values():
             Path(name).mkdir()
         # A daemon keeps what it is given as its output, so that nobody may wait for the end of that.
-        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        begun = subprocess.run([SHARING, "-d"], env=surroundings, check=False, **quiet)
+        begun = subprocess.run(
+            [SHARING, "-d"], env=surroundings, check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         if begun.returncode:
             print(f"{SHARING} -d: exit {begun.returncode}, so that the workers on a GPU take turns", flush=True)
             yield {}

@@ -16,7 +16,7 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
 
     ln p = -N ln r - K/2 ln N.
 
-So it does between modes of one name; and a name that leaves one is compared by sizes with nothing, on trials left out.
+So it does between modes of one name.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
@@ -98,8 +98,7 @@ class Conclusion:
         matters: Change of the motion that has to be seen [m].
         motion: Root mean square of the motion over markers and axes [m].
         partly: Whether the best candidate leaves a discrepancy that matters.
-        predictive: Gain of the best candidate on trials left out, and its standard error, see
-            :func:`~torchsoro.sim2real.inference.confirmation.compared`.
+        predictive: Gain of the best candidate in ln predictive density of trials left out, and its standard error.
         remedies: For "cannot_tell": what would make it tellable.
     """
 
