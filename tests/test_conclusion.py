@@ -9,13 +9,13 @@ import pytest
 from swings import EXACT, draws, recorded
 
 from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude, remainder
-from torchsoro.sim2real.inference.confirmation import compared
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
     Linearised,
     Model,
     TwinError,
+    compared,
     infer,
 )
 from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told

@@ -31,7 +31,6 @@ from tqdm import tqdm
 SHARING = "nvidia-cuda-mps-control"
 """NVIDIA's multi-process service; without it the processes on a GPU take turns, and small kernels leave it idle."""
 
-
 SERVED = Path("/tmp/nvidia-mps/control")
 """Where it is while somebody else's runs, unless told otherwise."""
 
@@ -91,7 +90,7 @@ def _devices(gpus: int, workers: int) -> list[str]:
 
 def _rank(case: Path) -> int:
     """How long an answer may take, by rank: a robot's mesh, a chamber and a plane each make it longer."""
-    setup = (case / "setup.toml").read_text() if (case / "setup.toml").exists() else ""
+    setup = (case / "setup.toml").read_text()
     return ("[[plane]]" in setup) + ("[[chamber]]" in setup) + (case / "body.stl").exists()
 
 

@@ -35,12 +35,13 @@ from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.confirmation import compared
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Model,
     Posterior,
     adjusted,
+    compared,
+    ln_strained,
     mode_of,
     products,
 )
@@ -277,7 +278,10 @@ class Weighing:
             name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
             for name, (p, *_) in self.groups.items()
         }
-        stated = {name: _ln_stated(self.data, mode) for name, (mode, *_) in self.groups.items()}
+        stated = {
+            name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
+            for name, (mode, *_) in self.groups.items()
+        }
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
@@ -387,13 +391,6 @@ def _same(one: Posterior, other: Posterior) -> bool:
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
     return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())
-
-
-def _ln_stated(data: Data, found: Posterior) -> float:
-    """Ln of the prior density of beliefs as they are told, over that at the stated numbers."""
-    at, count = told(data, found).at, found.near.model.beliefs
-    priors = found.near.model.priors[:count]
-    return sum(p.ln_density(float(x)) - p.ln_density(0.0) for p, x in zip(priors, at[:count], strict=True))
 
 
 def apart(one: Posterior, other: Posterior) -> float:

@@ -309,7 +309,7 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     def again(branch: Branch) -> Branch:
         mode, model = branch.mode, found.near.model
         before, after = (_ln_own_occam(model, mode, k) for k in (1.0, kappa))
-        strained = _ln_strained(model, mode)
+        strained = ln_strained(model, mode.at, (k for k in range(len(model.priors)) if k not in model.own))
         ln_evidence = (mode.ln_evidence - before - strained) / kappa + after + strained
         wider = mode_of(data, found.near, branch.discrepancy, kappa)
         return dataclasses.replace(branch, mode=dataclasses.replace(wider, ln_evidence=ln_evidence))
@@ -319,10 +319,9 @@ def adjusted(data: Data, found: Posterior, kappa: float) -> Posterior:
     return dataclasses.replace(found, some=again(found.some), none=again(found.none))
 
 
-def _ln_strained(model: Model, mode: Mode) -> float:
-    """Ln of the prior density of beliefs and measurement errors at a mode, over that at their most probable values."""
-    others = (k for k in range(len(model.priors)) if k not in model.own)
-    return sum(model.priors[k].ln_density(float(mode.at[k])) - model.priors[k].ln_density(0.0) for k in others)
+def ln_strained(model: Model, at: np.ndarray, unknowns: Iterable[int]) -> float:
+    """Ln of the prior density of some unknowns at a point [K], over that at their most probable values."""
+    return sum(model.priors[k].ln_density(float(at[k])) - model.priors[k].ln_density(0.0) for k in unknowns)
 
 
 def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
@@ -446,3 +445,20 @@ def leave_one_out(data: Data, found: Posterior, kappa: float = 1.0) -> np.ndarra
         return posterior(total(of), near.at, near.model.priors).ln_evidence if of else 0.0
 
     return np.array([ln_z(parts) - ln_z(parts[:i] + parts[i + 1 :]) for i in range(len(parts))])
+
+
+def compared(data: Data, one: Posterior, other: Posterior, kappa: float) -> tuple[float, float]:
+    """Gain in ln predictive density of trials left out, and its standard error over trials.
+
+    By density even where sizes decide between names: what the other trials leave unknown widens it, while numbers that
+    they do not tell would leave much of the trial by their size.
+
+    Args:
+        data: Recordings.
+        one: The one that may be better.
+        other: The other.
+        kappa: Of whose inverse the likelihood is taken to the power.
+    """
+    gain = leave_one_out(data, one, kappa) - leave_one_out(data, other, kappa)
+    n = len(gain)
+    return float(gain.sum()), float(math.sqrt(n * gain.var(ddof=1))) if n > 1 else math.inf
