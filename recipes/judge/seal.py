@@ -266,6 +266,7 @@ def seal(
     bodies: tuple[Body, ...] = FORMER,
     seed: int | None = None,
     seed_from_os: bool = False,
+    only: tuple[Body, ...] = (),
     processes: int = 2,
     finer: float = 1.0,
     finish: bool = False,
@@ -282,12 +283,17 @@ def seal(
         bodies: Specimens to draw from.
         seed: Of all draws.
         seed_from_os: Take the seed from the operating system; it is kept in the sealed file only.
+        only: Make the cases of these bodies now and leave the others to a later call, on another machine for
+            instance, to which ``sealed/seed.json`` is copied: a case hangs on the seed and its number alone.
         processes: That work side by side.
         finer: Divides the elements' edge; below 1 for a quick look.
         finish: Make no more cases, write the truth of those that are there.
 
     Returns:
-        SHA-256 of truth.sealed.
+        SHA-256 of truth.sealed, or nothing while cases are left to be made.
+
+    Raises:
+        ValueError: If the folder holds a batch with other settings, or a new batch gets no seed.
     """
     counts = (effects, nulls, pairs, outside)
     fresh = secrets.randbits(63) if seed_from_os and not (out / "sealed" / "seed.json").exists() else seed
@@ -303,6 +309,8 @@ def seal(
     if finish:
         unmade = {plan.name for plan, *_ in jobs}
         todo, jobs = [plan for plan in todo if plan.name not in unmade], []
+    left = [job for job in jobs if only and job[0].specimen not in only]
+    jobs = [job for job in jobs if job not in left]
     # What lasts longest is begun first, so that no process is left alone with it.
     slow = sorted({job[0].specimen for job in jobs}, key=lambda name: -_lasting(name, finer))
     jobs.sort(key=lambda job: slow.index(job[0].specimen))
@@ -317,6 +325,9 @@ def seal(
     else:
         for line in itertools.chain(map(_simulate, expected), map(_work, jobs)):
             print(line, flush=True)
+    if left:
+        print(f"{len(left)} cases of other bodies are left to be made; the truth is sealed when all are there")
+        return ""
     truths = [json.loads((out / "sealed" / f"{plan.name}.json").read_text()) for plan in todo]
     held = {
         str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest()
