@@ -182,6 +182,7 @@ def weighed(
         )
         for c in found.candidates
     ]
+    ranking.sort(key=lambda c: -c.probability)  # in the order of evidence where they are alike
     by_name = {c.name: c for c in ranking}
     for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1]):
         report(f"{name}: probability {probability:.3g}" + (f", {tell(by_name[name].fit)}" if name in by_name else ""))

@@ -244,7 +244,7 @@ def _considered(page: Document, e: Explanation) -> None:
         {
             "effect": candidate_words(x, e.problem),
             "probability": probability(x.probability),
-            "ln evidence": round(x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence, 1),
+            "ln evidence": f"{x.posterior.ln_evidence - e.verdict.ranking[0].posterior.ln_evidence:.1f}",
             "changes the motion by [mm]": float(digits(1e3 * x.size)),
             "leaves [mm]": float(digits(1e3 * x.left)),
         }
@@ -254,10 +254,11 @@ def _considered(page: Document, e: Explanation) -> None:
         page.section("What was considered")
         page.table(
             rows,
-            "Ln evidence: of the recordings under each, over the most probable. Leaves: root mean square of the "
-            "least that it leaves of the difference beyond noise and the simulation's own error; an effect that leaves "
-            "more than a fifth of it, and more than the noise, counts as none of the known ones, and one that changes "
-            "the motion by less than matters as nothing.",
+            "Ln evidence: of the recordings under each, over that of the first row. Leaves: root mean square of the "
+            "least that it leaves of the difference beyond noise and the simulation's own error. The probability of an "
+            "effect that leaves more than a fifth of it, and more than the noise, is given to none of the known ones, "
+            "that of one that changes the motion by less than matters to nothing, and that of an effect that holds a "
+            "simpler one, and moves the body no otherwise by more than matters, to the simpler one.",
         )
 
 
