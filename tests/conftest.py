@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 # Here and in processes that tests start: what is small gains nothing by threads, and two processes share two cores.
@@ -107,3 +108,15 @@ def straight(recipes, tmp_path_factory) -> tuple[Path, dict[str, float]]:
 def made(tmp_path_factory):
     """A bar's twin, and a function that makes recordings of it."""
     return bar(tmp_path_factory.mktemp("bar"))
+
+
+@pytest.fixture(scope="module")
+def judge() -> Iterator[SimpleNamespace]:
+    """The programs of the judge, as modules by name."""
+    pytest.importorskip("numba")
+    folder = RECIPES / "judge"
+    sys.path.insert(0, str(folder))
+    try:
+        yield SimpleNamespace(**{p.stem: importlib.import_module(p.stem) for p in sorted(folder.glob("*.py"))})
+    finally:
+        sys.path.remove(str(folder))

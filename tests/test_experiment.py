@@ -194,6 +194,18 @@ def test_a_trial_with_another_body_is_refused(tmp_path):
         read_experiment(folder)
 
 
+def test_a_trial_with_other_chambers_is_refused(tmp_path):
+    chamber = '[[chamber]]\nname = "air"\nbox = [[0.01, 0.005, 0.005], [{}, 0.015, 0.015]]\nair_stiffness = {}\n'
+    folder = experiment(tmp_path, SETUP + chamber.format(0.03, 0.0))
+    (folder / "trials" / "a" / "pressure.csv").write_text("time_s,air_pa\n0,0\n0.1,1000\n")
+    own = folder / "trials" / "a" / "trial.toml"
+    own.write_text(chamber.format(0.03, 5e3))
+    assert read_experiment(folder).trials[0].setup.chambers[0].air_stiffness == 5e3
+    own.write_text(chamber.format(0.025, 0.0))
+    with pytest.raises(ValueError, match=r"trial\.toml: other names or boxes in \[\[chamber\]\], wanted those of"):
+        read_experiment(folder)
+
+
 def test_a_pressure_without_a_chamber_is_refused(tmp_path):
     folder = experiment(tmp_path)
     (folder / "trials" / "a" / "pressure.csv").write_text("time_s,c_pa\n0,0\n0.1,0\n")

@@ -175,9 +175,29 @@ def test_probabilities_are_told_in_percent_and_never_as_certain():
 def test_a_set_of_one_name_and_what_is_unknown_says_so(monkeypatch):
     monkeypatch.setattr(sentences, "candidate_words", lambda candidate, problem: candidate)
 
-    def said(*chosen):
-        verdict = SimpleNamespace(kind="cannot_distinguish", chosen=chosen, conclusion=SimpleNamespace(partly=False))
+    def said(*chosen, kind="cannot_distinguish", credible=()):
+        conclusion = SimpleNamespace(partly=False, credible=credible)
+        verdict = SimpleNamespace(kind=kind, chosen=chosen, conclusion=conclusion)
         return sentences.verdict_sentence(SimpleNamespace(verdict=verdict, problem=None))
 
-    assert "a lag; a leak" in said("a lag", "a leak")
+    assert said("a lag", "a leak").endswith("by which: a lag; a leak.")
     assert "none of the known effects" in said("a lag")
+    assert "a leak; or none of the known effects" in said("a lag", "a leak", credible=("a lag", "unknown", "a leak"))
+    assert said(kind="unknown_physics", credible=("unknown",)).endswith("none of the known effects.")
+    both = said(kind="unknown_physics", credible=("unknown", "drag"))
+    assert "Most probably" in both and both.endswith("drag of the surrounding fluid is not excluded.")
+
+
+def test_why_an_effect_that_fits_is_not_told(still):
+    problem, null_model = still
+    found = weighed(problem, [effect("drag"), effect("density")], null_model, [], report=quiet)
+    for credible, reason in (
+        (("drag", "nothing"), "nothing is missing is not excluded"),
+        (("drag",), "no better with it"),
+    ):
+        seen = dataclasses.replace(found.conclusion, kind="cannot_tell", chosen=("drag",), credible=credible)
+        told = evidence(explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=seen)))
+        assert any("It may be drag of the surrounding fluid" in s and reason in s for s in told)
+    blind = dataclasses.replace(found.conclusion, kind="cannot_tell", chosen=(), limit=math.inf, matters=1e-3)
+    told = evidence(explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=blind)))
+    assert "No effect would have been seen, however large." in told

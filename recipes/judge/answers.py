@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from experiment import Recording
 
+SHORT = 0.01  # s, by which a prediction may begin later or end earlier than the trial: clocks differ by 8 ms
+VERDICTS = ("explained", "cannot_distinguish", "nothing_missing", "cannot_tell", "unknown_physics")
+
 
 @dataclass(frozen=True, kw_only=True)
 class Scored:
@@ -24,7 +27,7 @@ class Scored:
         strength: Of the effect over the noise.
         length: Of the body [m].
         truth: Names that were put in.
-        verdict: Of the answer; "missing" without one.
+        verdict: Of the answer; "missing" without one, "failed" if it cannot be read or is none of those there are.
         names: That it commits to.
         set: Names that it cannot tell apart, those it commits to included.
         unknown: Whether it says that something is missing which it does not know.
@@ -85,19 +88,22 @@ def _told(answer: Mapping[str, Any]) -> float | None:
 
 
 def _sealed(truth: Mapping[str, Any], folder: Path, batch: Path) -> float | None:
-    """Root mean square distance of the sealed trial as it was predicted [m]."""
-    path = folder / "predicted.csv"
-    if not path.exists():
-        return None
+    """Root mean square distance of the sealed trial as it was predicted [m]; None if it was not, or not as a whole."""
     clean = Recording.read(batch / "sealed" / truth["case"] / "clean.csv")
-    guess = Recording.read(path)
-    if guess.names != clean.names or guess.axes not in ("xyz", "xz"):
+    try:
+        guess = Recording.read(folder / "predicted.csv")
+    except (OSError, ValueError, IndexError):
         return None
-    chosen = ["xyz".index(a) for a in guess.axes]
-    inside = (clean.time >= guess.time[0]) & (clean.time <= guess.time[-1])
-    flat = guess.value.reshape(len(guess.time), -1)
-    at = np.stack([np.interp(clean.time[inside], guess.time, column) for column in flat.T], 1)
-    gap = at - clean.value[inside][..., chosen].reshape(len(at), -1)
+    axes = truth.get("axes", guess.axes)  # batches up to the sixteenth do not say in which the belief was compared
+    if not {*clean.names} <= {*guess.names} or not axes or not {*axes} <= {*guess.axes}:
+        return None
+    markers, columns = [guess.names.index(n) for n in clean.names], [guess.axes.index(a) for a in axes]
+    place = guess.value[:, markers][..., columns].reshape(len(guess.time), -1)
+    whole = guess.time[0] <= clean.time[0] + SHORT and guess.time[-1] >= clean.time[-1] - SHORT
+    if not whole or not np.isfinite(place).all() or not (np.diff(guess.time) > 0).all():
+        return None
+    at = np.stack([np.interp(clean.time, guess.time, column) for column in place.T], 1)
+    gap = at - clean.value[..., ["xyz".index(a) for a in axes]].reshape(len(at), -1)
     return float(np.sqrt(np.mean(gap**2)))
 
 
@@ -129,15 +135,31 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
     path = folder / truth["case"] / "explanation.json"
     if not path.exists():
         return Scored(**common, verdict="missing")
-    answer = json.loads(path.read_text())
+    try:
+        return _read(truth, json.loads(path.read_text()), folder, batch, words, common)
+    except (AttributeError, KeyError, TypeError, ValueError):  # of another form than was asked for
+        return Scored(**common, verdict="failed")
+
+
+def _read(
+    truth: Mapping[str, Any],
+    answer: Mapping[str, Any],
+    folder: Path,
+    batch: Path,
+    words: Mapping[str, Any],
+    common: Mapping[str, Any],
+) -> Scored:
+    """An answer of the form that was asked for; see :func:`match`."""
     effects = words.get("effects", {})
+    put = common["truth"]
 
-    def ours(name: str) -> str:
-        return effects.get(name, name)
+    def ours(name: str) -> list[str]:
+        return [effects.get(part, part) for part in name.split(" + ")]
 
-    verdict = str(answer.get("verdict", "failed"))
-    named = {ours(e["name"]): e for e in answer.get("effects") or []}
-    listed = [ours(n if isinstance(n, str) else n["name"]) for n in answer.get("set") or []]
+    verdict = answer.get("verdict") if answer.get("verdict") in VERDICTS else "failed"
+    named = {effects.get(e["name"], e["name"]): e for e in answer.get("effects") or []}
+    told = [n if isinstance(n, str) else n["name"] for n in answer.get("set") or []]
+    listed = [part for name in told for part in ours(name)]
     group: tuple[str, ...] = ()
     if verdict == "explained":
         group = tuple(dict.fromkeys([*named, *listed]))
@@ -176,7 +198,7 @@ def match(truth: Mapping[str, Any], folder: Path, batch: Path, words: Mapping[st
         place_error=min((math.dist(p, s) for p in places for s in sites), default=None),
         parameter_errors=tuple(errors),
         covered=tuple(covered),
-        likely=ours(likely),
+        likely=" + ".join(sorted(ours(likely))),
         probability=float(probabilities[likely]),
         told_ratio=_told(answer),
         sealed_ratio=None if sealed is None else 1e3 * sealed / truth["believed_heldout_rms_mm"],

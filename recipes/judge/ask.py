@@ -18,8 +18,10 @@ import os
 import queue
 import shlex
 import shutil
+import signal
 import subprocess
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,14 +37,49 @@ SERVED = Path("/tmp/nvidia-mps/control")
 """Where it is while somebody else's runs, unless told otherwise."""
 
 
+STOPPED = threading.Event()
+"""Set once a run is interrupted: what the tools have not answered by then is asked for the next time."""
+
+
+class Interrupted(Exception):
+    """The run ends before this case has its answer."""
+
+
 def _call(command: list[str], timeout: float, variables: dict[str, str]) -> str:
-    """Run; returns what went wrong, or nothing."""
-    surroundings = {**os.environ, **variables}
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False, env=surroundings)
-    except subprocess.TimeoutExpired:
+    """Run; returns what went wrong, or nothing.
+
+    Raises:
+        Interrupted: if the run ends before the command does.
+    """
+    surroundings, end = {**os.environ, **variables}, time.monotonic() + timeout
+    # In a session of its own: Ctrl-C is no answer of the tool, and what it starts ends with it.
+    tool = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=surroundings, start_new_session=True
+    )
+    while True:
+        try:
+            said, wrong = tool.communicate(timeout=min(1.0, max(end - time.monotonic(), 0.01)))
+            return "" if tool.returncode == 0 else f"exit {tool.returncode}: {(wrong or said)[-800:]}"
+        except subprocess.TimeoutExpired:
+            if not STOPPED.is_set() and time.monotonic() < end:
+                continue
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(tool.pid, signal.SIGKILL)
+        tool.communicate()
+        if STOPPED.is_set():
+            raise Interrupted
         return f"took more than {timeout:.0f} s"
-    return "" if done.returncode == 0 else f"exit {done.returncode}: {(done.stderr or done.stdout)[-800:]}"
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """An explanation, or the verdict "failed" with what is wrong with it."""
+    try:
+        found = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        return {"verdict": "failed", "error": f"explanation.json: {error}", "effects": []}
+    if not isinstance(found, dict) or not isinstance(found.get("verdict"), str):
+        return {"verdict": "failed", "error": "explanation.json: without a verdict", "effects": []}
+    return found
 
 
 @contextlib.contextmanager
@@ -102,19 +139,20 @@ def answer(
     extra: list[str],
     variables: dict[str, str] | None = None,
 ) -> dict[str, Any]:
-    """One case; returns its explanation, or the verdict "failed" with the reason."""
+    """One case; returns its explanation, or the verdict "failed" with the reason.
+
+    Raises:
+        Interrupted: if the run ends before; nothing is kept of the answer then.
+    """
     variables = variables or {}
     with tempfile.TemporaryDirectory() as folder:
         copy, out = Path(folder) / case.name, Path(folder) / "answer"
         shutil.copytree(case, copy)
         started = time.perf_counter()
         wrong = _call([*tool, str(copy), "--out", str(out), *extra], timeout, variables)
-        path = out / "explanation.json"
-        if not wrong and not path.exists():
-            wrong = "wrote no explanation.json"
         found: dict[str, Any] = {"verdict": "failed", "error": wrong, "effects": []}
         if not wrong:
-            found = json.loads(path.read_text())
+            found = _read(out / "explanation.json")
         found["judge_seconds"] = time.perf_counter() - started
         target = answers / case.name
         part = answers / f"{case.name}.part"
@@ -163,10 +201,14 @@ def ask(
         SHA-256 over all answers.
 
     Raises:
-        ValueError: If the batch is none, or there are fewer workers than ``gpus``, or fewer in CUDA_VISIBLE_DEVICES.
+        ValueError: If the batch is none, the tool is no program, or there are fewer workers than ``gpus``, or fewer in
+            CUDA_VISIBLE_DEVICES.
     """
+    STOPPED.clear()
     if not (batch / "cases").is_dir():
         raise ValueError(f"batch = {batch}: wanted a folder with cases/, made by seal.py")
+    if not (command := shlex.split(tool)) or shutil.which(command[0]) is None:
+        raise ValueError(f"tool = {tool!r}: wanted a command line that begins with a program")
     cases = sorted((batch / "cases").iterdir())
     todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
     todo.sort(key=_rank, reverse=True)
@@ -181,17 +223,22 @@ def ask(
             device = free.get()
             variables = {**sharing, **({"CUDA_VISIBLE_DEVICES": device} if device else {})}
             try:
-                return answer(case, shlex.split(tool), answers, timeout, shlex.split(extra), variables)
+                return answer(case, command, answers, timeout, shlex.split(extra), variables)
             finally:
                 free.put(device)
 
         jobs = {pool.submit(answered, case): case.name for case in todo}
         with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
-            for job in concurrent.futures.as_completed(jobs):
-                found = job.result()
-                reason = f" ({found['error'][:200]})" if found["verdict"] == "failed" else ""
-                bar.write(f"{jobs[job]}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
-                bar.update()
+            try:
+                for job in concurrent.futures.as_completed(jobs):
+                    found = job.result()
+                    reason = f" ({found.get('error', '')[:200]})" if found["verdict"] == "failed" else ""
+                    bar.write(f"{jobs[job]}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
+                    bar.update()
+            except BaseException:
+                STOPPED.set()
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
         for path in sorted(answers.rglob("*"))
@@ -205,4 +252,5 @@ def ask(
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # as by Ctrl-C: the tools and NVIDIA's service are ended
     tyro.cli(ask)

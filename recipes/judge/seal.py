@@ -159,6 +159,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     for trial, moved, still in zip(specimen.trials, runs, plain, strict=True):
         told, _ = instants(specimen, errors, trial.name)
         record = film(specimen, errors, told, moved[:, :count], rng)
+        axes = ["xyz".index(a) for a in record.axes]
         place = folder / ("heldout" if trial.held_out else "trials") / trial.name
         trial.write(place)
         record.write((kept if trial.held_out else place) / "markers.csv")
@@ -169,8 +170,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
             if not trial.tables:
                 (place / "trial.toml").write_text("# as in setup.toml\n")
             guess = believed_motion(plan.specimen, len(specimen.trials) - 1, World(), finer, common)(true)
-            believed = np.sqrt(np.mean((guess - moved[:, count:]) ** 2))
-        axes = ["xyz".index(a) for a in record.axes]
+            believed = np.sqrt(np.mean((guess - moved[:, count:])[..., axes] ** 2))
         effect = float(np.sqrt(np.mean((moved - still)[:, :count, axes] ** 2)))
         trials[trial.name] = {
             "held_out": trial.held_out,
@@ -196,6 +196,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
         "kind": plan.kind,
         "specimen": plan.specimen,
         "body_length_m": specimen.length,
+        "axes": "".join(specimen.setup["recording"].get("axes", "xyz")),
         "effects": [e.table() for e in drawn],
         "expected_verdict": {"null": "nothing_missing", "decoy": "nothing_missing", "outside": "unknown_physics"}.get(
             plan.kind, "explained"
@@ -293,8 +294,10 @@ def seal(
         SHA-256 of truth.sealed, or nothing while cases are left to be made.
 
     Raises:
-        ValueError: If the folder holds a batch with other settings, or a new batch gets no seed.
+        ValueError: If the folder holds a batch with other settings, or a new batch gets no seed, or two.
     """
+    if seed is not None and seed_from_os:
+        raise ValueError(f"seed = {seed}: also seed_from_os, wanted one of the two")
     counts = (effects, nulls, pairs, outside)
     fresh = secrets.randbits(63) if seed_from_os and not (out / "sealed" / "seed.json").exists() else seed
     kept = _wanted(out, batch, fresh, counts, finer, bodies)
@@ -329,9 +332,12 @@ def seal(
         print(f"{len(left)} cases of other bodies are left to be made; the truth is sealed when all are there")
         return ""
     truths = [json.loads((out / "sealed" / f"{plan.name}.json").read_text()) for plan in todo]
+    for truth in truths:
+        truth.pop("seconds", None)  # by which no two makings would have the same hash
     held = {
         str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for folder in ("cases", "sealed") for plan in todo for p in sorted((out / folder / plan.name).rglob("*.csv"))
+        for folder in ("cases", "sealed") for plan in todo for p in sorted((out / folder / plan.name).rglob("*"))
+        if p.is_file()
     }  # fmt: skip
     text = json.dumps({**kept, "cases": truths, "files": held}, indent=1)
     (out / "truth.sealed").write_text(text)

@@ -186,6 +186,10 @@ def read_trial(folder: Path, tables: Mapping[str, Any], file: Path) -> Trial:
     if other := [name for name in WHOLE if name in changed]:
         raise ValueError(f"{own}: table {', '.join(other)}, wanted the same in all trials, in setup.toml only")
     setup = setup_of({**tables, **changed}, own if changed else file, file.parent)
+    if "chamber" in changed:
+        stated = validated(SetupFile, tables, str(file)).chamber
+        if [(c.name, c.box) for c in setup.chambers] != [(c.name, c.box) for c in stated]:
+            raise ValueError(f"{own}: other names or boxes in [[chamber]], wanted those of {file}, in its order")
     markers, supply = folder / "markers.csv", folder / "pressure.csv"
     recording = None
     if markers.is_file():

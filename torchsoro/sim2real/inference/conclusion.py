@@ -90,6 +90,7 @@ class Conclusion:
     Attributes:
         kind: "explained", "cannot_distinguish", "nothing_missing", "cannot_tell" or "unknown_physics".
         chosen: Names in the credible set.
+        credible: That set, most probable first, with what is no effect.
         probabilities: Posterior, of nothing, of what is unknown, and of each name.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
@@ -105,6 +106,7 @@ class Conclusion:
 
     kind: str
     chosen: tuple[str, ...]
+    credible: tuple[str, ...]
     probabilities: dict[str, float]
     candidates: tuple[Candidate, ...]
     nothing: Posterior
@@ -472,6 +474,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     return Conclusion(
         kind=kind,
         chosen=tuple(n for n in chosen if n not in (NOTHING, UNKNOWN)),
+        credible=tuple(chosen),
         probabilities=shares,
         candidates=tuple(candidates),
         nothing=null,

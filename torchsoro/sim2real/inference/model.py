@@ -60,7 +60,8 @@ class Model:
             if effect.applies(scenario, twin):
                 scenario = effect(scenario, value, twin)
         for effect, found in self.effects:
-            scenario = effect(scenario, torch.from_numpy(found)[None], twin)
+            if effect.applies(scenario, twin):
+                scenario = effect(scenario, torch.from_numpy(found)[None], twin)
         return scenario
 
 

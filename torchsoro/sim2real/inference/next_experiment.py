@@ -104,16 +104,16 @@ def next_experiment(problem: FitProblem, one: Explained, other: Explained) -> li
     return sorted(found, key=lambda p: -p.distance)
 
 
-def advice(proposals: Sequence[Proposal]) -> str:
+def advice(proposals: Sequence[Proposal], which: str = "them") -> str:
     """The best of them in a sentence, or that none tells them apart; empty without any."""
     same = next((p for p in proposals if p.words == REPEAT), None)
     if same is None:
         return ""
     best = proposals[0]
     if best is same or best.distance < max(CLEAR**2, 2 * same.distance):
-        return "None of the trials that were thought of would tell them apart."
+        return f"None of the trials that were thought of would tell {which} apart."
     return (
-        f"To tell them apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
+        f"To tell {which} apart, record next: {best.words}; there they differ by {best.distance**0.5:.0f} standard "
         f"deviations, in the same trial once more by {same.distance**0.5:.1f}."
     )
 

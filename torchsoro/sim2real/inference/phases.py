@@ -88,7 +88,7 @@ class Mismatch:
         """Where and when they part, in words; empty if they do not."""
         if self.start is None or self.phase is None:
             return ""
-        return f"at {self.start:.2g} s, in the {self.phase.name}, most at marker {self.marker}"
+        return f"at {float(f'{self.start:.3g}'):g} s, in the {self.phase.name}, most at marker {self.marker}"
 
     def by_phase(self, after: bool = False) -> np.ndarray:
         """Root mean square in each phase, by marker [phases, M]; not a number where nothing was recorded."""

@@ -207,7 +207,7 @@ def _trials(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
                 f"as {said} [mm]": float(digits(1e3 * a.total)),
                 "used for the fit": b.trial not in e.heldout,
                 **{
-                    f"{m.name} [mm]": f"{1e3 * one:.2g} → {1e3 * other:.2g}"
+                    f"{m.name} [mm]": f"{digits(1e3 * one)} → {digits(1e3 * other)}"
                     for m, one, other in zip(markers if each else (), b.error, a.error, strict=each)
                 },
             }
@@ -271,7 +271,7 @@ def write_isolability(page: Document, found: Isolability) -> None:
                 "effect": effect_words(name),
                 "quantity": quantity_words(name, quantity),
                 "detectable from": with_unit(value, unit, quantity) if math.isfinite(value) else None,
-                "may be mistaken for": ", ".join(effect_words(b) for a, b in confused if a == name),
+                "may be mistaken for": ", ".join(dict.fromkeys(effect_words(b) for a, b in confused if a == name != b)),
             }
             for name, (quantity, unit), value in zip(found.effects, found.quantities, found.detectable, strict=True)
         ],

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from torchsoro.sim2real.inference.conclusion import NOTHING, UNKNOWN
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
@@ -27,7 +29,10 @@ def verdict_sentence(e: Explanation) -> str:
             "tolerances, and the error of the simulation itself explain the difference."
         )
     if v.kind == "unknown_physics":
-        return "Something is missing from the setup that is none of the known effects."
+        if len(v.conclusion.credible) == 1:
+            return "Something is missing from the setup that is none of the known effects."
+        others = " or ".join(told(name) for name in v.conclusion.credible[1:])
+        return f"Most probably something is missing that is none of the known effects; {others} is not excluded."
     if v.kind == "cannot_tell":
         return "It cannot be told from these recordings whether something is missing from the setup."
     how = "Most of the difference is" if v.conclusion.partly else "The difference is"
@@ -35,6 +40,8 @@ def verdict_sentence(e: Explanation) -> str:
     if v.kind == "cannot_distinguish" and len(v.chosen) == 1:
         return f"{how} explained by {parts}; or by none of the known effects: the recordings cannot tell."
     if v.kind == "cannot_distinguish":
+        if UNKNOWN in v.conclusion.credible:
+            parts += "; or none of the known effects"
         return f"{how} explained by one of these, and the recordings cannot tell by which: {parts}."
     return f"{how} explained by {parts}."
 
@@ -45,25 +52,26 @@ def evidence(e: Explanation) -> list[str]:
     found = [_departure(e), _probable(e), _visible(e)]
     if v.heldout and e.improvement:
         trials = f"trial{'s' if len(v.heldout) > 1 else ''} {', '.join(v.heldout)}"
+        how = "left out of the fit" if e.heldout else "each predicted from the others"
         found.append(
-            f"On {trials}, left out of the fit, the error of the prediction is {1e3 * e.improvement.explained:.2f} mm; "
+            f"On {trials}, {how}, the error of the prediction is {1e3 * e.improvement.explained:.2f} mm; "
             f"that of the setup as stated is {1e3 * e.improvement.believed:.2f} mm."
         )
     if v.chosen and v.conclusion.partly:
         best = v.chosen[0]
         found.append(
-            f"Of a difference of {1e3 * v.conclusion.left:.2g} mm it leaves {1e3 * best.left:.2g} mm that are none of "
-            "the known effects."
+            f"Of a difference of {words.millimetres(v.conclusion.left)} it leaves {words.millimetres(best.left)} that "
+            "are none of the known effects."
         )
     if v.kind == "unknown_physics":
         if v.ranking and v.ranking[0].left < v.conclusion.left:
             closest = candidate_words(v.ranking[0], e.problem)
-            left = f"it leaves {1e3 * v.ranking[0].left:.2g} mm unexplained"
+            left = f"it leaves {words.millimetres(v.ranking[0].left)} unexplained"
             found.append(f"Closest of the known effects: {closest}; {left}.")
         if e.forces:
             found.append(str(e.forces))
     if v.kind == "cannot_distinguish":
-        found.append(advice(e.following))
+        found.append(advice(e.following, "them" if len(v.chosen) == 2 else "the first two"))
     if v.chosen:
         found.append(_incredible_errors(e))
     return [sentence for sentence in found if sentence]
@@ -82,7 +90,7 @@ def told(name: str) -> str:
 def _probable(e: Explanation) -> str:
     """Posterior probabilities of the set."""
     c = e.verdict.conclusion
-    leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.chosen))]
+    leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.credible))]
     shares = ", ".join(f"{told(name)} {words.probability(p)}" for name, p in leading)
     return f"Probabilities of what is missing: {shares}."
 
@@ -92,15 +100,17 @@ def _visible(e: Explanation) -> str:
     v, c = e.verdict, e.verdict.conclusion
     if v.kind not in ("nothing_missing", "cannot_tell"):
         return ""
+    if v.kind == "cannot_tell" and c.chosen:
+        names = " or ".join(told(name) for name in c.chosen)
+        if NOTHING in c.credible:
+            return f"It may be {names}, but that nothing is missing is not excluded."
+        return f"It may be {names}, but trials that are left out are predicted no better with it."
+    limit, matters = words.millimetres(c.limit), words.millimetres(c.matters)
     if c.limit <= c.matters:
-        return (
-            f"An effect that changes the motion by {1e3 * c.limit:.2g} mm would have been seen; "
-            f"{1e3 * c.matters:.2g} mm matter."
-        )
-    sentence = (
-        f"An effect would have been seen only if it changed the motion by {1e3 * c.limit:.2g} mm, "
-        f"while {1e3 * c.matters:.2g} mm matter."
-    )
+        return f"An effect that changes the motion by {limit} would have been seen; {matters} matter."
+    if not math.isfinite(c.limit):
+        return "No effect would have been seen, however large."
+    sentence = f"An effect would have been seen only if it changed the motion by {limit}, while {matters} matter."
     if c.remedies:
         ways = " or ".join(REMEDIES[name].format(factor) for name, factor in c.remedies.items())
         sentence += f" It could be told with {ways}."
@@ -150,4 +160,6 @@ def _place(row: dict) -> str:
     if row["location_m"] is None:
         return ""
     within = [f" ± {1e3 * w:.0f}" for w in row["location_within_m"] or []] or [""] * 3
-    return f" at ({', '.join(f'{1e3 * x:.0f}{w}' for x, w in zip(row['location_m'], within, strict=True))}) mm"
+    return f" at ({', '.join(f'{1e3 * x:.0f}{w}' for x, w in zip(row['location_m'], within, strict=True))}) mm" + (
+        " (± 90 %)" if row["location_within_m"] else ""
+    )

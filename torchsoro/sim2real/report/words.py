@@ -54,6 +54,7 @@ QUANTITIES = {
     "stiffness_n_m": "stiffness of the spring",
     "damping_n_s_m": "coefficient of the damper",
     "fraction": "pressure lost",
+    "fraction_at_highest": "pressure lost at the highest pressure",
     "time_constant_s": "time constant",
     "air_stiffness_pa": "pressure lost as the chamber doubles its volume",
     "density_drag_kg_m3": "density of the fluid times drag coefficient",
@@ -92,7 +93,7 @@ MAIN = {
     "adhesion": ("energy_j_m2",),
 }
 
-PERCENT = {"fraction", "depth", "share"}  # quantities of unit 1 that people state in percent
+PERCENT = {"fraction", "fraction_at_highest", "depth", "share"}  # quantities of unit 1 that people state in percent
 
 # Units people use: factor on the SI value, and name; the first row whose upper limit is above the value.
 _UNITS = {
@@ -110,6 +111,7 @@ _UNITS = {
     "kg/m3": ((math.inf, 1.0, "kg/m³"),),
     "1": ((math.inf, 1.0, ""),),
     "over the body": ((math.inf, 1.0, ""),),
+    "between halves": ((math.inf, 1.0, ""),),
 }
 
 

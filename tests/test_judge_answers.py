@@ -1,0 +1,191 @@
+"""The judge asks and scores: what counts as an answer, and what it is compared with."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the service of the test is a shell script")
+def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge, tmp_path, monkeypatch):
+    setups = {"case-0": "", "case-1": "[[chamber]]", "case-2": "[[plane]]\n[[chamber]]", "case-3": "[[plane]]"}
+    for name, setup in setups.items():
+        (tmp_path / "batch" / "cases" / name).mkdir(parents=True)
+        (tmp_path / "batch" / "cases" / name / "setup.toml").write_text(setup)
+    tool, order = tmp_path / "tool.py", tmp_path / "order"
+    tool.write_text(
+        "import json, os, pathlib, sys, time\n"
+        f"with open({str(order)!r}, 'a') as order: print(pathlib.Path(sys.argv[1]).name, file=order)\n"
+        "time.sleep(0.2)\n"
+        "out = pathlib.Path(sys.argv[3])\n"
+        "out.mkdir()\n"
+        "seen = {'gpu': os.environ['CUDA_VISIBLE_DEVICES'], 'pipe': os.environ['CUDA_MPS_PIPE_DIRECTORY']}\n"
+        "(out / 'explanation.json').write_text(json.dumps({'verdict': 'nothing_missing', 'effects': [], **seen}))\n"
+    )
+    service = tmp_path / "bin" / judge.ask.SHARING
+    service.parent.mkdir()
+    calls = tmp_path / "calls"
+    service.write_text(
+        f'#!/bin/sh\n[ "$1" = -d ] && echo start${{CUDA_VISIBLE_DEVICES}} >> {calls} || cat >> {calls}\n'
+    )
+    service.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
+    monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
+    monkeypatch.setattr(judge.ask, "SERVED", tmp_path / "none")
+    command, answers = f"{sys.executable} {tool}", tmp_path / "answers"
+    judge.ask.ask(tmp_path / "batch", answers=answers, tool=command, workers=4, gpus=2)
+    told = [json.loads(path.read_text()) for path in sorted(answers.rglob("explanation.json"))]
+    assert sorted(found["gpu"] for found in told) == ["3", "3", "5", "5"]
+    assert len({found["pipe"] for found in told}) == 1
+    assert calls.read_text().split() == ["start", "quit"]
+    order.unlink()
+    monkeypatch.setenv("CUDA_MPS_PIPE_DIRECTORY", "served already")
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "served", tool=command, workers=2, gpus=1)
+    assert calls.read_text().split() == ["start", "quit"]
+    order.unlink()
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "one", tool=command, workers=1, gpus=1)
+    assert order.read_text().split() == ["case-2", "case-1", "case-3", "case-0"]
+    with pytest.raises(ValueError, match=r"gpus = 4: .* has 3"):
+        judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, workers=4, gpus=4)
+    with pytest.raises(ValueError, match="gpus = 2: wanted 0 to workers = 1"):
+        judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, gpus=2)
+    assert not (tmp_path / "none").exists()
+
+
+def test_intervals_are_those_of_clopper_and_pearson(judge):
+    low, high = judge.score.Rate(hits=18, of=30).interval
+    assert (round(low, 2), round(high, 2)) == (0.41, 0.77)
+    assert judge.score.Rate(hits=0, of=10).interval == (0.0, pytest.approx(0.3085, abs=1e-4))
+
+
+def test_probabilities_are_compared_with_how_often_they_are_right(judge):
+    def told(k, truth, likely, probability, **more):
+        common = {"case": f"case-{k}", "specimen": "bar", "kind": "effect" if truth else "null", "length": 0.1}
+        return judge.answers.Scored(
+            **common, strength=3.0, truth=truth, verdict="explained", likely=likely, probability=probability, **more
+        )
+
+    rows = judge.score.table(
+        [
+            told(0, ("drag",), "drag", 0.9),
+            told(1, ("drag",), "leak", 0.9),
+            told(2, ("leak",), "leak", 0.5),
+            told(3, (), "nothing", 1.0, priced_ratio=1.5),
+        ],
+        1.0,
+    )
+    assert rows["names told with 0.8 to 1, right"].endswith("1/2")
+    # In the fifth from 0.8 to 1 two of three are right where 2.8 were told, in that around 0.5 one where 0.5 was.
+    error = rows["  expected calibration error of the most probable"]
+    assert error == f"{(0.8 + 0.5) / 4:.2f} (4)"
+    assert rows["own error, as told / real, nothing missing"].startswith("1.5 ")
+
+
+def test_the_error_that_is_told_is_compared_with_that_of_the_sealed_trial(judge, tmp_path):
+    folder, sealed = tmp_path / "answers" / "case-000", tmp_path / "sealed" / "case-000"
+    time, place = np.linspace(0.0, 1.0, 5), np.zeros((5, 1, 3))
+    clean = judge.experiment.Recording(time=time, value=place, names=("m1",), axes="xyz")
+    for where, value in ((folder / "predicted.csv", place + 2e-4), (sealed / "clean.csv", place)):
+        where.parent.mkdir(parents=True)
+        judge.experiment.Recording(time=time, value=value, names=clean.names, axes="xyz").write(where)
+    answer = {"verdict": "nothing_missing", "effects": [], "noise": {"simulation_m": 3e-4}}
+    (folder / "explanation.json").write_text(json.dumps(answer))
+    truth = {"case": "case-000", "specimen": "bar", "kind": "null", "strength": 0.0, "body_length_m": 0.1}
+    found = judge.answers.match({**truth, "effects": [], "believed_heldout_rms_mm": 0.4}, folder.parent, tmp_path, {})
+    assert found.priced_ratio == pytest.approx(1.5)
+    assert found.sealed_ratio == pytest.approx(0.5)
+    # A prediction counts as a whole or not at all, whatever the order of its markers and with others beside them.
+    read, write = judge.experiment.Recording.read, judge.experiment.Recording
+    guess = read(folder / "predicted.csv")
+
+    def ratio(time, value, names):
+        write(time=time, value=value, names=names, axes="xyz").write(folder / "predicted.csv")
+        whole = {**truth, "effects": [], "believed_heldout_rms_mm": 0.4, "axes": "xz"}
+        return judge.answers.match(whole, folder.parent, tmp_path, {}).sealed_ratio
+
+    more = np.concatenate([np.full_like(guess.value, 9.0), guess.value], 1)
+    assert ratio(guess.time, more, ("other", "m1")) == pytest.approx(0.5)
+    assert ratio(guess.time[:3], guess.value[:3], ("m1",)) is None
+    assert ratio(guess.time, np.where(guess.time[:, None, None] == 0.5, np.nan, guess.value), ("m1",)) is None
+    assert ratio(guess.time, guess.value, ("m2",)) is None
+    (folder / "predicted.csv").write_text("")
+    assert (
+        judge.answers.match(
+            {**truth, "effects": [], "believed_heldout_rms_mm": 0.4}, folder.parent, tmp_path, {}
+        ).sealed_ratio
+        is None
+    )
+
+
+def test_an_answer_of_another_form_counts_as_none(judge, tmp_path):
+    clean = judge.experiment.Recording(time=np.arange(3.0), value=np.zeros((3, 1, 3)), names=("m1",), axes="xyz")
+    clean.write(tmp_path / "sealed" / "case-000" / "clean.csv")
+    effect = {"name": "drag", "parameters": {}, "location_m": None}
+    truth = {"case": "case-000", "specimen": "bar", "kind": "effect", "strength": 3.0, "body_length_m": 0.1}
+    truth |= {"effects": [effect], "believed_heldout_rms_mm": 0.4}
+    path = tmp_path / "answers" / "case-000" / "explanation.json"
+    path.parent.mkdir(parents=True)
+    for text in ("[]", "{", '{"verdict": "perhaps"}', '{"verdict": "explained", "effects": [{"parameters": {}}]}'):
+        path.write_text(text)
+        assert judge.answers.match(truth, path.parent.parent, tmp_path, {}).verdict == "failed"
+    pair = {"verdict": "cannot_distinguish", "set": ["drag + leak", "leak"], "probabilities": {"b + a": 1.0}}
+    path.write_text(json.dumps(pair))
+    found = judge.answers.match(truth, path.parent.parent, tmp_path, {"effects": {"a": "drag", "b": "leak"}})
+    assert found.set == ("drag", "leak") and found.likely == "drag + leak"
+
+
+def test_an_interrupted_ask_keeps_no_answer_and_ends_its_tools(judge, tmp_path):
+    for name in ("case-0", "case-1", "case-2"):
+        (tmp_path / "batch" / "cases" / name).mkdir(parents=True)
+        (tmp_path / "batch" / "cases" / name / "setup.toml").write_text("")
+    tool = tmp_path / "tool.py"
+    tool.write_text(
+        "import os, pathlib, sys, time\n"
+        f"pathlib.Path({str(tmp_path)!r}, f'pid-{{os.getpid()}}').write_text('')\n"
+        "time.sleep(60)\n"
+    )
+    command = [sys.executable, judge.ask.__file__, str(tmp_path / "batch"), "--answers", str(tmp_path / "answers")]
+    asking = subprocess.Popen(
+        [*command, "--tool", f"{sys.executable} {tool}", "--workers", "2"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    try:
+        for _ in range(600):
+            if len(begun := list(tmp_path.glob("pid-*"))) == 2:
+                break
+            time.sleep(0.05)
+        asking.send_signal(signal.SIGTERM)
+        assert asking.wait(timeout=30) != 0
+    finally:
+        asking.kill()
+    assert len(begun) == 2 and begun == list(tmp_path.glob("pid-*"))
+    assert not list((tmp_path / "answers").rglob("explanation.json"))
+    for path in begun:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(path.name.removeprefix("pid-")), 0)
+
+
+def test_ask_takes_what_is_no_explanation_for_a_failure(judge, tmp_path):
+    (tmp_path / "batch" / "cases" / "case-0").mkdir(parents=True)
+    (tmp_path / "batch" / "cases" / "case-0" / "setup.toml").write_text("")
+    tool = tmp_path / "tool.py"
+    tool.write_text(
+        "import pathlib, sys\n"
+        "out = pathlib.Path(sys.argv[3])\n"
+        "out.mkdir()\n"
+        "(out / 'explanation.json').write_text('[1]')\n"
+    )
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "answers", tool=f"{sys.executable} {tool}")
+    found = json.loads((tmp_path / "answers" / "case-0" / "explanation.json").read_text())
+    assert found["verdict"] == "failed" and "without a verdict" in found["error"]
+    with pytest.raises(ValueError, match=r"tool = 'no-such-tool': wanted a command line that begins with a program"):
+        judge.ask.ask(tmp_path / "batch", answers=tmp_path / "answers", tool="no-such-tool")
