@@ -5,8 +5,9 @@
     python recipes/explain.py --predict runs/explained/model.toml --trial trial.toml --out markers.csv
 
 The experiment is a folder: setup.toml says what is believed, trials/<name>/markers.csv what was recorded. Trials in a
-folder heldout/ are only predicted; without one, of three or more each of the first four from the others. Writes report.html,
-explanation.json and model.toml, the setup with what was missing, which predicts a trial that nobody has recorded yet.
+folder heldout/ are only predicted; without one, of three or more each of the first four from the others. Writes
+report.html, explanation.json and model.toml, the setup with what was missing, which predicts a trial that nobody has
+recorded yet.
 """
 
 from __future__ import annotations

@@ -156,7 +156,8 @@ def _read(
     def ours(name: str) -> list[str]:
         return [effects.get(part, part) for part in name.split(" + ")]
 
-    verdict = answer.get("verdict") if answer.get("verdict") in VERDICTS else "failed"
+    word = answer.get("verdict")
+    verdict = word if isinstance(word, str) and word in VERDICTS else "failed"
     named = {effects.get(e["name"], e["name"]): e for e in answer.get("effects") or []}
     told = [n if isinstance(n, str) else n["name"] for n in answer.get("set") or []]
     listed = [part for name in told for part in ours(name)]
