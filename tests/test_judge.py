@@ -269,6 +269,17 @@ def test_a_batch_of_some_bodies_holds_only_these_and_what_makes_sense_for_them(j
         assert set(plan.effects) <= {*specimen.effects, *specimen.outside}
 
 
+def test_cases_of_some_bodies_are_made_by_themselves(judge, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(judge.seal, "_simulate", lambda job: "as believed")
+    monkeypatch.setattr(judge.seal, "_work", lambda job: made.append(job[0].specimen) or "made")
+    settings = {"effects": 6, "nulls": 6, "pairs": 0, "outside": 0, "processes": 1, "bodies": ("bar", "post", "pad")}
+    assert judge.seal.seal(out=tmp_path, seed=3, only=("bar",), **settings) == ""
+    assert set(made) == {"bar"} and not (tmp_path / "truth.sealed").exists()
+    with pytest.raises(ValueError, match="seed = 3: also seed_from_os, wanted one of the two"):
+        judge.seal.seal(out=tmp_path, seed=3, seed_from_os=True, **settings)
+
+
 def test_a_thrown_block_comes_to_rest_and_a_crawler_lifts_off_its_plate(judge):
     t = np.linspace(0, 0.5, 101)
     block = judge.believed.believed_motion("block", 0, judge.world.World(), 0.5)(t)

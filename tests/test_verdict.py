@@ -186,6 +186,7 @@ def test_a_set_of_one_name_and_what_is_unknown_says_so(monkeypatch):
     assert said(kind="unknown_physics", credible=("unknown",)).endswith("none of the known effects.")
     both = said(kind="unknown_physics", credible=("unknown", "drag"))
     assert "Most probably" in both and both.endswith("drag of the surrounding fluid is not excluded.")
+    assert "that nothing is missing is not" in said(kind="unknown_physics", credible=("unknown", "nothing"))
 
 
 def test_why_an_effect_that_fits_is_not_told(still):
