@@ -31,8 +31,9 @@ def verdict_sentence(e: Explanation) -> str:
     if v.kind == "unknown_physics":
         if len(v.conclusion.credible) == 1:
             return "Something is missing from the setup that is none of the known effects."
-        others = [told(n) if n != NOTHING else "that nothing is missing" for n in v.conclusion.credible[1:]]
-        return f"Most probably something is missing that is none of the known effects; {' or '.join(others)} is not excluded."
+        names = (told(n) if n != NOTHING else "that nothing is missing" for n in v.conclusion.credible[1:])
+        others = " or ".join(names)
+        return f"Most probably something is missing that is none of the known effects; {others} is not excluded."
     if v.kind == "cannot_tell":
         return "It cannot be told from these recordings whether something is missing from the setup."
     how = "Most of the difference is" if v.conclusion.partly else "The difference is"
