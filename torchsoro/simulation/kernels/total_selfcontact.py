@@ -11,6 +11,9 @@ from torchsoro.simulation.kernels.tensor import load_vector, store_vector
 
 # Of ``bounds``: squared distance from which on nothing acts; squared way that nodes may go before pairs are listed.
 REACH, SLACK = 0, 1
+# No number of a point. A sum that might end at it is taken one after the other: LLVM would else regroup it by lanes of a
+# processor, and its last bits would depend on pairs that are listed and do not act.
+NO_PAIR = -1
 
 
 @ti.func
@@ -87,6 +90,8 @@ def contact_forces(
         b = w // points
         force = load_vector(places, 3 * w, 1) * 0
         for e in range(first[w], first[w + 1]):
+            if other[e] == NO_PAIR:
+                break
             j = b * points + other[e]
             r = load_vector(places, 3 * w, 1) - load_vector(places, 3 * j, 1)
             force += laws.repulsion(r.dot(r), bounds[REACH], stiffness[w], stiffness[j]) * r
@@ -159,6 +164,8 @@ def contact_adjoint(
         found = load_vector(places, 3 * w, 1) * 0
         by_stiffness = stiffness[w] * 0
         for n in range(first[w], first[w + 1]):
+            if other[n] == NO_PAIR:
+                break
             j = b * points + other[n]
             r = load_vector(places, 3 * w, 1) - load_vector(places, 3 * j, 1)
             e = load_vector(pulled, 3 * w, 1) - load_vector(pulled, 3 * j, 1)
