@@ -13,7 +13,9 @@ import numpy as np
 from experiment import Recording
 
 SHORT = 0.01  # s, by which a prediction may begin later or end earlier than the trial: clocks differ by 8 ms
-VERDICTS = ("explained", "cannot_distinguish", "nothing_missing", "cannot_tell", "unknown_physics")
+SETS = ("explained", "cannot_distinguish")
+SILENT = ("nothing_missing", "cannot_tell")
+VERDICTS = (*SETS, *SILENT, "unknown_physics")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -36,7 +36,6 @@ SHARING = "nvidia-cuda-mps-control"
 SERVED = Path("/tmp/nvidia-mps/control")
 """Where it is while somebody else's runs, unless told otherwise."""
 
-
 STOPPED = threading.Event()
 """Set once a run is interrupted: what the tools have not answered by then is asked for the next time."""
 

@@ -21,12 +21,10 @@ from typing import Any
 
 import numpy as np
 import tyro
-from answers import Scored, match
+from answers import SETS, SILENT, Scored, match
 from scipy.stats import beta
 
 NAMED = ("explained",)
-SETS = ("explained", "cannot_distinguish")
-SILENT = ("nothing_missing", "cannot_tell")
 MUTE = ("failed", "missing")
 
 

@@ -312,8 +312,8 @@ def seal(
     if finish:
         unmade = {plan.name for plan, *_ in jobs}
         todo, jobs = [plan for plan in todo if plan.name not in unmade], []
-    left = [job for job in jobs if only and job[0].specimen not in only]
-    jobs = [job for job in jobs if job not in left]
+    every, jobs = len(jobs), [job for job in jobs if not only or job[0].specimen in only]
+    left = every - len(jobs)
     # What lasts longest is begun first, so that no process is left alone with it.
     slow = sorted({job[0].specimen for job in jobs}, key=lambda name: -_lasting(name, finer))
     jobs.sort(key=lambda job: slow.index(job[0].specimen))
@@ -329,7 +329,7 @@ def seal(
         for line in itertools.chain(map(_simulate, expected), map(_work, jobs)):
             print(line, flush=True)
     if left:
-        print(f"{len(left)} cases of other bodies are left to be made; the truth is sealed when all are there")
+        print(f"{left} cases of other bodies are left to be made; the truth is sealed when all are there")
         return ""
     truths = [json.loads((out / "sealed" / f"{plan.name}.json").read_text()) for plan in todo]
     for truth in truths:

@@ -11,8 +11,8 @@ from torchsoro.simulation.kernels.tensor import load_vector, store_vector
 
 # Of ``bounds``: squared distance from which on nothing acts; squared way that nodes may go before pairs are listed.
 REACH, SLACK = 0, 1
-# No number of a point. A sum that might end at it is taken one after the other: LLVM would else regroup it by lanes of a
-# processor, and its last bits would depend on pairs that are listed and do not act.
+# No number of a point. A sum that might end at it is taken one after the other: LLVM would else regroup it by lanes of
+# a processor, and its last bits would depend on pairs that are listed and do not act.
 NO_PAIR = -1
 
 
