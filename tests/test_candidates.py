@@ -69,7 +69,9 @@ def test_nothing_is_named_in_a_bar_that_is_as_believed(weighed):
     assert 0.0 < seen < 0.1 * weighing.data.size
     found = conclude(weighing, limit=0.0)
     assert (found.kind, found.chosen) == ("nothing_missing", ())
-    assert found.probabilities["nothing"] > 0.95
+    # The rest is shared by effects too small to matter, of which few cannot be excluded.
+    assert max(found.probabilities, key=lambda name: found.probabilities[name]) == "nothing"
+    assert found.probabilities["nothing"] > 0.8 and found.credible == ("nothing",)
 
 
 def test_trials_that_are_only_predicted_change_no_evidence(weighed):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from swings import EXACT, draws, recorded
 
-from torchsoro.sim2real.inference.conclusion import Weighing, adjustment, apart, conclude, remainder
+from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.decision import MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
@@ -24,6 +24,7 @@ from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
 from torchsoro.sim2real.inference.verdict import _looked_at_again, _moved
 from torchsoro.sim2real.inference.visible import limit, remedies
+from torchsoro.sim2real.inference.weighing import Weighing, adjustment, apart, remainder
 
 # Conclusions ---------------------------------------------------------------------------------------------------------
 
@@ -107,6 +108,33 @@ def test_a_discrepancy_that_is_no_larger_than_the_noise_is_nothing():
     assert MATTERS * data.size < remainder(data, weighing.null) < 1.1 * data.noise
     found = conclude(weighing, limit=0.0)
     assert (found.kind, found.chosen) == ("nothing_missing", ())
+
+
+@pytest.mark.parametrize("seed", [4, 5, 30])
+def test_the_name_of_an_effect_that_does_not_matter_keeps_its_probability(seed):
+    data, nothing, drag = recorded(0.0, seed, effect=0.03)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    assert (found.kind, found.chosen, found.credible) == ("nothing_missing", (), ("nothing",))
+    assert found.candidates[0].size < MATTERS * data.size
+    assert found.probabilities["drag"] > 0.95
+    assert sum(found.probabilities.values()) == pytest.approx(1.0, rel=1e-9)
+
+
+def test_nothing_and_what_moves_less_than_the_twin_may_err_are_told_apart_no_better_than_it_can():
+    data, nothing, drag = recorded(0.0, 9, effect=0.08)
+
+    def told_by(error):
+        price = TwinError(amplitude=np.full_like(data.amplitudes[0], error), draws=tuple(draws(data, 2, error, 10)))
+        weighing = weighed(data, *(dataclasses.replace(m, numerics=price) for m in (nothing, drag)))
+        assert weighing.candidates()[0]["drag"] > 0.999
+        found = conclude(weighing, limit=0.0)
+        assert sum(found.probabilities.values()) == pytest.approx(1.0, rel=1e-9)
+        return found
+
+    good, fair, bad = map(told_by, (0.01, 0.02, 0.06))
+    assert (good.kind, good.chosen) == ("explained", ("drag",)) and good.candidates[0].size > 0.01
+    assert fair.kind == bad.kind == "nothing_missing" and fair.candidates[0].size < 0.02
+    assert good.probabilities["drag"] > 0.999 > 0.5 > fair.probabilities["drag"] > bad.probabilities["drag"] > 0
 
 
 def test_an_effect_that_leaves_less_than_the_noise_is_told_if_it_moves_more():

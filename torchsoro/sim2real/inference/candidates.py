@@ -10,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.outer_effects import Friction
-from torchsoro.sim2real.inference.conclusion import Weighing
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
 from torchsoro.sim2real.inference.discretization import GAPS, shifted
 from torchsoro.sim2real.inference.evidence import (
@@ -28,6 +27,7 @@ from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
 from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
+from torchsoro.sim2real.inference.weighing import Weighing
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest says nothing

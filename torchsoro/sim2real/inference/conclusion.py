@@ -1,86 +1,13 @@
-"""What can be concluded from evidence: the smallest set of candidates with most of the posterior probability.
-
-Candidates are: nothing is missing; a discrepancy that no effect explains; each effect; each pair. Their evidences are
-compared after an adjustment for how errors really vary. The covariance of the errors takes markers and axes nearly as
-independent, while errors of contact move the whole body: sums over samples are then more uncertain than it says. Along
-the change D by an effect, draws d of the twin's error tell by how much (magnitude adjustment of a composite
-likelihood: Ribatet, Cooley and Davison 2012),
-
-    kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
-
-C without what it has of d, and the likelihood is taken to the power of 1 / kappa.
-
-Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
-how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
-not known, of root mean square r, left by a model with K numbers of its own, have the likelihood (Schwarz 1978)
-
-    ln p = -N ln r - K/2 ln N.
-
-So it does between modes of one name.
-
-Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
-this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
-as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
-name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
-that a stated number is off by many tolerances is improbable whatever the twin errs by.
-"""
+"""What can be concluded from probabilities: the smallest set of candidates with most of them."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
-import numpy as np
-
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
-from torchsoro.sim2real.inference.evidence import (
-    Model,
-    Posterior,
-    adjusted,
-    compared,
-    ln_strained,
-    mode_of,
-    products,
-)
-from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
-from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
-from torchsoro.sim2real.inference.state_space import total
-
-NOTHING, UNKNOWN = "nothing", "unknown"
-SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
-CLOSE = 0.2  # of a tolerance, of a noticeable change, or of a tenth of the body, below which they are, too
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Candidate:
-    """One name, by all modes that were found of it.
-
-    Attributes:
-        modes: Distinct ones, adjusted, see :attr:`Weighing.modes`.
-        size: Root mean square of the change of the motion by it, from what is believed, within tolerances [m].
-        left: What it leaves of the recordings, see :func:`remainder` [m].
-        ln_evidence: Summed over modes, adjusted.
-        probability: Posterior.
-    """
-
-    modes: tuple[Posterior, ...]
-    size: float
-    left: float
-    ln_evidence: float
-    probability: float
-
-    @property
-    def name(self) -> str:
-        """Of its effects."""
-        return self.modes[0].near.model.name
-
-    @property
-    def best(self) -> Posterior:
-        """The first of its modes."""
-        return self.modes[0]
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.evidence import Posterior, compared
+from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN, Candidate, Weighing, apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,7 +18,7 @@ class Conclusion:
         kind: "explained", "cannot_distinguish", "nothing_missing", "cannot_tell" or "unknown_physics".
         chosen: Names in the credible set.
         credible: That set, most probable first, with what is no effect.
-        probabilities: Posterior, of nothing, of what is unknown, and of each name.
+        probabilities: Posterior, of nothing, of what is unknown, and of each name, whether it matters or not.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
         left: What that one leaves of the recordings, its beliefs within tolerances, see :func:`remainder` [m].
@@ -120,301 +47,6 @@ class Conclusion:
     remedies: dict[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Weighing:
-    """Posterior probabilities of names.
-
-    Attributes:
-        data: Recordings.
-        nothing: Modes of the model without an effect.
-        effects: Modes of all others.
-        names: Number of single effects that can be named.
-        rough: Whether looks at one mode differ by chance in touching. Where they do not, they differ as a linear model
-            does from a simulation, and the most probable one counts.
-    """
-
-    data: Data
-    nothing: tuple[Posterior, ...]
-    effects: tuple[Posterior, ...]
-    names: int
-    rough: bool = True
-
-    @cached_property
-    def _looks_at_nothing(self) -> list[list[Posterior]]:
-        return _alike(self.nothing)
-
-    @cached_property
-    def _looks_at_effects(self) -> list[list[Posterior]]:
-        return _alike(self.effects)
-
-    @cached_property
-    def nulls(self) -> tuple[Posterior, ...]:
-        """Distinct modes of the model without an effect, most probable first."""
-        return tuple(sorted(map(self._one_of, self._looks_at_nothing), key=lambda p: -p.ln_evidence))
-
-    @property
-    def null(self) -> Posterior:
-        """The most probable of them."""
-        return self.nulls[0]
-
-    def _one_of(self, same: Sequence[Posterior]) -> Posterior:
-        """The look that counts of those at one mode, which are sorted."""
-        return _middle(same) if self.rough else same[0]
-
-    @property
-    def valleys(self) -> tuple[Posterior, ...]:
-        """The same modes, each by the look at which it is most probable."""
-        return tuple(same[0] for same in self._looks_at_nothing)
-
-    def latest(self, found: Posterior) -> Posterior:
-        """The last look at a mode."""
-        name = found.near.model.name
-        return [p for p in (*self.nothing, *self.effects) if p.near.model.name == name and _same(p, found)][-1]
-
-    @cached_property
-    def scatter(self) -> float:
-        """Standard deviation of ln evidence where a mode was linearised more than once, a little beside itself.
-
-        Of rough motions that says how much of it hangs on which node touches when.
-        """
-        if not self.rough:
-            return 0.0
-        again = [[p.ln_evidence for p in same] for same in (*self._looks_at_nothing, *self._looks_at_effects)]
-        free = sum(len(same) - 1 for same in again)
-        return math.sqrt(sum(len(same) * float(np.var(same)) for same in again) / free) if free else 0.0
-
-    def change(self, found: Posterior) -> Motions:
-        """Of the motion, by an effect: from what is believed, within its tolerances."""
-        return tuple(a - b for a, b in zip(self.believed, found.left, strict=True))
-
-    @cached_property
-    def bounded(self) -> Posterior:
-        """The model without an effect, its beliefs within their tolerances, by the mode that is least beyond them."""
-
-        def beyond(p: Posterior) -> float:
-            return max(1.0, float(np.abs(p.near.at[: p.near.model.beliefs]).max(initial=0.0)))
-
-        return within(min(sorted(self.nothing, key=lambda p: -p.ln_evidence), key=beyond))
-
-    @cached_property
-    def believed(self) -> Motions:
-        """Residuals of the same [T, M, A] m."""
-        near = self.bounded.near
-        return near.left(mode_of(self.data, near, self.bounded.discrepancy).at)
-
-    @cached_property
-    def by_error(self) -> float:
-        """Mean adjustment over the changes by all names, by the errors of the most probable model."""
-        changes = [self.change(modes[0]) for modes in self.groups.values()]
-        columns = tuple(np.stack(same, -1) for same in zip(*changes, strict=True))
-        return adjustment(self.data, self.best, columns) if changes else 1.0
-
-    @property
-    def scattered(self) -> bool:
-        """Whether ln evidence scatters by more than the twin's error leaves uncertain of it."""
-        return bool(self.groups) and self.scatter > self.by_error
-
-    @property
-    def kappa(self) -> float:
-        """Likelihoods are taken to the power of its inverse; differences are no more certain than evidence scatters."""
-        return self.scatter if self.scattered else self.by_error
-
-    @cached_property
-    def modes(self) -> tuple[Posterior, ...]:
-        """Distinct modes of all names: the most probable first, or what leaves the least where none is right."""
-        distinct = [self._one_of(looks) for looks in self._looks_at_effects]
-        if self.best.matters:
-            return tuple(sorted(distinct, key=lambda p: remainder(self.data, p)))
-        return tuple(sorted(distinct, key=lambda p: -p.ln_evidence))
-
-    @property
-    def leading(self) -> Posterior:
-        """The first of the modes with an effect where none is right, else the most probable of all."""
-        return self.modes[0] if self.best.matters and self.modes else self.best
-
-    def within_reach(self, found: Sequence[Posterior], behind: float) -> list[Posterior]:
-        """Of modes, those that another look may make what is told: no farther behind, in ln of evidence or of size."""
-        if not self.best.matters or not self.modes:
-            return [p for p in found if p.ln_evidence > self.best.ln_evidence - behind]
-        count = independent(self.modes[0].left)
-        size = {id(p): math.hypot(remainder(self.data, p), self.data.noise) for p in (*found, self.modes[0])}
-        least = size[id(self.modes[0])]
-        return [p for p in found if count * math.log(size[id(p)] / least) < behind]
-
-    @cached_property
-    def groups(self) -> dict[str, tuple[Posterior, ...]]:
-        """The same of each name, in the order of their first ones."""
-        found: dict[str, list[Posterior]] = {}
-        for p in self.modes:
-            found.setdefault(p.near.model.name, []).append(p)
-        return {name: tuple(modes) for name, modes in found.items()}
-
-    @cached_property
-    def best(self) -> Posterior:
-        """The most probable of all."""
-        return max((*map(self._one_of, self._looks_at_effects), self.null), key=lambda p: p.ln_evidence)
-
-    @cached_property
-    def unexplained(self) -> float:
-        """What the model without an effect leaves, its beliefs within their tolerances, see :func:`remainder` [m]."""
-        return remainder(self.data, self.bounded)
-
-    def _ln_prior(self, model: Model) -> float:
-        """Of a name; a model without effects stands for what has none."""
-        pair = math.log(self.names) if len(model.effects) > 1 else 0.0
-        return math.log(MISSING / (self.names + 1)) - pair
-
-    def _bounded(
-        self, probabilities: dict[str, float], ln_prior: dict[str, float], left: dict[str, float]
-    ) -> dict[str, float]:
-        """Probabilities of names that add up to as much, no farther apart than the twin's error allows."""
-        first = max(probabilities, key=lambda name: probabilities[name])
-        best = self.groups[first][0]
-        priced = best.near.numerics.size
-        error = min(remainder(self.data, best, priced=False), priced)
-        if not probabilities[first] or not error:
-            return probabilities
-        ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
-        count = min((independent(draw) for draw in best.near.numerics.draws), default=1.0)
-        within = {
-            name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
-            for name, (p, *_) in self.groups.items()
-        }
-        stated = {
-            name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
-            for name, (mode, *_) in self.groups.items()
-        }
-        for name, (mode, *_) in self.groups.items():
-            # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
-            if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
-                most = max(stated[name] - stated[first], 0.0)
-                ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], most))
-        whole = sum(probabilities.values())
-        return {name: whole * p for name, p in normalised(ln_p).items()}
-
-    def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
-        """Posterior probabilities of all names, and what has an effect, most probable first."""
-        kappa = self.kappa
-        null = adjusted(self.data, self.null, kappa)
-        groups = {name: [adjusted(self.data, p, kappa) for p in modes] for name, modes in self.groups.items()}
-        ln_prior = {name: self._ln_prior(modes[0].near.model) for name, modes in groups.items()}
-        ln_p = {name: ln_prior[name] + _summed(modes) for name, modes in groups.items()}
-        # Without a discrepancy that matters nothing is missing, with one something is that has no name.
-        ln_p[NOTHING] = math.log(1 - MISSING) + null.none.ln_evidence
-        ln_p[UNKNOWN] = self._ln_prior(null.near.model) + null.some.ln_evidence
-        probabilities = normalised(ln_p)
-        left = {name: remainder(self.data, modes[0]) for name, modes in groups.items()}
-        if self.best.matters:
-            # Whether something is missing is told by evidence, what it is by the size of what is left.
-            missing = 1 - probabilities[NOTHING]
-            least = min(groups, key=lambda name: left[name]) if groups else None
-            count = independent(self.null.left if least is None else self.groups[least][0].left)
-            seen = math.hypot(self.unexplained, self.data.noise)
-            rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(seen)}
-            for name, modes in groups.items():
-                own = len(modes[0].near.model.own)
-                size = math.hypot(left[name], self.data.noise)
-                rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
-            probabilities |= {name: missing * p for name, p in normalised(rest).items()}
-        if groups:
-            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior, left)
-        found = [
-            Candidate(
-                modes=tuple(modes),
-                size=size_of(self.change(self.groups[name][0])),
-                left=left[name],
-                ln_evidence=_summed(modes),
-                probability=probabilities[name],
-            )
-            for name, modes in groups.items()
-        ]
-        return probabilities, sorted(found, key=lambda c: -c.probability)
-
-
-def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
-    """Kappa, on average over changes of the motion.
-
-    Args:
-        data: Recordings.
-        found: Whose errors count.
-        changes: Of each trial [T, M, A, E] m.
-    """
-    numerics, n = found.near.numerics, changes[0].shape[-1]
-    if not numerics.draws or not n:
-        return 1.0
-    gained = []
-    for k, draw in enumerate(numerics.draws):
-        # A sample that was lost tells nothing of a change either.
-        columns = [
-            np.concatenate([np.where(np.isfinite(d)[..., None], c, np.nan), found.discrepancy.twin * d[..., None]], -1)
-            for c, d in zip(changes, draw, strict=True)
-        ]
-        # What a draw is worth to an effect is seen where it is none of the errors that are known.
-        product = total(products(data, numerics.without(k), found.discrepancy, columns)).product
-        gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
-    return 1.0 + float(np.mean(gained))
-
-
-def normalised(ln_p: dict[str, float]) -> dict[str, float]:
-    """Probabilities in proportion, that add up to one."""
-    most = max(ln_p.values())
-    whole = sum(math.exp(value - most) for value in ln_p.values())
-    return {name: math.exp(value - most) / whole for name, value in ln_p.items()}
-
-
-def _summed(modes: Sequence[Posterior]) -> float:
-    """Ln evidence of all modes."""
-    return float(np.logaddexp.reduce([p.ln_evidence for p in modes]))
-
-
-def _alike(found: Sequence[Posterior]) -> list[list[Posterior]]:
-    """Those of each mode, most probable first."""
-    modes: list[list[Posterior]] = []
-    for p in sorted(found, key=lambda p: -p.ln_evidence):
-        mine = [same for same in modes if same[0].near.model.name == p.near.model.name and _same(p, same[0])]
-        if mine:
-            mine[0].append(p)
-        else:
-            modes.append([p])
-    return modes
-
-
-def _middle(same: Sequence[Posterior]) -> Posterior:
-    """Of those of one mode the one in the middle, the less probable of two."""
-    return sorted(same, key=lambda p: p.ln_evidence)[(len(same) - 1) // 2]
-
-
-def _same(one: Posterior, other: Posterior) -> bool:
-    """Whether two modes of a name are one, in beliefs and in the numbers of effects.
-
-    They are if they are near by the narrower of them, or by what is noticeable: that of rough motions is too narrow.
-    """
-    own = one.near.model.simulated
-    off = (one.mode.at - other.mode.at)[own]
-    spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
-    return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())
-
-
-def apart(one: Posterior, other: Posterior) -> float:
-    """Root mean square distance of two predictions [m]."""
-    return size_of(tuple(a - b for a, b in zip(one.left, other.left, strict=True)))
-
-
-def remainder(data: Data, found: Posterior, *, priced: bool = True) -> float:
-    """Root mean square of the least that a model leaves, beyond noise and what there is of the twin's own error [m].
-
-    Args:
-        data: Recordings.
-        found: The model.
-        priced: Whether what there is of the twin's own error is taken off.
-    """
-    near = found.near
-    known = data.noise**2
-    if priced:
-        known += float(((found.discrepancy.twin * near.numerics.amplitude) ** 2).mean())
-    return math.sqrt(max(size_of(near.left(closest(data, near).at)) ** 2 - known, 0.0))
-
-
 def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None = None) -> Conclusion:
     """The conclusion from evidence.
 
@@ -427,33 +59,16 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     probabilities, candidates = weighing.candidates()
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
-    # What does not matter is nothing; what leaves much, more than noise and than the twin may err, is not missing.
-    shares = dict.fromkeys([NOTHING, UNKNOWN], 0.0)
-    shares[NOTHING] = probabilities[NOTHING]
-    shares[UNKNOWN] = probabilities[UNKNOWN]
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
-    faint = max(UNEXPLAINED * left, data.noise, null.near.numerics.size)
+    shares = {NOTHING: probabilities[NOTHING], UNKNOWN: probabilities[UNKNOWN]}
+    told, small = dict(shares), []
     for c in candidates:
-        # An extension that moves as what it extends, as far as it matters, adds nothing; nor does one that does so as
-        # far as the twin tells, unless evidence is for it.
-        tells = max(least, c.best.near.numerics.size)
-        plain = []
-        for d in (names[n] for n in c.best.near.model.simpler if n in names):
-            sure = c.probability > CREDIBLE * (c.probability + d.probability)
-            if apart(c.best, d.best) < (least if sure else tells):
-                plain.append(d)
-        if c.size < tells:
-            shares[NOTHING] += c.probability
-        elif c.best.matters and c.left > max(faint, c.best.near.numerics.size):
-            shares[UNKNOWN] += c.probability
-        elif c.left > max(c.size, c.best.near.numerics.size):
-            # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.
-            shares[UNKNOWN if left > data.noise else NOTHING] += c.probability
-        elif plain:
-            name = max(plain, key=lambda d: d.ln_evidence).name
-            shares[name] = shares.get(name, 0.0) + c.probability
-        else:
-            shares[c.name] = shares.get(c.name, 0.0) + c.probability
+        counted, called = _meaning(c, names, left, data.noise, least, null.near.numerics.size)
+        shares[counted] = shares.get(counted, 0.0) + c.probability
+        told[called] = told.get(called, 0.0) + c.probability
+        if called == NOTHING:
+            small.append(c.name)
+    told = weighing.beside_nothing(told, {name: names[name].probability for name in small})
     chosen: list[str] = []
     for name in sorted(shares, key=lambda name: -shares[name]):
         chosen.append(name)
@@ -475,7 +90,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         kind=kind,
         chosen=tuple(n for n in chosen if n not in (NOTHING, UNKNOWN)),
         credible=tuple(chosen),
-        probabilities=shares,
+        probabilities=told,
         candidates=tuple(candidates),
         nothing=null,
         left=left,
@@ -489,9 +104,37 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     )
 
 
-def within(null: Posterior) -> Posterior:
-    """The model without an effect whose beliefs cannot leave their tolerances; its modes are those of before."""
-    model = null.near.model
-    bounded = [dataclasses.replace(p, low=-1.0, high=1.0) for p in model.priors[: model.beliefs]]
-    model = dataclasses.replace(model, priors=(*bounded, *model.priors[model.beliefs :]))
-    return dataclasses.replace(null, near=dataclasses.replace(null.near, model=model))
+def _meaning(
+    c: Candidate, names: dict[str, Candidate], left: float, noise: float, least: float, error: float
+) -> tuple[str, str]:
+    """What a candidate counts as, and what its probability is told of.
+
+    What does not matter counts as nothing. Its name is told all the same, unless the twin may err by as much. What
+    leaves much, more than noise and than the twin may err, is not missing.
+
+    Args:
+        c: The candidate.
+        names: All of them.
+        left: What is left without an effect [m].
+        noise: Its standard deviation [m].
+        least: Change of the motion that matters [m].
+        error: What the twin may err by without an effect [m].
+    """
+    own = c.best.near.numerics.size
+    # An extension that moves as what it extends, as far as it matters, adds nothing; nor does one that does so as
+    # far as the twin tells, unless evidence is for it.
+    plain = []
+    for d in (names[n] for n in c.best.near.model.simpler if n in names):
+        sure = c.probability > CREDIBLE * (c.probability + d.probability)
+        if apart(c.best, d.best) < (least if sure else max(least, own)):
+            plain.append(d)
+    name = max(plain, key=lambda d: d.ln_evidence).name if plain else c.name
+    unexplained = c.best.matters and c.left > max(UNEXPLAINED * left, noise, error, own)
+    if c.size < max(least, own):
+        return NOTHING, NOTHING if unexplained or c.size < own else name
+    if unexplained:
+        return UNKNOWN, UNKNOWN
+    if c.left > max(c.size, own):
+        # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.
+        return (UNKNOWN, UNKNOWN) if left > noise else (NOTHING, name)
+    return name, name

@@ -13,7 +13,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
-from torchsoro.sim2real.inference.conclusion import Conclusion, Weighing, adjustment, conclude
+from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
 from torchsoro.sim2real.inference.evidence import Posterior
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction, predictions
@@ -21,6 +21,7 @@ from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.least_squares import told
 from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
+from torchsoro.sim2real.inference.weighing import Weighing, adjustment
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects

@@ -108,7 +108,11 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
         )
     leading = sorted(e.verdict.conclusion.probabilities.items(), key=lambda item: -item[1])
     shown = [(told(name), p) for k, (name, p) in enumerate(leading) if k < LEAST_BARS or p > FAINT][:BARS]
-    page.bars([(name, p, probability(p), 1) for name, p in shown], "Probability of what is missing", longest=1.0)
+    page.bars(
+        [(name, p, probability(p), 1) for name, p in shown],
+        "Probability of what is missing, whether it matters or not",
+        longest=1.0,
+    )
     if found is not None:
         worst = sorted(found.trials.items(), key=lambda item: -item[1][0])[:BARS]
         rows = []
@@ -257,8 +261,9 @@ def _considered(page: Document, e: Explanation) -> None:
             "Ln evidence: of the recordings under each, over that of the first row. Leaves: root mean square of the "
             "least that it leaves of the difference beyond noise and the simulation's own error. The probability of an "
             "effect that leaves more than a fifth of it, and more than the noise, is given to none of the known ones, "
-            "that of one that changes the motion by less than matters to nothing, and that of an effect that holds a "
-            "simpler one, and moves the body no otherwise by more than matters, to the simpler one.",
+            "and that of an effect that holds a simpler one, and moves the body no otherwise by more than matters, to "
+            "the simpler one. Of effects that change the motion by less than the simulation may err, nothing is told "
+            "apart by more than an error of that size allows.",
         )
 
 

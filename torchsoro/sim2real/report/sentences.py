@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
-from torchsoro.sim2real.inference.conclusion import NOTHING, UNKNOWN
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
 from torchsoro.sim2real.inference.verdict import Candidate
+from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN
 from torchsoro.sim2real.report import words
 from torchsoro.sim2real.report.explanation import Explanation, effect_rows
 
@@ -24,10 +24,15 @@ def verdict_sentence(e: Explanation) -> str:
     """The answer."""
     v = e.verdict
     if v.kind == "nothing_missing":
-        return (
-            "Nothing is missing from the setup: measurement errors, modulus, pressure and friction within their "
-            "tolerances, and the error of the simulation itself explain the difference."
-        )
+        errors = "measurement errors, modulus, pressure and friction within their tolerances, and the error of the "
+        errors += "simulation itself explain the difference"
+        little = _little(e)
+        if little is not None:
+            return (
+                f"Nothing that matters is missing from the setup: {errors}, but for {words.millimetres(little.size)}, "
+                f"which are most probably {candidate_words(little, e.problem)}."
+            )
+        return f"Nothing is missing from the setup: {errors}."
     if v.kind == "unknown_physics":
         if len(v.conclusion.credible) == 1:
             return "Something is missing from the setup that is none of the known effects."
@@ -94,6 +99,12 @@ def _probable(e: Explanation) -> str:
     leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.credible))]
     shares = ", ".join(f"{told(name)} {words.probability(p)}" for name, p in leading)
     return f"Probabilities of what is missing: {shares}."
+
+
+def _little(e: Explanation) -> Candidate | None:
+    """What does not matter, but is more probable than that nothing is missing; None where nothing is."""
+    first = max(e.verdict.ranking, key=lambda c: c.probability, default=None)
+    return first if first and first.probability > e.verdict.conclusion.probabilities[NOTHING] else None
 
 
 def _visible(e: Explanation) -> str:
