@@ -129,7 +129,7 @@ def _meaning(
         if apart(c.best, d.best) < (least if sure else max(least, own)):
             plain.append(d)
     name = max(plain, key=lambda d: d.ln_evidence).name if plain else c.name
-    unexplained = c.best.matters and c.left > max(UNEXPLAINED * left, noise, error, own)
+    unexplained = c.left > max(UNEXPLAINED * left, noise, error, own)
     if c.size < max(least, own):
         return NOTHING, NOTHING if unexplained or c.size < own else name
     if unexplained:
