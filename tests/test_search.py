@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchsoro.sim2real.inference import search
+from torchsoro.sim2real.inference.gauss_newton import GaussNewton, Point
 from torchsoro.sim2real.inference.search import ENDS_PAIR, FINER_ROUNDS, PROMISING
 
 
@@ -109,3 +110,33 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     assert starts == {a: 11.0, b: 11.0, c: 11.0}
     # Of a, neither the spread point, which leaves 5, nor the first start, which leaves 1.
     assert [e.name for (e,), _ in begun[1]] == ["lag", "drag", "mass"]
+
+
+class Swallowed(GaussNewton):
+    """A search whose steps are lost in rounding, while each look at a point is a little better than the last."""
+
+    held = places = np.zeros(1, bool)
+    weight = np.ones(1)
+
+    def step(self, point: Point, damping: float) -> np.ndarray:
+        return np.full(1, 1e-17)
+
+    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray) -> Any:
+        chi2 = yield at
+        columns = np.ones((3, 1)) if len(moving) else np.zeros((3, 1))
+        return Point(chi2=chi2, at=at, errors=errors, r=np.ones(3), J=columns, columns=columns, motions=[]), False
+
+
+def test_a_step_that_rounding_swallows_ends_a_search_with_its_derivatives():
+    looks = Swallowed(SimpleNamespace(bounds=lambda effects: (np.zeros(1), np.full(1, 9.0))), ()).search(
+        np.ones(1), np.zeros(1), 8, settle=False
+    )
+    asked, found = [next(looks)], None
+    for chi2 in (100.0, 90.0, 80.0):
+        try:
+            asked.append(looks.send(chi2))
+        except StopIteration as end:
+            found = end.value
+            break
+    assert found is not None and np.isfinite(found.columns).all() and found.columns.any()
+    assert len(asked) == 1

@@ -122,7 +122,8 @@ class GaussNewton:
         fresh = True  # whether the derivatives were simulated at this point
         for _ in range(rounds):
             step = self.step(current, damping)
-            if not step.any():
+            # A step that rounding swallows leads nowhere, too: nothing could be learnt from it of the derivatives.
+            if not (current.at + step != current.at).any():
                 break
             asked = moving if eager else moving[:0]
             complete = eager
