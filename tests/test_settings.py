@@ -7,6 +7,7 @@ import math
 import typing
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tiny import TINY
@@ -163,6 +164,8 @@ def test_errors_that_a_user_can_act_on_become_one_line(capsys):
             raise error
         assert end.value.code == code
     assert capsys.readouterr().err == f"error: wall = 0\nerror: {broken}\n"
+    with pytest.raises(np.linalg.LinAlgError), plain_errors():
+        np.linalg.inv(np.zeros((2, 2)))
     with pytest.raises(TypeError), plain_errors():
         raise TypeError("a bug")
 

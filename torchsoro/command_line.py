@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, Protocol, TypeVar, dataclass_transform
 
+import numpy as np
 import pydantic
 from pydantic import Field
 from pydantic.dataclasses import dataclass
@@ -157,13 +158,16 @@ def plain_errors() -> Iterator[None]:
     """End the process with a line instead of a traceback.
 
     Exit code 2 for bad input; 1 for a simulation that diverged, a file that cannot be read or written, and too little
-    memory; 130 for Ctrl-C.
+    memory; 130 for Ctrl-C. A matrix that is no numbers is a defect and no bad input, though a ``ValueError``: it keeps
+    its traceback.
     """
     try:
         yield
     except BrokenPipeError:  # whoever read the output, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # so that nothing fails when it is flushed
         raise SystemExit(0) from None
+    except np.linalg.LinAlgError:
+        raise
     except (ValueError, SimulationDiverged, OSError, MemoryError) as error:
         print(f"error: {error or 'not enough memory'}", file=sys.stderr)
         raise SystemExit(2 if isinstance(error, ValueError) else 1) from error
