@@ -280,6 +280,37 @@ def test_cases_of_some_bodies_are_made_by_themselves(judge, tmp_path, monkeypatc
         judge.seal.seal(out=tmp_path, seed=3, seed_from_os=True, **settings)
 
 
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_motion_is_simulated_once_though_a_body_does_not_bear_it(judge, tmp_path, monkeypatch, broken):
+    simulated = []
+
+    def simulate(*given):
+        simulated.append(given)
+        if broken:
+            raise judge.march.Broken("inside out")
+        return np.ones((2, 2, 3))
+
+    monkeypatch.setattr(judge.seal, "_simulated", simulate)
+    bar = judge.specimens.SPECIMENS["bar"]()
+    errors = judge.camera.draw_errors(bar, np.random.default_rng(0))
+    for number, times in ((0, 1), (0, 1), (1, 2)):
+        if broken:
+            with pytest.raises(judge.march.Broken):
+                judge.seal._motion(bar, number, judge.world.World(), errors, 1.0, tmp_path)
+        else:
+            found = judge.seal._motion(bar, number, judge.world.World(), errors, 1.0, tmp_path)
+            np.testing.assert_array_equal(found, np.ones((2, 2, 3)))
+        assert len(simulated) == times
+    (plan,) = judge.seal.plans(1, 0, 0, 0, np.random.default_rng(0), ("bar",))
+    monkeypatch.setattr(judge.seal, "MOTIONS", "motions")
+    jobs = judge.seal._motions((plan, [0], tmp_path, 1.0))
+    assert len(jobs) == 2 * len(bar.trials) and len({path for path, *_ in jobs}) == len(jobs)
+    for motion in jobs:
+        judge.seal._one(motion)
+    # Another draw follows one that is broken.
+    assert len(judge.seal._motions((plan, [0], tmp_path, 1.0))) == (2 if broken else 1) * len(jobs)
+
+
 def test_a_thrown_block_comes_to_rest_and_a_crawler_lifts_off_its_plate(judge):
     t = np.linspace(0, 0.5, 101)
     block = judge.believed.believed_motion("block", 0, judge.world.World(), 0.5)(t)

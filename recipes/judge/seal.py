@@ -5,13 +5,15 @@
     python recipes/judge/seal.py --out runs/judge/calibration --batch calibration ...   # to tune on; disjoint seeds
 
 Writes OUT/cases/<id>/, which may be shown, OUT/truth.sealed and its SHA-256, and OUT/sealed/ with the recordings of the
-held-out trials. Interrupted, the same command goes on. What is always there and never counts as physics: the modulus
-may be off by 10 %, the pressure by 5 %, beside clock, scale, frame, marker places, noise and losses. The effect
-"modulus" is at least 25 %. Half of the nulls are decoys: errors of measurement larger than stated.
+held-out trials. Each motion is a job of its own, and kept until its case is made: processes end together, and,
+interrupted, the same command goes on. What is always there and never counts as physics: the modulus may be off by 10 %,
+the pressure by 5 %, beside clock, scale, frame, marker places, noise and losses. The effect "modulus" is at least 25 %.
+Half of the nulls are decoys: errors of measurement larger than stated.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -19,7 +21,7 @@ import multiprocessing
 import os
 import secrets
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -39,6 +41,7 @@ from world import Line, World
 Body = Literal["bar", "finger", "pad", "slider", "post", "crawler", "block", "robot"]
 BATCHES = ("calibration", "test", "smoke")
 BELIEVED = "sealed/believed"  # folder of motions as believed, which cases share
+MOTIONS = "sealed/motions"  # of motions of cases that are not made yet
 DRAWS = 60  # of a case, until a body bears what was drawn
 
 
@@ -91,7 +94,72 @@ def plans(
     return [Plan(name=f"case-{n:03d}", **found[i]) for n, i in enumerate(order)]
 
 
-def _motion(specimen: Specimen, trial: Trial, number: int, world: World, errors: Errors, finer: float) -> Floats:
+@dataclass(frozen=True, kw_only=True)
+class Draw:
+    """What a case may be; the next one is taken where a body does not bear it.
+
+    Attributes:
+        errors: Of measurement.
+        bare: World without the effects.
+        world: With them.
+        effects: Drawn.
+    """
+
+    errors: Errors
+    bare: World
+    world: World
+    effects: tuple[Effect, ...]
+
+    @property
+    def worlds(self) -> tuple[World, ...]:
+        """That are simulated."""
+        return (self.world, self.bare) if self.effects else (self.world,)
+
+
+def draws(plan: Plan, specimen: Specimen, rng: np.random.Generator) -> Iterator[Draw]:
+    """What a case may be, one after the other."""
+    for _ in range(DRAWS):
+        errors = draw_errors(specimen, rng)
+        bare = world = own_world(specimen, rng)
+        drawn: list[Effect] = []
+        for name in plan.effects:
+            world, effect = {**LIBRARY, **OUTSIDE}[name](world, specimen, rng)
+            drawn.append(effect)
+        if plan.decoy:
+            errors = decoy(errors, plan.decoy, specimen, rng)
+        yield Draw(errors=errors, bare=bare, world=world, effects=tuple(drawn))
+
+
+def _path(specimen: Specimen, number: int, world: World, errors: Errors, finer: float, kept: Path) -> Path:
+    """Where a motion is kept."""
+    text = repr((specimen.name, number, world, errors, finer))
+    return kept / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
+
+
+def _motion(specimen: Specimen, number: int, world: World, errors: Errors, finer: float, kept: Path) -> Floats:
+    """Markers of a trial, where they are and where they are said to be; simulated once.
+
+    Raises:
+        Broken: if the body does not bear it.
+    """
+    path = _path(specimen, number, world, errors, finer, kept)
+    if not path.exists():
+        try:
+            found = _simulated(specimen, specimen.trials[number], number, world, errors, finer)
+        except Broken:
+            found = np.zeros(0)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part = path.with_suffix(f".{os.getpid()}")
+        with part.open("wb") as file:
+            np.save(file, found)
+        part.rename(path)
+    found = np.load(path, allow_pickle=False)
+    if not found.size:
+        raise Broken(f"{specimen.name}, trial {specimen.trials[number].name}")
+    return found
+
+
+def _simulated(specimen: Specimen, trial: Trial, number: int, world: World, errors: Errors, finer: float) -> Floats:
     mesh = mesh_for(specimen.name, finer)
     duration = specimen.setup["duration"]
     tables = {**specimen.setup, **trial.tables}
@@ -128,21 +196,12 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     rng = np.random.default_rng(seed)
     specimen = SPECIMENS[plan.specimen]()
     started = time.perf_counter()
-    for _ in range(DRAWS):
-        errors = draw_errors(specimen, rng)
-        bare = world = own_world(specimen, rng)
-        drawn: list[Effect] = []
-        for name in plan.effects:
-            world, effect = {**LIBRARY, **OUTSIDE}[name](world, specimen, rng)
-            drawn.append(effect)
-        if plan.decoy:
-            errors = decoy(errors, plan.decoy, specimen, rng)
+    number = range(len(specimen.trials))
+    for draw in draws(plan, specimen, rng):
+        errors, bare, drawn = draw.errors, draw.bare, draw.effects
         try:
-            runs = [_motion(specimen, t, i, world, errors, finer) for i, t in enumerate(specimen.trials)]
-            if drawn:
-                plain = [_motion(specimen, t, i, bare, errors, finer) for i, t in enumerate(specimen.trials)]
-            else:
-                plain = runs
+            motions = [[_motion(specimen, i, w, errors, finer, out / MOTIONS) for i in number] for w in draw.worlds]
+            runs, plain = motions[0], motions[-1]
             break
         except Broken:
             continue
@@ -218,6 +277,8 @@ def _work(job: tuple[Plan, list[int], Path, float]) -> str:
     part = target.with_suffix(".part")
     part.write_text(json.dumps(truth, indent=1))
     part.rename(target)
+    for path, *_ in _motions((plan, seed, out, finer)):
+        path.unlink(missing_ok=True)
     return f"{plan.name} done in {truth['seconds']:.0f} s"
 
 
@@ -225,6 +286,29 @@ def _simulate(job: tuple[str, int, World, float, Path]) -> str:
     name, number, world, finer, kept = job
     believed_motion(name, number, world, finer, kept)
     return f"{name}: motion {number} as believed"
+
+
+def _motions(job: tuple[Plan, list[int], Path, float]) -> list[tuple[Path, str, int, World, Errors, float]]:
+    """Motions of the draw that a case is as far as is known, and of those before it that are broken."""
+    plan, seed, out, finer = job
+    specimen, found = SPECIMENS[plan.specimen](), []
+    for draw in draws(plan, specimen, np.random.default_rng(seed)):
+        mine = []
+        for world in draw.worlds:
+            for i in range(len(specimen.trials)):
+                path = _path(specimen, i, world, draw.errors, finer, out / MOTIONS)
+                mine.append((path, plan.specimen, i, world, draw.errors, finer))
+        found += mine
+        if not any(path.exists() and not np.load(path, allow_pickle=False).size for path, *_ in mine):
+            break
+    return found
+
+
+def _one(motion: tuple[Path, str, int, World, Errors, float]) -> str:
+    path, name, number, world, errors, finer = motion
+    with contextlib.suppress(Broken):
+        _motion(SPECIMENS[name](), number, world, errors, finer, path.parent)
+    return f"{name}: motion {number}"
 
 
 def _lasting(name: str, finer: float) -> float:
@@ -323,7 +407,13 @@ def seal(
     ]  # fmt: skip
     if processes > 1:
         with multiprocessing.get_context("spawn").Pool(processes) as pool:
-            for line in itertools.chain(pool.imap_unordered(_simulate, expected), pool.imap_unordered(_work, jobs)):
+            for line in pool.imap_unordered(_simulate, expected):
+                print(line, flush=True)
+            # Draws that turn out broken are followed by others.
+            while motions := [m for job in jobs for m in _motions(job) if not m[0].exists()]:
+                for k, line in enumerate(pool.imap_unordered(_one, motions)):
+                    print(f"{line}, {k + 1} of {len(motions)}", flush=True)
+            for line in pool.imap_unordered(_work, jobs):
                 print(line, flush=True)
     else:
         for line in itertools.chain(map(_simulate, expected), map(_work, jobs)):

@@ -1,4 +1,8 @@
-"""What can be concluded from probabilities: the smallest set of candidates with most of them."""
+"""What can be concluded from probabilities: the smallest set of candidates with most of them.
+
+In the set, what changes the motion by less than matters counts as nothing; the probabilities that are told are of what
+is missing, whether it matters or not.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,8 @@ Two names are told apart no better than the twin can. What the first leaves may 
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
 name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
-that a stated number is off by many tolerances is improbable whatever the twin errs by.
+that a stated number is off by many tolerances is improbable whatever the twin errs by. Nothing and what moves the body
+by less than the twin may err are compared in the same way.
 """
 
 from __future__ import annotations
