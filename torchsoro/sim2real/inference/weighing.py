@@ -37,7 +37,7 @@ from functools import cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import MISSING
-from torchsoro.sim2real.inference.evidence import Model, Posterior, adjusted, ln_strained, mode_of, products
+from torchsoro.sim2real.inference.evidence import Model, Posterior, TwinError, adjusted, ln_strained, mode_of, products
 from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
@@ -231,7 +231,7 @@ class Weighing:
         if not probabilities[first] or not error:
             return probabilities
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
-        count = min((independent(draw) for draw in best.near.numerics.draws), default=1.0)
+        count = _numbers(best.near.numerics)
         within = {
             name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
             for name, (p, *_) in self.groups.items()
@@ -260,18 +260,18 @@ class Weighing:
         numerics, none = self.null.near.numerics, probabilities[NOTHING] - sum(small.values())
         if not small or not numerics.size:
             return probabilities
-        count = min((independent(draw) for draw in numerics.draws), default=1.0)
-        ln_prior = {name: self._ln_prior(self.groups[name][0].near.model) for name in small}
-        found = {NOTHING: math.log(1 - MISSING) + ln_evidence_within(self.data, self.null.near, numerics.size, count)}
+        count = _numbers(numerics)
+        ln_nothing = math.log(1 - MISSING) + ln_evidence_within(self.data, self.null.near, numerics.size, count)
+        ln_odds = {NOTHING: 0.0}
         for name, share in small.items():
-            by_size = ln_prior[name] + ln_evidence_within(self.data, self.groups[name][0].near, numerics.size, count)
+            near = self.groups[name][0].near
+            by_size = self._ln_prior(near.model) + ln_evidence_within(self.data, near, numerics.size, count)
             by_evidence = math.log(max(share, 1e-300)) - math.log(max(none, 1e-300))
-            found[name] = found[NOTHING] + min(by_evidence, by_size - found[NOTHING])
-        shared = {name: probabilities[NOTHING] * p for name, p in normalised(found).items()}
-        return {
-            **probabilities,
-            **{name: p + probabilities.get(name, 0.0) * (name != NOTHING) for name, p in shared.items()},
-        }
+            ln_odds[name] = min(by_evidence, by_size - ln_nothing)
+        found = probabilities | {NOTHING: 0.0}
+        for name, p in normalised(ln_odds).items():
+            found[name] = found.get(name, 0.0) + probabilities[NOTHING] * p
+        return found
 
     def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
         """Posterior probabilities of all names, and what has an effect, most probable first."""
@@ -334,6 +334,11 @@ def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
         product = total(products(data, numerics.without(k), found.discrepancy, columns)).product
         gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
     return 1.0 + float(np.mean(gained))
+
+
+def _numbers(numerics: TwinError) -> float:
+    """Independent numbers that all samples amount to, with the most lasting draw of the twin's error."""
+    return min((independent(draw) for draw in numerics.draws), default=1.0)
 
 
 def normalised(ln_p: dict[str, float]) -> dict[str, float]:

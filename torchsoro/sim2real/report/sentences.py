@@ -103,7 +103,7 @@ def _probable(e: Explanation) -> str:
 
 def _little(e: Explanation) -> Candidate | None:
     """What does not matter, but is more probable than that nothing is missing; None where nothing is."""
-    first = max(e.verdict.ranking, key=lambda c: c.probability, default=None)
+    first = next(iter(e.verdict.ranking), None)  # the most probable one
     return first if first and first.probability > e.verdict.conclusion.probabilities[NOTHING] else None
 
 
