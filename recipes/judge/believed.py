@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+from lobatto import Floats
 from march import March, case_of
 from scipy.interpolate import CubicSpline
 from specimens import SPECIMENS, mesh_for
@@ -38,9 +39,14 @@ def believed_motion(name: str, number: int, world: World, finer: float, kept: Pa
     points = np.array([m["at"] for m in specimen.setup["marker"]], float)
     moved = March(case, world).run(t, *mesh.interpolation(points))
     if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}")
-        with part.open("wb") as file:
-            np.save(file, moved)
-        part.rename(path)
+        keep(path, moved)
     return CubicSpline(t, moved)
+
+
+def keep(path: Path, motion: Floats) -> None:
+    """Write a motion that other processes may look for: whole, or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(f".{os.getpid()}")
+    with part.open("wb") as file:
+        np.save(file, motion)
+    part.rename(path)

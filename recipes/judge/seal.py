@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 import numpy as np
 import tyro
-from believed import believed_motion
+from believed import believed_motion, keep
 from camera import DECOYS, Errors, decoy, draw_errors, film, instants
 from effects import LIBRARY, OUTSIDE, Effect, own_world
 from experiment import Trial
@@ -148,11 +148,7 @@ def _motion(specimen: Specimen, number: int, world: World, errors: Errors, finer
             found = _simulated(specimen, specimen.trials[number], number, world, errors, finer)
         except Broken:
             found = np.zeros(0)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(f".{os.getpid()}")
-        with part.open("wb") as file:
-            np.save(file, found)
-        part.rename(path)
+        keep(path, found)
     found = np.load(path, allow_pickle=False)
     if not found.size:
         raise Broken(f"{specimen.name}, trial {specimen.trials[number].name}")
