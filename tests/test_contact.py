@@ -253,7 +253,7 @@ def test_a_block_slides_by_the_stribeck_curve_and_holds_below_its_static_frictio
     assert float(slide(0.5, 0.4).center_velocity[-1, 0]) > 0.5  # and on the move
 
 
-@pytest.mark.parametrize("lanes", [True, False])
+@pytest.mark.parametrize("lanes", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_static_friction_and_stribeck_speed_have_gradients(lanes):
     def end(numbers):
         _, body = block(velocity=vector(0.1, 0.05, -0.2))

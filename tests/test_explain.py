@@ -321,6 +321,7 @@ def test_the_null_model_of_a_body_on_a_plane_begins_where_what_is_stated_leaves_
     assert [float(at[0]) for _, at in starts] == pytest.approx([-0.6, -0.6], abs=0.13)
 
 
+@pytest.mark.slow
 def test_the_finer_twin_finds_from_evenly_spread_points_what_its_own_recordings_hide(made):
     twin, record = made
     fine = finer(twin, 2, 40.0)
@@ -332,6 +333,7 @@ def test_the_finer_twin_finds_from_evenly_spread_points_what_its_own_recordings_
     assert found[0].values[0] == pytest.approx([800.0], rel=0.1)
 
 
+@pytest.mark.slow
 def test_components_that_add_up_are_told_by_the_finer_twin_from_afar(made):
     twin, record = made
     fine = finer(twin, 1, 5.0)

@@ -49,7 +49,7 @@ def thickness(field: DesignField) -> float:
     return (ends[1] - ends[0]) * H if len(ends) == 2 else 0.0
 
 
-@pytest.mark.parametrize("feature", [2.5 * H, 4 * H, 6 * H])
+@pytest.mark.parametrize("feature", [2.5 * H, *(pytest.param(n * H, marks=pytest.mark.slow) for n in (4, 6))])
 def test_of_plates_those_that_are_left_when_eroded_are_as_thick_as_asked(feature):
     eta = threshold_of(8 * H, feature)
     left = {}

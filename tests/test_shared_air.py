@@ -22,8 +22,10 @@ DOMAIN = Domain(
 )
 
 
-@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "taichi"])
 @pytest.mark.parametrize("name", ["coefficients", "pressure", "state"])
+@pytest.mark.parametrize(
+    "lanes", [pytest.param(True, id="lanes"), pytest.param(False, id="taichi", marks=pytest.mark.slow)]
+)
 def test_gradcheck_by_shares_of_air_and_what_acts_on_them(name, lanes):
     assert check(with_shared_air(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes)), name)
 

@@ -108,7 +108,7 @@ def test_moduli_and_times_recovered_within_1_percent_from_noiseless_sweep_and_re
     assert found.equilibrium == pytest.approx(1e5, rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [0.01, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.01, marks=pytest.mark.slow), 0.05])
 def test_table_s1_moduli_within_5_percent_and_intervals_cover_truth_at_1_and_5_percent_noise(noise):
     truth = np.array([TABLE_S1.equilibrium, *TABLE_S1.moduli])
     off, half, held = [], [], []

@@ -52,7 +52,7 @@ def spread(values):
 # ------------------------------------------------------------------------------------------------- known shift factors
 
 
-@pytest.mark.parametrize("reference", [20.0, 17.0])
+@pytest.mark.parametrize("reference", [pytest.param(20.0, marks=pytest.mark.slow), 17.0])
 def test_horizontal_shift_factors_match_wlf_within_standard_errors(reference):
     truth = LAW.at(reference).log_a(TEMPERATURES)
     off, steps, quality = [], [], []

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import itertools
 import json
 import multiprocessing
 import os
@@ -401,18 +400,15 @@ def seal(
         (name, i, world, finer, out / BELIEVED)
         for name in slow for i in range(len(SPECIMENS[name]().trials)) for world in _expected(SPECIMENS[name]())
     ]  # fmt: skip
-    if processes > 1:
-        with multiprocessing.get_context("spawn").Pool(processes) as pool:
-            for line in pool.imap_unordered(_simulate, expected):
-                print(line, flush=True)
-            # Draws that turn out broken are followed by others.
-            while motions := [m for job in jobs for m in _motions(job) if not m[0].exists()]:
-                for k, line in enumerate(pool.imap_unordered(_one, motions)):
-                    print(f"{line}, {k + 1} of {len(motions)}", flush=True)
-            for line in pool.imap_unordered(_work, jobs):
-                print(line, flush=True)
-    else:
-        for line in itertools.chain(map(_simulate, expected), map(_work, jobs)):
+    with multiprocessing.get_context("spawn").Pool(processes) if processes > 1 else contextlib.nullcontext() as pool:
+        each = pool.imap_unordered if pool else map
+        for line in each(_simulate, expected):
+            print(line, flush=True)
+        # Draws that turn out broken are followed by others.
+        while motions := [m for job in jobs for m in _motions(job) if not m[0].exists()]:
+            for k, line in enumerate(each(_one, motions)):
+                print(f"{line}, {k + 1} of {len(motions)}", flush=True)
+        for line in each(_work, jobs):
             print(line, flush=True)
     if left:
         print(f"{left} cases of other bodies are left to be made; the truth is sealed when all are there")
