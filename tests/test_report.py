@@ -199,16 +199,18 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
     assert [part["start"] for part in data["parts"]] == [0, 8]
 
 
-@pytest.mark.parametrize("kind", ["nothing_missing", "cannot_tell", "unknown_physics", "cannot_distinguish"])
+@pytest.mark.parametrize(
+    "kind", ["nothing_missing", "cannot_tell", "unknown_physics", "cannot_distinguish", "explained"]
+)
 def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, shown, kind, tmp_path):
     problem, fit = dragged
     _, _, _, worst, body = shown
     (null_model,) = problem.fit([((), None)], rounds=2)
     found = weighed(problem, [effect("drag")], null_model, [fit], report=lambda line: None)
-    named = kind == "cannot_distinguish"
-    verdict = dataclasses.replace(
-        found, kind=kind, chosen=2 * found.chosen[:1] if named else (), heldout={"a": (3e-3, 1e-4), "b": (4e-3, 2e-4)}
-    )
+    small = dataclasses.replace(found.chosen[0], size=0.012 * found.conclusion.motion)
+    chosen = {"cannot_distinguish": 2 * found.chosen[:1], "explained": (small,)}.get(kind, ())
+    named = bool(chosen)
+    verdict = dataclasses.replace(found, kind=kind, chosen=chosen, heldout={"a": (3e-3, 1e-4), "b": (4e-3, 2e-4)})
     before, after = (tuple(predict(problem, verdict.best, problem.trials, believed=b)) for b in (True, False))
     told = Explanation(
         problem=problem,
@@ -230,6 +232,7 @@ def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, shown,
     large = [f"{digits(1e3 * answer['improvement'][key])} mm" for key in ("believed_m", "explained_m", "floor_m")]
     assert re.findall(r"<b>([^<]*)</b>", page) == large and large[0] == "3.54 mm"
     assert ("error as explained by drag" in page) == named and ("fitted without an effect" in page) != named
+    assert ("1.2 % of it, which is too little to matter" in page) == (kind == "explained")
     assert answer["worst"]["trial"] == "b" and answer["worst"]["time_s"] == worst.time
     lengths = [float(x) for x in re.findall(r'<rect class="\w+" width="([\d.]+)"', page)]
     bars = [100 * p for p in sorted(answer["probabilities"].values(), reverse=True)]

@@ -1,7 +1,8 @@
 """What can be concluded from probabilities: the smallest set of candidates with most of them.
 
-In the set, what changes the motion by less than matters counts as nothing; the probabilities that are told are of what
-is missing, whether it matters or not.
+Probabilities are of what is missing, whether it matters or not. In the set, what changes the motion by less than
+matters goes by its name where nothing is not credible beside it and trials left out are predicted better with it; else
+it counts as nothing.
 """
 
 from __future__ import annotations
@@ -73,15 +74,16 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         if called == NOTHING:
             small.append(c.name)
     told = weighing.beside_nothing(told, {name: names[name].probability for name in small})
-    chosen: list[str] = []
-    for name in sorted(shares, key=lambda name: -shares[name]):
-        chosen.append(name)
-        if sum(shares[n] for n in chosen) >= CREDIBLE:
-            break
-    predictive = (0.0, math.inf)
-    first = next((c for c in candidates if c.name == chosen[0]), None)
-    if first is not None:
-        predictive = compared(data, first.best, weighing.bounded, weighing.kappa)
+
+    def gain(name: str) -> tuple[float, float]:
+        found = next((c for c in candidates if c.name == name), None)
+        return compared(data, found.best, weighing.bounded, weighing.kappa) if found else (0.0, math.inf)
+
+    chosen = _credible(told)
+    predictive = gain(chosen[0])
+    if NOTHING in chosen or predictive[0] <= 0:
+        chosen = _credible(shares)
+        predictive = gain(chosen[0])
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"
     elif chosen == [NOTHING]:
@@ -102,10 +104,20 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         limit=limit,
         matters=matters,
         motion=data.size,
-        partly=first is not None and first.best.matters,
+        partly=any(c.best.matters for c in candidates if c.name == chosen[0]),
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )
+
+
+def _credible(probabilities: dict[str, float]) -> list[str]:
+    """The smallest set of names with most of the probability, most probable first."""
+    chosen: list[str] = []
+    for name in sorted(probabilities, key=lambda name: -probabilities[name]):
+        chosen.append(name)
+        if sum(probabilities[n] for n in chosen) >= CREDIBLE:
+            break
+    return chosen
 
 
 def _meaning(
@@ -113,8 +125,8 @@ def _meaning(
 ) -> tuple[str, str]:
     """What a candidate counts as, and what its probability is told of.
 
-    What does not matter counts as nothing. Its name is told all the same, unless the twin may err by as much. What
-    leaves much, more than noise and than the twin may err, is not missing.
+    What does not matter counts as nothing. Its probability is told all the same, unless the twin may err by as much.
+    What leaves much, more than noise and than the twin may err, is not missing.
 
     Args:
         c: The candidate.

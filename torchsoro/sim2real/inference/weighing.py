@@ -22,8 +22,9 @@ Two names are told apart no better than the twin can. What the first leaves may 
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
 name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
-that a stated number is off by many tolerances is improbable whatever the twin errs by. Nothing and what moves the body
-by less than the twin may err are compared in the same way.
+that a stated number is off by many tolerances is improbable whatever the twin errs by. An extension has a number more,
+by which it fits the twin's error as well: beside what it extends, the error is as large as it is priced. Nothing and
+what moves the body by less than the twin may err are compared in the same way.
 """
 
 from __future__ import annotations
@@ -232,10 +233,15 @@ class Weighing:
             return probabilities
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
         count = _numbers(best.near.numerics)
-        within = {
-            name: ln_prior[name] + ln_evidence_within(self.data, p.near, error, count)
-            for name, (p, *_) in self.groups.items()
-        }
+
+        def ln_odds(name: str) -> float:
+            # What an extension leaves tells nothing of an error along the number that it has more.
+            along = priced if name in best.near.model.simpler else error
+            pair = (
+                ln_prior[n] + ln_evidence_within(self.data, self.groups[n][0].near, along, count) for n in (name, first)
+            )
+            return next(pair) - next(pair)
+
         stated = {
             name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
             for name, (mode, *_) in self.groups.items()
@@ -244,7 +250,7 @@ class Weighing:
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
                 most = max(stated[name] - stated[first], 0.0)
-                ln_p[name] = max(ln_p[name], ln_p[first] + min(within[name] - within[first], most))
+                ln_p[name] = max(ln_p[name], ln_p[first] + min(ln_odds(name), most))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 

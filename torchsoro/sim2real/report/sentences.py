@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from torchsoro.sim2real.inference.decision import MATTERS
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
 from torchsoro.sim2real.inference.verdict import Candidate
@@ -55,7 +56,7 @@ def verdict_sentence(e: Explanation) -> str:
 def evidence(e: Explanation) -> list[str]:
     """What the verdict rests on, and what remains open, a sentence each."""
     v = e.verdict
-    found = [_departure(e), _probable(e), _visible(e)]
+    found = [_departure(e), _probable(e), _visible(e), _small(e)]
     if v.heldout and e.improvement:
         trials = f"trial{'s' if len(v.heldout) > 1 else ''} {', '.join(v.heldout)}"
         how = "left out of the fit" if e.heldout else "each predicted from the others"
@@ -127,6 +128,15 @@ def _visible(e: Explanation) -> str:
         ways = " or ".join(REMEDIES[name].format(factor) for name, factor in c.remedies.items())
         sentence += f" It could be told with {ways}."
     return sentence
+
+
+def _small(e: Explanation) -> str:
+    """How much the motion changes by what is named, where that does not matter."""
+    v = e.verdict
+    if not v.chosen or v.chosen[0].size >= MATTERS * v.conclusion.motion:
+        return ""
+    size, share = words.millimetres(v.chosen[0].size), v.chosen[0].size / v.conclusion.motion
+    return f"It changes the motion by {size}, {100 * share:.2g} % of it, which is too little to matter."
 
 
 def _departure(e: Explanation) -> str:
