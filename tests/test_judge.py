@@ -272,6 +272,7 @@ def test_a_batch_of_some_bodies_holds_only_these_and_what_makes_sense_for_them(j
 def test_cases_of_some_bodies_are_made_by_themselves(judge, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(judge.seal, "_simulate", lambda job: "as believed")
+    monkeypatch.setattr(judge.seal, "_motions", lambda job: [])
     monkeypatch.setattr(judge.seal, "_work", lambda job: made.append(job[0].specimen) or "made")
     settings = {"effects": 6, "nulls": 6, "pairs": 0, "outside": 0, "processes": 1, "bodies": ("bar", "post", "pad")}
     assert judge.seal.seal(out=tmp_path, seed=3, only=("bar",), **settings) == ""

@@ -142,8 +142,8 @@ LATTICES = {
     **{"uniform": (None, False), "uneven": (uneven(), False), "wide": (wide(), False), "whole": (hollow(), True)},
     **{"x".join(map(str, shape.nodes)): (filled(shape), False) for shape in layout.SHAPES},
 }
-# Each takes 12 s to compile.
-AT_ONCE = {*((name, torch.float64) for name in ("uniform", "uneven", "wide", "whole")), ("whole", torch.float32)}
+# Each takes 12 s to compile, on a core that does nothing else.
+AT_ONCE = {("wide", torch.float64), ("whole", torch.float64)}
 
 
 @pytest.mark.parametrize(
