@@ -33,7 +33,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -234,13 +234,9 @@ class Weighing:
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
         count = _numbers(best.near.numerics)
 
-        def ln_odds(name: str) -> float:
-            # What an extension leaves tells nothing of an error along the number that it has more.
-            along = priced if name in best.near.model.simpler else error
-            pair = (
-                ln_prior[n] + ln_evidence_within(self.data, self.groups[n][0].near, along, count) for n in (name, first)
-            )
-            return next(pair) - next(pair)
+        @cache
+        def ln_within(name: str, error: float) -> float:
+            return ln_prior[name] + ln_evidence_within(self.data, self.groups[name][0].near, error, count)
 
         stated = {
             name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
@@ -250,7 +246,10 @@ class Weighing:
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
                 most = max(stated[name] - stated[first], 0.0)
-                ln_p[name] = max(ln_p[name], ln_p[first] + min(ln_odds(name), most))
+                # What an extension leaves tells nothing of an error along the number that it has more.
+                along = priced if name in best.near.model.simpler else error
+                ln_odds = ln_within(name, along) - ln_within(first, along)
+                ln_p[name] = max(ln_p[name], ln_p[first] + min(ln_odds, most))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 

@@ -133,10 +133,12 @@ def _visible(e: Explanation) -> str:
 def _small(e: Explanation) -> str:
     """How much the motion changes by what is named, where that does not matter."""
     v = e.verdict
-    if not v.chosen or v.chosen[0].size >= MATTERS * v.conclusion.motion:
+    size = max((c.size for c in v.chosen), default=math.inf)
+    if size >= MATTERS * v.conclusion.motion:
         return ""
-    size, share = words.millimetres(v.chosen[0].size), v.chosen[0].size / v.conclusion.motion
-    return f"It changes the motion by {size}, {100 * share:.2g} % of it, which is too little to matter."
+    who = "It changes the motion by" if len(v.chosen) == 1 else "Each changes the motion by at most"
+    share = 100 * size / v.conclusion.motion
+    return f"{who} {words.millimetres(size)}, {share:.2g} % of it, which is too little to matter."
 
 
 def _departure(e: Explanation) -> str:
