@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 from problems import constant, problem, with_shared_air, without_normals
-from test_lattice_forces import uneven
+from test_lattice_forces import one_at_once, uneven
 from test_ops import check
 
 from torchsoro import Chamber, Domain, Gas, Prony, Simulator, Solid, fill
@@ -23,9 +23,7 @@ DOMAIN = Domain(
 
 
 @pytest.mark.parametrize("name", ["coefficients", "pressure", "state"])
-@pytest.mark.parametrize(
-    "lanes", [pytest.param(True, id="lanes"), pytest.param(False, id="taichi", marks=pytest.mark.slow)]
-)
+@one_at_once
 def test_gradcheck_by_shares_of_air_and_what_acts_on_them(name, lanes):
     assert check(with_shared_air(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes)), name)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, compared
@@ -75,9 +76,11 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
             small.append(c.name)
     told = weighing.beside_nothing(told, {name: names[name].probability for name in small})
 
+    @cache
     def gain(name: str) -> tuple[float, float]:
-        found = next((c for c in candidates if c.name == name), None)
-        return compared(data, found.best, weighing.bounded, weighing.kappa) if found else (0.0, math.inf)
+        if name not in names:
+            return 0.0, math.inf
+        return compared(data, names[name].best, weighing.bounded, weighing.kappa)
 
     chosen = _credible(told)
     predictive = gain(chosen[0])
@@ -104,7 +107,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         limit=limit,
         matters=matters,
         motion=data.size,
-        partly=any(c.best.matters for c in candidates if c.name == chosen[0]),
+        partly=chosen[0] in names and names[chosen[0]].best.matters,
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )

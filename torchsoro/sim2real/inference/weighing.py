@@ -235,8 +235,8 @@ class Weighing:
         count = _numbers(best.near.numerics)
 
         @cache
-        def ln_within(name: str, error: float) -> float:
-            return ln_prior[name] + ln_evidence_within(self.data, self.groups[name][0].near, error, count)
+        def ln_within(name: str, size: float) -> float:
+            return ln_prior[name] + ln_evidence_within(self.data, self.groups[name][0].near, size, count)
 
         stated = {
             name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
