@@ -20,7 +20,7 @@ from torchsoro.sim2real.inference.evidence import (
     infer,
 )
 from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told
-from torchsoro.sim2real.inference.observed import Data, TrialData, independent, size_of
+from torchsoro.sim2real.inference.observed import Data, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
 from torchsoro.sim2real.inference.verdict import _looked_at_again, _moved
@@ -246,20 +246,6 @@ def test_where_no_model_is_right_it_is_linearised_again_where_its_numbers_are_to
     for one, again in ((found, []), (infer(data, drag), [0])):
         weighing = Weighing(data=data, nothing=(nothing,), effects=(one,), names=10)
         assert _looked_at_again(weighing, np.inf, 1) == [(one,)[k] for k in again]
-
-
-def test_residuals_that_last_and_move_together_are_worth_few_values():
-    rng = np.random.default_rng(19)
-    count, time = 2000, 40.0  # samples, and their correlation time in samples
-    keep = np.exp(-1 / time)
-    x = np.zeros((count, 4))
-    for k in range(1, count):
-        x[k] = keep * x[k - 1] + np.sqrt(1 - keep**2) * rng.normal(size=4)
-    apart_, together = x.reshape(count, 2, 2), np.repeat(x[:, :1], 4, 1).reshape(count, 2, 2)
-    assert independent((rng.normal(size=(count, 2, 2)),)) == pytest.approx(4 * count, rel=0.1)
-    assert independent((apart_,)) == pytest.approx(4 * count / time, rel=0.3)
-    assert independent((together,)) == pytest.approx(count / time, rel=0.3)
-    assert independent((together, together)) == pytest.approx(2 * independent((together,)))
 
 
 def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told():

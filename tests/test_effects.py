@@ -42,7 +42,8 @@ def test_an_orifice_without_a_hole_is_a_lag(made):
     leak, lag = OrificeLeak()(scenario, values, twin), PressureLag()(scenario, values[:, 1:], twin)
     # Implicit steps of half a millisecond are late by half of that: 1.25 % of the time constant.
     assert float((leak.pressure.pressure - lag.pressure.pressure).abs().max()) < 0.0125 * 1e4
-    assert OrificeLeak().simpler(np.array([0.0, 0.02]))[0] == "pressure_lag"
+    (simple,) = OrificeLeak().simpler(np.array([0.0, 0.02]))
+    assert simple.name == "pressure_lag" and simple.values == [0.02] and not simple.ln_pressure
 
 
 def test_a_bend_deflects_the_free_end_and_keeps_cross_sections_plane_and_normal(made):

@@ -23,7 +23,7 @@ from torchsoro.sim2real.inference.noise import LASTING, NoiseModel, estimate_noi
 from torchsoro.sim2real.inference.observation import MarkerSlip, ObservationModel
 from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import WALLS, choose_twin, cost, finer
-from torchsoro.sim2real.inference.search import _by_finer, _simpler
+from torchsoro.sim2real.inference.search import _by_finer
 from torchsoro.sim2real.inference.starts import FIRST, null_starts, spread
 from torchsoro.sim2real.inference.verdict import judge
 from torchsoro.sim2real.report.explanation import as_json, effect_rows
@@ -130,21 +130,6 @@ def test_finds_what_its_own_twin_was_given(made, name, values, wrong):
     assert one.total < 0.3 * other.total
 
 
-def test_a_tether_of_nothing_but_its_mass_is_a_mass(made):
-    twin, record = made
-    recorded = record("attached_mass", (0.004, 0.055, 0.01, 0.015))
-    problem = FitProblem(recorded, twin, trials=recorded.trials[:1])
-    mass, tether = effect("attached_mass"), effect("tether")
-    start = np.array([0.0, 0.0, 0.0, 2.0, 9.0, 5.0, 7.0])
-    (hung,) = problem.fit([((tether,), start)], rounds=2)
-    bare = np.where(np.arange(6) < 2, 0.0, hung.values[0])
-    (found,) = _simpler(problem, [mass, tether], [dataclasses.replace(hung, values=(bare,))])
-    assert found.name == "attached_mass" and found.values[0][0] == pytest.approx(0.004, rel=0.35)
-    sprung = dataclasses.replace(hung, values=(np.where(np.arange(6) == 0, 1.0, bare),))
-    assert _simpler(problem, [mass, tether], [sprung]) == [sprung]
-    assert _simpler(problem, [tether], [dataclasses.replace(hung, values=(bare,))])[0].name == "tether"
-
-
 def test_the_beginning_of_a_trial_is_that_of_its_recording(made):
     twin, record = made
     recorded = record(None)
@@ -183,14 +168,13 @@ def test_a_clock_that_is_behind_has_seen_what_comes_after_the_end(made):
         assert all(s.duration == pytest.approx(end) for s in part.scenarios)
 
 
-def test_a_leak_without_a_loss_is_a_lag_and_without_a_lag_a_loss():
-    leak = effect("leak")
-    assert leak.simpler(np.array([0.1, 0.02])) is None
-    name, values = leak.simpler(np.array([0.0, 0.02]))
-    assert name == "pressure_lag" and values == pytest.approx([0.02])
-    name, values = leak.simpler(np.array([0.1, 0.0]))
-    told = effect("pressure_loss").reported(values, None, None)
-    assert name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
+def test_a_leak_is_a_lag_at_a_lower_pressure_and_at_once_a_loss():
+    lag, loss = effect("leak").simpler(np.array([0.1, 0.02]))
+    assert lag.name == "pressure_lag" and lag.values == pytest.approx([0.02])
+    assert np.exp(lag.ln_pressure) == pytest.approx(0.9)
+    told = effect("pressure_loss").reported(loss.values, None, None)
+    assert loss.name == "pressure_loss" and told["fraction"][0] == pytest.approx(0.1)
+    assert not loss.ln_pressure
 
 
 def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):

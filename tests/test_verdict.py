@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from ringing import effect
 
+from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict, predictions
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, distinct, running
 from torchsoro.sim2real.inference.starts import unconstrained
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.inference.verdict import weighed
+from torchsoro.sim2real.inference.verdict import _as_simpler, weighed
 from torchsoro.sim2real.report import sentences
 from torchsoro.sim2real.report.explanation import Explanation, as_json
 from torchsoro.sim2real.report.sentences import evidence, verdict_sentence
@@ -63,6 +65,38 @@ def test_modulus_beyond_its_tolerance_is_fitted_without_its_prior(still):
     ((chosen, begin),) = unconstrained(problem, library(), dataclasses.replace(null_model, point=np.array([3.5])))
     assert [e.name for e in chosen] == ["modulus"]
     assert begin.tolist() == pytest.approx([0.0, 3.5])  # tolerance and scale are the same
+
+
+def test_what_a_leak_extends_is_weighed_where_it_supplies_the_same_pressure(still):
+    _, null_model = still
+    common = (Modulus(), 0.1), (PressureGain(), 0.05)
+    problem = SimpleNamespace(
+        common=common, scales=lambda effects: np.array([0.1, 0.05, *(q.scale for e in effects for q in e.quantities)])
+    )
+    leak = effect("leak")
+    # Eight hundredths less of a supply that is seven hundredths higher, late by 30 ms.
+    fit = dataclasses.replace(
+        null_model, effects=(leak,), values=(np.array([0.08, 0.03]),), point=np.array([0.4, 1.4, 1.6, 3.0])
+    )
+    effects = [effect("pressure_loss"), effect("pressure_lag")]
+    lag, loss = _as_simpler(problem, effects, [fit, null_model])
+    total = 0.07 + math.log(0.92)
+    assert lag.name == "pressure_lag" and lag.point == pytest.approx([0.4, total / 0.05, 3.0])
+    # The stated pressure is the same number as the loss, which moves in its place.
+    assert loss.name == "pressure_loss" and loss.point == pytest.approx([0.4, 0.0, total / 0.05])
+    assert _as_simpler(problem, [leak], [fit]) == []
+    at_once = dataclasses.replace(fit, values=(np.array([0.08, 0.0]),))
+    assert [f.name for f in _as_simpler(problem, effects, [at_once])] == ["pressure_loss"]
+
+
+def test_the_mass_of_a_tether_is_weighed_at_its_place(still):
+    problem, null_model = still
+    tether, mass = effect("tether"), effect("attached_mass")
+    values = np.array([4.0, 0.1, 0.006, 0.05, 0.01, 0.01])
+    point = np.concatenate([[0.2], values / problem.scales((tether,))[1:]])
+    fit = dataclasses.replace(null_model, effects=(tether,), values=(values,), point=point)
+    (found,) = _as_simpler(problem, [tether, mass], [fit])
+    assert found.name == "attached_mass" and found.point == pytest.approx(point[[0, 3, 4, 5, 6]])
 
 
 def test_ends_of_one_name_count_once_where_they_are_the_same_place(still):

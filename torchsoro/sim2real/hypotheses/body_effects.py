@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
+from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity, Simpler
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
@@ -239,10 +239,9 @@ class Tether(Hypothesis):
     )
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
 
-    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
         """Without spring and dashpot, a mass."""
-        slack = all(v < 0.01 * q.scale for v, q in zip(values[:2], self.quantities, strict=False))
-        return ("attached_mass", values[2:]) if slack else None
+        return [Simpler("attached_mass", values[2:])]
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """The spring is at rest in the undeformed body."""

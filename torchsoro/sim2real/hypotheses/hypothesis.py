@@ -48,6 +48,21 @@ class Quantity:
     most: float = math.inf
 
 
+@dataclass(frozen=True)
+class Simpler:
+    """An effect that another one extends, where it comes nearest to that.
+
+    Attributes:
+        name: Of the effect.
+        values: Of its quantities in their units, and its place if it is local [K].
+        ln_pressure: By what ln of the stated pressure differs then, which stands for the numbers that are left out.
+    """
+
+    name: str
+    values: np.ndarray
+    ln_pressure: float = 0.0
+
+
 class Hypothesis(nn.Module):
     """One effect.
 
@@ -114,9 +129,9 @@ class Hypothesis(nn.Module):
         """Excess of ln of the modulus on the stiffest side over its mean: the stated one may be that of this side."""
         return 0.0
 
-    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
-        """A simpler effect that is the same at values [K]: its name and its values; None if there is none."""
-        return None
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
+        """What is left of the effect at values [K] without one or more of its numbers; nothing that has no name."""
+        return []
 
     def probe_points(self, twin: Twin) -> list[np.ndarray]:
         """Points at which the response is simulated: alternatives, each with directions [D, K] in scales.

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity
+from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity, Simpler
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
@@ -128,12 +128,10 @@ class Leak(Hypothesis):
     quantities = (Quantity("fraction", "1", 0.05, 0.0, 19.0), Quantity("time_constant_s", "s", 0.01, 0.0, 100.0))
     starts = tuple((f, t) for f in (1.0, 5.0) for t in (1.0, 3.0))
 
-    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
-        """With all of the pressure in the end, a lag; at once, a loss."""
-        full, prompt = (v < 0.01 * q.scale for v, q in zip(values, self.quantities, strict=True))
-        if full:
-            return "pressure_lag", values[1:]
-        return ("pressure_loss", np.log1p(-values[:1])) if prompt else None
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
+        """A lag, at a pressure that is as much lower; at once, a loss."""
+        lost = np.log1p(-values[:1])
+        return [Simpler("pressure_lag", values[1:], ln_pressure=float(lost[0])), Simpler("pressure_loss", lost)]
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Less pressure, later."""
@@ -165,9 +163,9 @@ class OrificeLeak(Hypothesis):
         """By the names of the other form."""
         return {"fraction": (float(values[0]), "1"), "time_constant_s": (float(values[1]), "s")}
 
-    def simpler(self, values: np.ndarray) -> tuple[str, np.ndarray] | None:
-        """Without a hole, a lag."""
-        return ("pressure_lag", values[1:]) if values[0] < 0.01 * self.quantities[0].scale else None
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
+        """Without a hole, a lag, at a pressure as much lower as it is at the highest."""
+        return [Simpler("pressure_lag", values[1:], ln_pressure=float(np.log1p(-values[0])))]
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """Less pressure, later; of pressures below the surroundings', as of those above."""

@@ -75,7 +75,7 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
         effects=tuple(e.name for e in effects),
         priors=(*moving, *faults),
         own=tuple(range(beliefs, len(moving))),
-        simpler=simpler_of(problem, effects),
+        simpler=simpler_of(effects),
         beliefs=beliefs,
         released=tuple(k - (len(held) - len(moving)) for k in released),
     )
@@ -87,18 +87,11 @@ def held_of(problem: Likelihood, effects: Effects) -> np.ndarray:
     return np.array(held + [False] * (len(problem.scales(effects)) - len(held)))
 
 
-def simpler_of(problem: Likelihood, effects: Effects) -> tuple[str, ...]:
-    """Names that effects are extensions of: of a pair its members, of one what it comes to at zero."""
+def simpler_of(effects: Effects) -> tuple[str, ...]:
+    """Names that effects are extensions of: of a pair its members, of one what is left without some of its numbers."""
     if len(effects) > 1:
         return tuple(e.name for e in effects)
-    found = set()
-    for effect in effects:
-        # At zero in all quantities but one, an effect with several says what it is by itself.
-        for row in np.eye(len(effect.quantities)):
-            values = row * [q.scale for q in effect.quantities]
-            plain = effect.simpler(np.concatenate([values, problem.twin.setup.center] if effect.local else [values]))
-            found |= {plain[0]} if plain else set()
-    return tuple(sorted(found))
+    return tuple(s.name for e in effects for s in e.simpler(np.zeros(len(e.quantities) + 3 * e.local)))
 
 
 def near(

@@ -15,10 +15,8 @@ from torchsoro.sim2real.inference.recording_faults import find_slips
 from torchsoro.sim2real.inference.resolution import cost
 from torchsoro.sim2real.inference.starts import (
     EARLY_ABOVE,
-    FAINT,
     STARTS,
     Task,
-    correlation,
     likely,
     looked_at,
     null_starts,
@@ -116,7 +114,7 @@ def search(
         left = best[0].chi2 - best[0].samples
         pairs = _pairs(problem, effects, running(problem, best), report)
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
-    ends = distinct([*_simpler(problem, effects, best), *sorted(completed, key=lambda f: f.chi2)], ENDS)
+    ends = distinct([*best, *sorted(completed, key=lambda f: f.chi2)], ENDS)
     ends = running(problem, ends)
     valleys = _other_valleys(problem, null_model, ends)
     if not problem.searched_finely:
@@ -233,21 +231,6 @@ def _other_valleys(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) ->
         return []
     tasks: list[Task] = [((), point) for point in within_tolerances(problem)]
     return [f for f in problem.fit(tasks, errors=null_model.errors, rounds=0, settle=False) if f is not None]
-
-
-def _simpler(problem: FitProblem, effects: Sequence[Hypothesis], best: list[Fit]) -> list[Fit]:
-    """Fits without those of the best that come to a simpler effect, which are fitted as that."""
-    for fit in [f for f in best[:3] if len(f.effects) == 1]:
-        simple = fit.effects[0].simpler(fit.values[0])
-        plain = [e for e in effects if simple is not None and e.name == simple[0]]
-        if simple is None or not plain:
-            continue
-        known = len(fit.ln_factors)
-        start = np.concatenate([fit.point[:known], simple[1] / problem.scales((plain[0],))[known:]])
-        (again,) = problem.fit([((plain[0],), start)], errors=fit.errors, rounds=ROUNDS)
-        if again is not None and again.chi2 < fit.chi2 + 2 * FAINT * correlation(fit):
-            best = _best([*(f for f in best if f is not fit), again])
-    return best
 
 
 def _from_the_beginning(problem: FitProblem, effects: Sequence[Hypothesis], most: int) -> list[Task]:

@@ -11,6 +11,7 @@ import numpy as np
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
+from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
@@ -145,7 +146,8 @@ def weighed(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
-    known = weigh(problem, [null_model, *strained, *_as_beliefs(problem, null_model, ends), *ends])
+    simpler = [*_as_beliefs(problem, null_model, ends), *_as_simpler(problem, effects, ends)]
+    known = weigh(problem, [null_model, *strained, *simpler, *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.leading
     leading = at_mode(problem, _fit_of(known, best), told(data, best))
@@ -208,6 +210,27 @@ def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> li
             if len(fit.effects) == 1 and isinstance(fit.effects[0], type(stated)) and abs(off) <= 1:
                 point = np.where(np.arange(len(problem.common)) == k, off, fit.point[: len(problem.common)])
                 found.append(dataclasses.replace(null_model, point=point, errors=fit.errors))
+    return found
+
+
+def _as_simpler(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequence[Fit]) -> list[Fit]:
+    """Where an effect that others extend comes nearest to these, as its own search may have ended elsewhere."""
+    found, known = [], len(problem.common)
+    for fit in ends:
+        if len(fit.effects) != 1:
+            continue
+        for simple in fit.effects[0].simpler(fit.values[0]):
+            plain = next((e for e in effects if e.name == simple.name), None)
+            if plain is None or not simple.values[0]:
+                continue
+            own, stated = simple.values / problem.scales((plain,))[known:], fit.point[:known].copy()
+            for k, (belief, tolerance) in enumerate(problem.common):
+                if isinstance(belief, PressureGain):
+                    stated[k] += simple.ln_pressure / tolerance
+                if isinstance(plain, type(belief)):  # one number by two names, of which the effect's moves
+                    own[0] += stated[k] * tolerance / plain.quantities[0].scale
+                    stated[k] = 0.0
+            found.append(dataclasses.replace(fit, effects=(plain,), point=np.concatenate([stated, own])))
     return found
 
 

@@ -20,7 +20,8 @@ So it does between modes of one name.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
-as few as the most lasting draw of the twin's error amounts to. By this likelihood, with the priors as they are, another
+as few as the most lasting draw of the twin's error amounts to in a trial: cells that are too stiff are so in all of
+them. By this likelihood, with the priors as they are, another
 name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
 that a stated number is off by many tolerances is improbable whatever the twin errs by. An extension has a number more,
 by which it fits the twin's error as well: beside what it extends, the error is as large as it is priced. Nothing and
@@ -38,7 +39,7 @@ from functools import cache, cached_property
 import numpy as np
 
 from torchsoro.sim2real.inference.decision import MISSING
-from torchsoro.sim2real.inference.evidence import Model, Posterior, TwinError, adjusted, ln_strained, mode_of, products
+from torchsoro.sim2real.inference.evidence import Model, Posterior, adjusted, ln_strained, mode_of, products
 from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
@@ -232,7 +233,7 @@ class Weighing:
         if not probabilities[first] or not error:
             return probabilities
         ln_p = {name: math.log(max(p, 1e-300)) for name, p in probabilities.items()}
-        count = _numbers(best.near.numerics)
+        count = best.near.numerics.count
 
         @cache
         def ln_within(name: str, size: float) -> float:
@@ -265,7 +266,7 @@ class Weighing:
         numerics, none = self.null.near.numerics, probabilities[NOTHING] - sum(small.values())
         if not small or not numerics.size:
             return probabilities
-        count = _numbers(numerics)
+        count = numerics.count
         ln_nothing = math.log(1 - MISSING) + ln_evidence_within(self.data, self.null.near, numerics.size, count)
         ln_odds = {NOTHING: 0.0}
         for name, share in small.items():
@@ -339,11 +340,6 @@ def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
         product = total(products(data, numerics.without(k), found.discrepancy, columns)).product
         gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
     return 1.0 + float(np.mean(gained))
-
-
-def _numbers(numerics: TwinError) -> float:
-    """Independent numbers that all samples amount to, with the most lasting draw of the twin's error."""
-    return min((independent(draw) for draw in numerics.draws), default=1.0)
 
 
 def normalised(ln_p: dict[str, float]) -> dict[str, float]:
