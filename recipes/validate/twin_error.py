@@ -80,6 +80,8 @@ def main(asked: Options) -> None:
     """Print a table of each case, and in how many directions all trials agree."""
     sealed = asked.batch / "sealed"
     truths = {p.stem: json.loads(p.read_text()) for p in sorted(sealed.glob("case-*.json"))}
+    if not truths:
+        raise ValueError(f"batch = {asked.batch}: no sealed/case-*.json, wanted a batch with its truth")
     names = asked.cases or [n for n, t in truths.items() if t["kind"] == "null"]
     if unknown := [n for n in names if n not in truths or truths[n]["effects"]]:
         raise ValueError(f"cases = {', '.join(unknown)}: wanted cases of {sealed} that lack nothing")

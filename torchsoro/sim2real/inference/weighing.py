@@ -21,11 +21,11 @@ So it does between modes of one name.
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
 as few as the most lasting draw of the twin's error amounts to in a trial: cells that are too stiff are so in all of
-them. By this likelihood, with the priors as they are, another
-name is as probable as it is at least. It is at most as probable as the first, but for how much less it strains beliefs:
-that a stated number is off by many tolerances is improbable whatever the twin errs by. An extension has a number more,
-by which it fits the twin's error as well: beside what it extends, the error is as large as it is priced. Nothing and
-what moves the body by less than the twin may err are compared in the same way.
+them. By this likelihood, with the priors as they are, another name is as probable as it is at least. It is at most as
+probable as the first, but for how much less it strains beliefs: that a stated number is off by many tolerances is
+improbable whatever the twin errs by. An extension has a number more, by which it fits the twin's error as well: beside
+what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
+are compared in the same way.
 """
 
 from __future__ import annotations
