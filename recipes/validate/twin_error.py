@@ -27,9 +27,11 @@ from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options as Explaining
 
-EFFECTS = ("modulus", "viscoelastic", "stiffening", "density", "drag", "gravity_tilt")
-SUPPLY = ("pressure_lag", "pressure_loss", "leak", "air_stiffness")
-LASTING = 10.0  # samples that count as one: noise in part lasts
+EFFECTS = (
+    *("modulus", "viscoelastic", "stiffening", "density", "drag", "gravity_tilt"),
+    *("pressure_lag", "pressure_loss", "leak", "air_stiffness"),
+)
+CORRELATED = 10.0  # samples that count as one: noise in part lasts
 
 
 @options
@@ -60,7 +62,7 @@ def amplitudes(problem: FitProblem, at: np.ndarray, effects: list[Hypothesis]) -
     bare, *moved = problem.simulate([((), at[None]), *asked])
     deviations = problem.observation.deviations
     none = np.zeros(len(deviations))
-    weight = 1 / (LASTING * problem.noise**2)
+    weight = 1 / (CORRELATED * problem.noise**2)
     found = np.zeros((len(effects), len(problem.trials)))
     for i, trial in enumerate(problem.trials):
         assert trial.recording is not None
@@ -91,13 +93,10 @@ def main(asked: Options) -> None:
             Explaining(experiment=asked.batch / "cases" / name, out=asked.batch, threads=asked.threads)
         )
         problem = FitProblem(inputs.experiment, inputs.fine, trials=inputs.trials, threads=inputs.threads)
-        chambered = bool(problem.experiment.setup.chambers)
-        wanted = (*EFFECTS, *(SUPPLY if chambered else ()))
-        effects = list({e.name: e for e in problem.thought_of(library()) if e.name in wanted}.values())
+        effects = list({e.name: e for e in problem.thought_of(library()) if e.name in EFFECTS}.values())
+        found = amplitudes(problem, true_point(problem, truths[name]["nuisance"]), effects)
         print(f"{name}, {truths[name]['specimen']}: mm along the response to an effect, by trial")
-        for effect, own in zip(
-            effects, amplitudes(problem, true_point(problem, truths[name]["nuisance"]), effects), strict=True
-        ):
+        for effect, own in zip(effects, found, strict=True):
             print(f"  {effect.name:<14}" + "".join(f"{1e3 * a:+9.3f}" for a in own), flush=True)
             agreed, count = agreed + (abs(np.sign(own).sum()) == len(own)), count + 1
     print(f"one sign in all trials: {agreed} of {count} directions")
