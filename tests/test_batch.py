@@ -16,7 +16,7 @@ from torchsoro.sim2real.twin.batch import simulate, waves
 from torchsoro.sim2real.twin.twin import Twin
 
 EDGE = 0.008
-EFFECTS = {e.name: e for e in library()}
+EFFECTS = {type(e).__name__: e for e in library()}
 
 
 @pytest.fixture
@@ -25,13 +25,14 @@ def trial(tmp_path):
 
 
 def varied(twin, trial):
-    """Variations without and with two Maxwell elements, springs, added mass and drag; those of an effect differ."""
+    """Variations without and with two Maxwell elements, springs, added mass, drag and forces; all differ."""
     still = twin.scenario(trial)
     values = {
-        "modulus": [[0.0], [0.3], [-0.2]],
-        "viscoelastic": [[0.3, 0.0], [0.1, -1.0]],
-        "attached_mass": [[1e-3, 0.02, 0.01, 0.02]],
-        "tether": [[3.0, 0.1, 1e-4, 0.03, 0.01, 0.02], [10.0, 0.0, 1e-3, 0.02, 0.01, 0.02]],
+        "Modulus": [[0.0], [0.3], [-0.2]],
+        "Viscoelastic": [[0.3, 0.0], [0.1, -1.0]],
+        "AttachedMass": [[1e-3, 0.02, 0.01, 0.02]],
+        "Tether": [[3.0, 0.1, 1e-4, 0.03, 0.01, 0.02], [10.0, 0.0, 1e-3, 0.02, 0.01, 0.02]],
+        "TautTether": [[0.0, 0.02, 0.0, 0.03, 0.01, 0.02], [0.0, 0.02, 0.0, 0.02, 0.01, 0.02]],
     }
     return [EFFECTS[name](still, torch.tensor(v, dtype=torch.float64), twin) for name, v in values.items()]
 

@@ -365,6 +365,19 @@ def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_m
     assert found.probabilities.get("leak", 0.0) < 0.02  # what leaves much is not told by name
 
 
+def test_forms_of_a_name_are_modes_of_their_own_whatever_their_numbers():
+    data, nothing, drag = recorded(0.0, 8, effect=0.3)
+    linear = dataclasses.replace(drag, model=dataclasses.replace(drag.model, forms=("Linear",)))
+    quadratic = dataclasses.replace(drag, model=dataclasses.replace(drag.model, forms=("Quadratic",)))
+    wide = Model(effects=("drag",), priors=(Prior(1.0), Prior(1.0)), own=(0, 1), forms=("General",))
+    slopes = tuple(np.concatenate([J, J**2], -1) for J in drag.slopes)
+    general = Linearised(model=wide, at=np.zeros(2), residuals=drag.residuals, slopes=slopes, numerics=EXACT)
+    weighing = weighed(data, nothing, linear, linear, quadratic, general)
+    assert sorted(p.near.model.forms for p in weighing.groups["drag"]) == [("General",), ("Linear",), ("Quadratic",)]
+    for mode in weighing.groups["drag"]:
+        assert weighing.latest(mode).near.model.forms == mode.near.model.forms
+
+
 def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
     data, nothing, drag = recorded(0.0, 8, effect=0.3)
     spring = tuple(np.concatenate([J, 0.01 * J**2], -1) for J in drag.slopes)

@@ -10,10 +10,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from torchsoro.sim2real.hypotheses.body_effects import LoadInertia, TautTether
 from torchsoro.sim2real.hypotheses.outer_effects import InitialPose
-from torchsoro.sim2real.hypotheses.supply_effects import OrificeLeak, PressureLag
+from torchsoro.sim2real.hypotheses.supply_effects import OrificeLeak, PressureLag, ThrottledLoss
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
+from torchsoro.simulation.loads import Force
 
 
 def supplied(made, pressure):
@@ -34,6 +36,21 @@ def test_an_orifice_takes_its_share_of_the_highest_steady_pressure_and_less_of_a
     q = (np.sqrt(b**2 + 1) - b) / 2
     assert float(found[0]) == pytest.approx(sign * pressure * q**2, rel=1e-9)
     assert q**2 / 0.25 <= 1 - share + 1e-12
+
+
+@given(share=st.floats(0.0, 0.9), part=st.floats(0.01, 1.0), sign=st.sampled_from((1.0, -1.0)))
+def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_one(made, share, part, sign):
+    highest = 1e4
+    twin, scenario = supplied(made, [sign * part * highest, sign * highest, 0.0])
+    values = torch.tensor([[share], [0.0]], dtype=torch.float64)
+    found = ThrottledLoss()(scenario, values, twin).pressure.pressure[:, 0]
+    assert float(found[0, 1]) == pytest.approx(sign * highest * (1 - share), rel=1e-9)
+    # What is missing is what air that seeps away in proportion to p loses in the throttle.
+    p = abs(float(found[0, 0]))
+    assert p + share / (1 - share) ** 2 * p**2 / highest == pytest.approx(part * highest, rel=1e-9)
+    assert p >= part * highest * (1 - share) * (1 - 1e-12)
+    assert float(found[0, 2]) == 0.0
+    assert torch.equal(found[1], scenario.pressure.pressure)
 
 
 def test_an_orifice_without_a_hole_is_a_lag(made):
@@ -70,3 +87,32 @@ def test_only_a_body_that_is_clamped_at_one_face_is_let_go_from_a_bend(made):
     assert InitialPose().applies(scenario, twin)
     free = Twin(dataclasses.replace(setup, clamps=()), edge=twin.edge)
     assert not InitialPose().applies(scenario, free)
+
+
+def test_a_taut_tube_pulls_each_variation_at_its_own_place(made):
+    twin, record = made
+    scenario = twin.scenario(record(None).trials[0])
+    places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]) * torch.tensor(twin.setup.size)
+    places = places.double() + torch.tensor(twin.setup.origin, dtype=torch.float64)
+    pulls = torch.tensor([[0.0, 0.03, 0.04], [0.02, 0.0, 0.0], [0.0, 0.0, -0.01]], dtype=torch.float64)
+    forces = TautTether()(scenario, torch.cat([pulls, places], -1), twin).loads
+    assert len(forces) == 2  # two places
+    on_nodes = sum(f.value[:, None] * f.share[:, None] for f in forces)
+    assert torch.allclose(on_nodes.sum(1), pulls, rtol=1e-12, atol=0)
+    shares = on_nodes.norm(dim=-1) / pulls.norm(dim=-1)[:, None]
+    assert torch.allclose(shares[0], shares[2]) and not torch.allclose(shares[0], shares[1])
+    assert TautTether().reported(np.array([0.0, 0.03, 0.04]), scenario, twin)["pull_n"] == (pytest.approx(0.05), "N")
+
+
+def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
+    twin, record = made
+    scenario = twin.scenario(record(None).trials[0])
+    assert not LoadInertia().applies(scenario, twin)
+    weight = Force(share=torch.eye(twin.nodes, dtype=torch.float64)[0], value=0.1 * scenario.gravity)
+    pulled = TautTether()(scenario.plus(weight), torch.tensor([[0.01, 0.02, 0.0, 0.0, 0.0, 0.0]] * 2).double(), twin)
+    assert LoadInertia().applies(pulled, twin)
+    values = torch.tensor([[0.25], [1.0]], dtype=torch.float64)
+    left, pull, mass = LoadInertia()(pulled, values, twin).loads
+    assert pull is pulled.loads[1]
+    assert torch.allclose(left.value, 0.1 * scenario.gravity * (1 - values))
+    assert torch.allclose(mass.mass, 0.1 * values[:, 0])

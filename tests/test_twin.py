@@ -123,7 +123,7 @@ def test_centroid_of_a_load_is_the_middle_of_its_box(trial):
     box = ((0.03, 0.006, 0.012), (0.04, 0.013, 0.02))
     t = changed(trial, forces=(ForceTable(box=box, force=(0.0, 0.0, -0.1)),))
     push = Twin(t.setup, edge=EDGE)
-    push = push.scenario(t).forces[0].share @ push.places
+    push = push.scenario(t).loads[0].share @ push.places
     torch.testing.assert_close(push, torch.tensor([0.035, 0.0095, 0.016], dtype=torch.float64))
 
 

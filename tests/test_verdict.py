@@ -12,11 +12,11 @@ from ringing import effect
 
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
+from torchsoro.sim2real.hypotheses.supply_effects import PressureGain, ThrottledLoss
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.heldout import predict, predictions
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, distinct, running
-from torchsoro.sim2real.inference.starts import unconstrained
+from torchsoro.sim2real.inference.starts import likely, unconstrained
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.verdict import _as_simpler, weighed
 from torchsoro.sim2real.report import sentences
@@ -236,3 +236,14 @@ def test_why_an_effect_that_fits_is_not_told(still):
     blind = dataclasses.replace(found.conclusion, kind="cannot_tell", chosen=(), limit=math.inf, matters=1e-3)
     told = evidence(explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=blind)))
     assert "No effect would have been seen, however large." in told
+
+
+def test_each_form_of_an_effect_is_searched_however_well_another_one_looks():
+    null = SimpleNamespace(chi2=1e5, samples=100, point=np.zeros(1), whitened=[np.array([1.0, -1.0, 1.0])])
+    throttled, gain, modulus = ThrottledLoss(), PressureGain(), Modulus()
+    looks = [(10.0 + k, throttled, np.array([0.0, 2.0**k])) for k in range(5)]
+    looks.append((11.5, throttled, np.array([0.1, 2.1])))
+    looks += [(50.0, gain, np.array([0.0, 2.0])), (60.0, modulus, np.array([0.0, 1.0]))]
+    found = [(type(effects[0]), start[-1]) for effects, start in likely(looks, null, most=9)]  # type: ignore[arg-type]
+    first, more = [(ThrottledLoss, 1.0), (Modulus, 1.0)], [(ThrottledLoss, 2.0), (ThrottledLoss, 4.0)]
+    assert found == [*first, *more, (PressureGain, 2.0)]

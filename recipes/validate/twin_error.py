@@ -18,18 +18,18 @@ import numpy as np
 import tyro
 
 from torchsoro.command_line import options, program
-from torchsoro.sim2real.hypotheses.body_effects import Modulus
+from torchsoro.sim2real.hypotheses.body_effects import Density, Modulus, Stiffening, Viscoelastic
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.hypotheses.library import library
-from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
+from torchsoro.sim2real.hypotheses.outer_effects import FluidDrag, GravityTilt
+from torchsoro.sim2real.hypotheses.supply_effects import AirStiffness, OrificeLeak, PressureGain, PressureLag
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options as Explaining
 
 EFFECTS = (
-    *("modulus", "viscoelastic", "stiffening", "density", "drag", "gravity_tilt"),
-    *("pressure_lag", "pressure_loss", "leak", "air_stiffness"),
+    *(Modulus, Viscoelastic, Stiffening, Density, FluidDrag, GravityTilt),
+    *(PressureLag, PressureGain, OrificeLeak, AirStiffness),
 )
 CORRELATED = 10.0  # samples that count as one: noise in part lasts
 
@@ -93,7 +93,7 @@ def main(asked: Options) -> None:
             Explaining(experiment=asked.batch / "cases" / name, out=asked.batch, threads=asked.threads)
         )
         problem = FitProblem(inputs.experiment, inputs.fine, trials=inputs.trials, threads=inputs.threads)
-        effects = list({e.name: e for e in problem.thought_of(library()) if e.name in EFFECTS}.values())
+        effects = problem.thought_of([kind() for kind in EFFECTS])
         found = amplitudes(problem, true_point(problem, truths[name]["nuisance"]), effects)
         print(f"{name}, {truths[name]['specimen']}: mm along the response to an effect, by trial")
         for effect, own in zip(effects, found, strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import TypeGuard
 
 import numpy as np
 import torch
@@ -12,7 +13,7 @@ from torch import Tensor
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity, Simpler
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
-from torchsoro.simulation.loads import Drag, Force, PointMass, Spring
+from torchsoro.simulation.loads import Drag, Force, Load, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
 HALF_WIDTH = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
@@ -207,19 +208,25 @@ class LoadInertia(Hypothesis):
         size = scenario.gravity.norm(dim=-1).amax()
         masses, loads = [], []
         for load in scenario.loads:
-            if isinstance(load, Force):
-                mass = values[:, 0] * load.value.norm(dim=-1).amax() / size
-                masses.append(PointMass(share=load.share, mass=mass))
-            loads.append(
-                dataclasses.replace(load, value=load.value * (1 - values)) if isinstance(load, Force) else load
-            )
+            if not _stated(load):
+                loads.append(load)
+                continue
+            mass = values[:, 0] * load.value.norm(dim=-1) / size
+            masses.append(PointMass(share=load.share, mass=mass))
+            loads.append(dataclasses.replace(load, value=load.value * (1 - values)))
         return scenario.replace(loads=(*loads, *masses))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:
         """With loads that are there from the start and point down, as weights do."""
         g = scenario.gravity.reshape(-1, 3)[0]
-        down = [float(p.value @ g) > 0.99 * float(p.value.norm() * g.norm()) for p in scenario.forces]
-        return bool(down) and all(down) and all(p.start == 0 for p in scenario.forces)
+        stated = [load for load in scenario.loads if _stated(load)]
+        down = [float(p.value @ g) > 0.99 * float(p.value.norm() * g.norm()) for p in stated]
+        return bool(down) and all(down) and all(p.start == 0 for p in stated)
+
+
+def _stated(load: Load) -> TypeGuard[Force]:
+    """Whether it is a dead force of a setup: one of another effect has a value for each variation."""
+    return isinstance(load, Force) and load.value.ndim == 1
 
 
 class Tether(Hypothesis):
@@ -250,4 +257,26 @@ class Tether(Hypothesis):
             Spring(share=share, stiffness=values[:, 0], mean=True),
             Drag(share=share, coefficient=values[:, 1]),
             PointMass(share=share, mass=values[:, 2]),
+        )
+
+
+class TautTether(Hypothesis):
+    """A taut tube pulls at a place, with a force that hardly changes as the body moves."""
+
+    name, affected_quantity, local, model_form_deviation = "tether", "force at a place", True, LAW
+    nonnegative = frozenset({"pull_n"})
+    quantities = tuple(Quantity(f"pull_{axis}", "N", 0.02, -1000.0, 1000.0) for axis in "xyz")
+    starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """Its size as well."""
+        return {**super().reported(values, scenario, twin), "pull_n": (float(np.linalg.norm(values[:3])), "N")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """One force for each place, on the variations whose place it is."""
+        places, which = torch.unique(values[:, 3:], dim=0, return_inverse=True)
+        shares = twin.at(places)
+        own = (which == torch.arange(len(places))[:, None]).to(values)
+        return scenario.plus(
+            *(Force(share=s, value=values[:, :3] * w[:, None]) for s, w in zip(shares, own, strict=True))
         )

@@ -53,7 +53,7 @@ class Simpler:
     """An effect that another one extends, where it comes nearest to that.
 
     Attributes:
-        name: Of the effect.
+        name: Of the effect, of which the first form in the library is meant.
         values: Of its quantities in their units, and its place if it is local [K].
         ln_pressure: By what ln of the stated pressure differs then, which stands for the numbers that are left out.
     """
@@ -67,7 +67,7 @@ class Hypothesis(nn.Module):
     """One effect.
 
     Attributes:
-        name: Of the effect.
+        name: Of the effect, of which the first form in the library is meant.
         affected_quantity: Quantity of the simulation that it changes, in words.
         quantities: Its parameters.
         local: Whether it acts at one place, which is then fitted as well.

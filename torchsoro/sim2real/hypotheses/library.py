@@ -12,6 +12,7 @@ from torchsoro.sim2real.hypotheses.body_effects import (
     SoftHalf,
     SoftSide,
     Stiffening,
+    TautTether,
     Tether,
     Viscoelastic,
 )
@@ -35,6 +36,7 @@ from torchsoro.sim2real.hypotheses.supply_effects import (
     OrificeLeak,
     PressureGain,
     PressureLag,
+    ThrottledLoss,
 )
 
 
@@ -42,8 +44,8 @@ def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftHalf, PrintOffset, Density),
-        *(AttachedMass, Tether, LoadInertia, FluidDrag),
-        *(PressureLag, PressureGain, Leak, OrificeLeak, AirStiffness, AirTwice),
+        *(AttachedMass, Tether, TautTether, LoadInertia, FluidDrag),
+        *(PressureLag, PressureGain, ThrottledLoss, Leak, OrificeLeak, AirStiffness, AirTwice),
         *(
             Sliding,
             Friction,

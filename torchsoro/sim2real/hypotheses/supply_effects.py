@@ -41,6 +41,42 @@ class PressureGain(Hypothesis):
         return scenario.pressure is not None
 
 
+class ThrottledLoss(Hypothesis):
+    """A throttle takes a share that grows with the pressure: p_supply = p + b p^2 / P, P the highest supply.
+
+    Air that seeps away behind it in proportion to p loses b p^2 / P in the throttle (turbulent flow). Of a steady
+    supply P, the share a is lost, where b = a / (1 - a)^2.
+    """
+
+    name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
+    quantities = (Quantity("fraction_at_highest", "1", 0.05, 0.0, 19.0),)
+    starts = ((2.0,), (6.0,))
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """By the name of the other form."""
+        return {"fraction": (float(values[0]), "1")}
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """Less pressure; of pressures below the surroundings', as of those above."""
+        assert scenario.pressure is not None
+        supply = _chambers(scenario.pressure).double()
+        share = values[:, 0].clamp(0, 0.99)
+        throttle = (share / (1 - share) ** 2)[:, None, None]
+        most = supply.abs().amax(-1, keepdim=True).clamp(min=_faint(scenario))
+        # The root of b q^2 + q = |p_supply| / P, in a form that does not cancel where b is small.
+        behind = 2 * supply / (1 + torch.sqrt(1 + 4 * throttle * supply.abs() / most))
+        return scenario.replace(pressure=dataclasses.replace(scenario.pressure, pressure=behind))
+
+    def applies(self, scenario: Scenario, twin: Twin) -> bool:
+        """With a chamber."""
+        return scenario.pressure is not None
+
+
+def _faint(scenario: Scenario) -> float:
+    """A pressure that moves nothing [Pa]."""
+    return float(scenario.youngs_modulus.mean()) * 1e-9
+
+
 def _chambers(supply: Waveform) -> Tensor:
     """Pressure [..., chambers, S]."""
     return supply.pressure if supply.pressure.ndim > 1 else supply.pressure.unsqueeze(0)
@@ -172,8 +208,7 @@ class OrificeLeak(Hypothesis):
         time, p = _sampled(scenario, len(values))
         share, tau = values[:, 0].clamp(0, 0.99), values[:, 1].clamp(min=0)
         hole = share / torch.sqrt(1 - share)
-        least = float(scenario.youngs_modulus.mean()) * 1e-9  # pressures that move nothing
-        most = p.abs().amax(-1).clamp(min=least)
+        most = p.abs().amax(-1).clamp(min=_faint(scenario))
         behind = p.clone().numpy()
         _escape(behind, hole.numpy(), tau.numpy(), most.numpy(), SAMPLE)
         return scenario.replace(pressure=Waveform(time=time, pressure=torch.from_numpy(behind)))

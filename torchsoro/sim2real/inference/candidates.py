@@ -78,6 +78,7 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
         simpler=simpler_of(effects),
         beliefs=beliefs,
         released=tuple(k - (len(held) - len(moving)) for k in released),
+        forms=tuple(sorted(type(e).__name__ for e in effects)),
     )
 
 

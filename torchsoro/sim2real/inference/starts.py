@@ -14,7 +14,7 @@ from torchsoro.sim2real.twin.twin import Twin
 
 BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
 FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
-STARTS = 3  # searches of each effect, from probe points that differ
+STARTS = 3  # searches of each effect, from probe points that differ; and one of each other form of it
 EARLY_ABOVE = (
     3.0  # chi-squared over its expectation, above which searches begin with the first part of the trials, or try pairs
 )
@@ -39,27 +39,28 @@ def probe_points(problem: FitProblem, null_model: Fit, effects: Sequence[Hypothe
 
 
 def likely(looks: Sequence[Look], null_model: Fit, most: int) -> list[Task]:
-    """Where to begin searches: each effect that promises something at its best look, then at others that differ."""
+    """Where to begin searches: each effect that promises something at its best look; then other forms, and other looks.
+
+    Looks at one form are others where they differ.
+    """
     unit = max(1.0, null_model.chi2 / null_model.samples) * correlation(null_model)
     strained = np.abs(null_model.point).max(initial=0.0) > 1  # so that much is taken up that it should not be
     first: list[Task] = []
     more: list[Task] = []
-    known: dict[str, list[np.ndarray]] = {}
+    known: dict[str, list[tuple[type[Hypothesis], np.ndarray]]] = {}
     for chi2, effect, start in sorted(looks, key=lambda look: look[0]):
         faint = null_model.chi2 - chi2 < 2 * FAINT * unit
         if faint and null_model.chi2 < 2 * null_model.samples and not strained:
             continue
-        mine = known.setdefault(effect.name, [])
-        if not mine:
-            first.append(((effect,), start))
-        elif len(mine) < STARTS:
-            scale = np.where(np.abs(start) > 1, np.abs(start), 1.0)
-            if not all((np.abs(start - k) / scale).max() > 0.4 for k in mine):
+        mine, form = known.setdefault(effect.name, []), type(effect)
+        if form in [f for f, _ in mine]:
+            if len(mine) >= STARTS:
                 continue
-            more.append(((effect,), start))
-        else:
-            continue
-        mine.append(start)
+            scale = np.where(np.abs(start) > 1, np.abs(start), 1.0)
+            if any((np.abs(start - k) / scale).max() <= 0.4 for f, k in mine if f is form):
+                continue
+        (more if mine else first).append(((effect,), start))
+        mine.append((form, start))
     return [*first, *more][:most]
 
 

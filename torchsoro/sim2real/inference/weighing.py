@@ -126,8 +126,7 @@ class Weighing:
 
     def latest(self, found: Posterior) -> Posterior:
         """The last look at a mode."""
-        name = found.near.model.name
-        return [p for p in (*self.nothing, *self.effects) if p.near.model.name == name and _same(p, found)][-1]
+        return [p for p in (*self.nothing, *self.effects) if _same(p, found)][-1]
 
     @cached_property
     def scatter(self) -> float:
@@ -358,7 +357,7 @@ def _alike(found: Sequence[Posterior]) -> list[list[Posterior]]:
     """Those of each mode, most probable first."""
     modes: list[list[Posterior]] = []
     for p in sorted(found, key=lambda p: -p.ln_evidence):
-        mine = [same for same in modes if same[0].near.model.name == p.near.model.name and _same(p, same[0])]
+        mine = [same for same in modes if _same(p, same[0])]
         if mine:
             mine[0].append(p)
         else:
@@ -372,11 +371,14 @@ def _middle(same: Sequence[Posterior]) -> Posterior:
 
 
 def _same(one: Posterior, other: Posterior) -> bool:
-    """Whether two modes of a name are one, in beliefs and in the numbers of effects.
+    """Whether two modes are one: of one name and form, near in beliefs and in the numbers of effects.
 
-    They are if they are near by the narrower of them, or by what is noticeable: that of rough motions is too narrow.
+    They are near by the narrower of them, or by what is noticeable: that of rough motions is too narrow.
     """
-    own = one.near.model.simulated
+    model, another = one.near.model, other.near.model
+    if (model.name, model.forms) != (another.name, another.forms):
+        return False
+    own = model.simulated
     off = (one.mode.at - other.mode.at)[own]
     spread = np.sqrt(np.minimum(np.diag(one.mode.covariance)[own], np.diag(other.mode.covariance)[own]))
     return bool((np.abs(off) < np.maximum(SAME * spread, CLOSE)).all())

@@ -309,8 +309,10 @@ class _Group:
             for force in self.scenarios[i].loads:
                 if isinstance(force, Force):
                     assert force.share is not None
-                    shares[id(force.share)] = force.share
                     value = force.value if force.value.ndim == 1 else force.value[b if len(force.value) > 1 else 0]
+                    if not bool(value.any()):
+                        continue  # as of a force whose place is that of other variations
+                    shares[id(force.share)] = force.share
                     whole = values.setdefault((id(force.share), force.start), torch.zeros(len(self.lanes), 3))
                     whole[k] += value.float()
         return [Force(share=shares[number], value=value, start=start) for (number, start), value in values.items()]

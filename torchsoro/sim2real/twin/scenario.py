@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane
-from torchsoro.simulation.loads import Force, Load
+from torchsoro.simulation.loads import Load
 from torchsoro.simulation.material import Prony
 
 
@@ -59,11 +59,6 @@ class Scenario:
     def plus(self, *loads: Load) -> Scenario:
         """A scenario with more loads."""
         return self.replace(loads=(*self.loads, *loads))
-
-    @property
-    def forces(self) -> tuple[Force, ...]:
-        """The dead forces among the loads."""
-        return tuple(load for load in self.loads if isinstance(load, Force))
 
     @cached_property
     def batch(self) -> int:
