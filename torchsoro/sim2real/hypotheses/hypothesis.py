@@ -67,7 +67,7 @@ class Hypothesis(nn.Module):
     """One effect.
 
     Attributes:
-        name: Of the effect, of which the first form in the library is meant.
+        name: Of the effect.
         affected_quantity: Quantity of the simulation that it changes, in words.
         quantities: Its parameters.
         local: Whether it acts at one place, which is then fitted as well.

@@ -107,7 +107,7 @@ class Model:
         simpler: Names of which this one is an extension, as a tether is of a mass, or a pair of its members.
         beliefs: Number of the first unknowns, which are beliefs over their tolerances.
         released: Numbers of the unknowns of effects that are beliefs without their tolerances.
-        forms: Laws of the effects, as a name may have several, whose numbers are others.
+        forms: Classes of the effects: a name may have several, whose numbers mean something else.
     """
 
     effects: tuple[str, ...]
