@@ -135,7 +135,9 @@ def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
 
 
 def _beside(one: Fit, other: Fit) -> bool:
-    """Whether fits of the same effects end at one place."""
+    """Whether fits of the same effects, in the same forms, end at one place."""
+    if [type(e) for e in one.effects] != [type(e) for e in other.effects]:
+        return False
     return bool((np.abs(one.point - other.point) < APART * np.maximum(np.abs(one.point), 1)).all())
 
 
