@@ -75,3 +75,23 @@ def test_twin_of_a_walker_stays_within_5_mm_of_its_plane(hide):
     assert moved.sound.all()
     # Neither falls through the ground, nor jumps off it.
     assert np.abs(moved.position[..., 2] - moved.position[..., :1, :, 2]).max() < 5e-3
+
+
+@pytest.mark.slow
+def test_twins_leave_less_of_a_walker_with_the_true_tube(hide):
+    found, _ = hide("tube", strength=10.0)
+    gap_error = importlib.import_module("gap_error")
+    tables = gap_error.main(gap_error.Options(experiment=found.folder, threads=1))
+    assert len(tables) == 2
+    for table in tables.values():
+        without, true = (np.array(table[f"{name}, corrected"]) for name in ("described", "with the true tether"))
+        assert without.shape == (len(found.trials),) and (true < without).all()
+
+
+def test_gap_error_refuses_what_it_has_no_form_for(tmp_path):
+    gap_error = importlib.import_module("gap_error")
+    for wrong in ({}, {"name": "viscoelastic"}):
+        with pytest.raises(ValueError, match=r"hidden = (nothing|viscoelastic): wanted one of tether"):
+            gap_error.true_point(None, wrong)
+    with pytest.raises(ValueError, match=r"no none-truth\.json beside it, wanted a folder of gap\.py"):
+        gap_error.main(gap_error.Options(experiment=tmp_path / "none"))

@@ -64,7 +64,7 @@ def measure(
         cells = added(trials, believed[: len(trials)], middle)
     else:
         believed = _believed(there)
-    other = [_as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
+    other = [as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
     here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors.values())
@@ -141,7 +141,7 @@ def _chance(
     return middle, touching, chance_in(seen, GAPS)
 
 
-def _as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:
+def as_simulated(motion: MarkerTrajectory, trial: Trial) -> MarkerTrajectory:
     """A motion with the places of the trial's own simulation, where there is one; it goes on by itself after that."""
     own = trial.simulated
     if own is None:
