@@ -27,6 +27,7 @@ from torchsoro.sim2real.hypotheses.supply_effects import AirStiffness
 from torchsoro.sim2real.inference.discretization import as_simulated
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import added
+from torchsoro.sim2real.inference.observed import size_of
 from torchsoro.sim2real.inputs import read_inputs
 from torchsoro.sim2real.options import Options as Explaining
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
@@ -82,7 +83,7 @@ def left(problem: FitProblem, motions: Sequence[MarkerTrajectory]) -> list[float
     """Root mean square of what motions leave of each trial, with measurement errors fitted [m]."""
     errors = problem.measure(motions, np.zeros(len(problem.observation.deviations)))[1]
     return [
-        math.sqrt(float(np.nanmean((t.recording.position - problem.observation.observe(m, i, errors)) ** 2)))
+        size_of((t.recording.position - problem.observation.observe(m, i, errors),))
         for i, (t, m) in enumerate(zip(problem.trials, motions, strict=True))
         if t.recording is not None
     ]

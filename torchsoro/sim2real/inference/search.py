@@ -129,7 +129,7 @@ def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
     """The first of fits that differ, by effects or in where they ended; so many at most."""
     found: list[Fit] = []
     for fit in fits:
-        if fit.effects and not any(fit.name == other.name and _beside(fit, other) for other in found):
+        if fit.effects and not any(_beside(fit, other) for other in found):
             found.append(fit)
     return found[:most]
 
