@@ -12,9 +12,11 @@ from torchsoro.sim2real.inference.evidence import (
     Model,
     TwinError,
     errors,
+    infer,
 )
 from torchsoro.sim2real.inference.observed import Data, TrialData
 from torchsoro.sim2real.inference.priors import Prior
+from torchsoro.sim2real.inference.weighing import Weighing
 
 MARKERS, AXES = 3, 2
 EXACT = TwinError(amplitude=np.zeros((AXES, MARKERS)))
@@ -67,3 +69,14 @@ def draws(data, count, size, seed, time=0.1):
         tuple(size * (root @ rng.normal(size=(len(times), 2)))[:, None] * np.ones((1, 3, 1)) for _ in data.trials)
         for _ in range(count)
     ]
+
+
+def weighed(data, *models, names=10):
+    """Posteriors of models beside each other."""
+    found = [infer(data, m) for m in models]
+    return Weighing(
+        data=data,
+        nothing=tuple(p for p in found if not p.near.model.effects),
+        effects=tuple(p for p in found if p.near.model.effects),
+        names=names,
+    )

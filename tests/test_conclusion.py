@@ -1,4 +1,4 @@
-"""What follows from evidence: the twin's own error, the credible set, and what would have been seen."""
+"""What follows from evidence: the twin's own error, and the credible set."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from swings import EXACT, draws, recorded
+from swings import EXACT, draws, recorded, weighed
 
 from torchsoro.sim2real.inference import conclusion
 from torchsoro.sim2real.inference.conclusion import conclude
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
     Linearised,
@@ -24,20 +24,7 @@ from torchsoro.sim2real.inference.observed import Data, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
 from torchsoro.sim2real.inference.verdict import _looked_at_again, _moved
-from torchsoro.sim2real.inference.visible import limit, remedies
 from torchsoro.sim2real.inference.weighing import Weighing, adjustment, apart, remainder
-
-# Conclusions ---------------------------------------------------------------------------------------------------------
-
-
-def weighed(data, *models, names=10):
-    found = [infer(data, m) for m in models]
-    return Weighing(
-        data=data,
-        nothing=tuple(p for p in found if not p.near.model.effects),
-        effects=tuple(p for p in found if p.near.model.effects),
-        names=names,
-    )
 
 
 def shifted(found, by):
@@ -390,6 +377,24 @@ def test_an_extension_that_moves_as_what_it_extends_goes_by_the_simpler_name():
     assert found.probabilities["drag"] == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.parametrize(("priced", "name"), [(0.0, "drag + mass"), (0.03, "drag")])
+def test_what_a_second_effect_adds_is_told_unless_the_twin_may_err_by_as_much(priced, name):
+    """A mass that changes the motion by less than matters, as an effect by itself would be told."""
+    data, nothing, drag = recorded(0.0, 8, effect=0.3)
+    more = tuple(
+        0.05 * J[..., 0] * np.sin(20 * t.time)[:, None, None] for J, t in zip(drag.slopes, data.trials, strict=True)
+    )
+    residuals = tuple(r + m for r, m in zip(drag.residuals, more, strict=True))
+    both = tuple(np.concatenate([J, m[..., None]], -1) for J, m in zip(drag.slopes, more, strict=True))
+    model = Model(effects=("drag", "mass"), priors=(Prior(1.0), Prior(1.0)), own=(0, 1), simpler=("drag", "mass"))
+    twin = dataclasses.replace(EXACT, amplitude=EXACT.amplitude + priced * data.size)
+    pair = Linearised(model=model, at=np.zeros(2), residuals=residuals, slopes=both, numerics=twin)
+    drag = dataclasses.replace(drag, residuals=residuals, numerics=twin)
+    weighing = weighed(data, dataclasses.replace(nothing, residuals=residuals, numerics=twin), drag, pair)
+    assert apart(*(modes[0] for modes in weighing.groups.values())) < MATTERS * data.size
+    assert conclude(weighing, limit=0.0).chosen == (name,)
+
+
 @pytest.mark.parametrize(
     ("share", "priced", "lasting", "name"),
     [(0.05, 0.0, 0.1, "drag"), (0.15, 0.0, 0.1, "tether"), (0.15, 3.0, 0.001, "tether"), (0.15, 3.0, 1.0, "drag")],
@@ -466,32 +471,3 @@ def test_a_mode_that_was_found_twice_counts_once():
     once, twice = weighed(data, nothing, drag), weighed(data, nothing, drag, drag)
     assert len(twice.groups["drag"]) == 1
     assert twice.candidates()[0] == once.candidates()[0]
-
-
-# What would have been seen -------------------------------------------------------------------------------------------
-
-
-def test_an_effect_of_the_limit_is_near_the_credible_probability():
-    data, nothing, drag = recorded(0.0, 12)
-    weighing = weighed(data, nothing, drag)
-    seen = limit(data, weighing.null, drag.slopes, 1.0, weighing.names)
-    size = float(np.sqrt(np.mean([J**2 for J in drag.slopes])))
-    probabilities = []
-    for share in (0.5, 2.0):
-        # The mean recording with an effect of this size, without its noise.
-        change = tuple(share * seen / size * J[..., 0] for J in drag.slopes)
-        near = [dataclasses.replace(m, residuals=change, at=np.zeros(len(m.at))) for m in (nothing, drag)]
-        probabilities.append(weighed(data, *near).candidates()[0]["drag"])
-    assert probabilities[0] < 0.5
-    assert probabilities[1] > 0.95
-
-
-def test_remedies_name_what_hides_an_effect():
-    data, nothing, drag = recorded(0.0, 13)
-    wanted = max(MATTERS * data.size, VISIBLE * data.noise)
-    still = infer(data, nothing)
-    kappa = next(k for k in np.geomspace(1, 1e6, 100) if limit(data, still, drag.slopes, k, 10) > 1.5 * wanted)
-    found = remedies(data, still, drag.slopes, float(kappa), 10)
-    assert found["twin"] == 2.0  # kappa is of the twin's error
-    assert found["motion"] == 2.0
-    assert found["trials"] == 4.0

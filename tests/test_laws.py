@@ -130,3 +130,11 @@ def test_numbers_in_the_laws_are_exact_in_float32():
     numbers = [value for value in numbers if isinstance(value, int | float)]
     assert numbers
     assert all(math.isclose(float(np.float32(value)), value, rel_tol=0, abs_tol=0) for value in numbers)
+
+
+def test_what_is_lost_below_the_largest_stretch_is_that_of_ogden_and_roxburgh():
+    for below in np.linspace(0.0, 3.0, 31):
+        left, largest = text.softening(2.0 - below, 2.0, 0.4, 0.5)
+        assert left == pytest.approx(1 - 0.4 * math.erf(below / 0.5), abs=0.4 * 5e-4)
+        assert largest == 2.0
+    assert text.softening(2.5, 2.0, 0.4, 0.5) == (1.0, 2.5)

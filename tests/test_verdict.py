@@ -18,7 +18,7 @@ from torchsoro.sim2real.inference.heldout import predict, predictions
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, distinct, running
 from torchsoro.sim2real.inference.starts import likely, unconstrained
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.inference.verdict import _as_simpler, weighed
+from torchsoro.sim2real.inference.verdict import _as_pairs, _as_simpler, weighed
 from torchsoro.sim2real.report import sentences
 from torchsoro.sim2real.report.explanation import Explanation, as_json
 from torchsoro.sim2real.report.sentences import evidence, verdict_sentence
@@ -97,6 +97,35 @@ def test_the_mass_of_a_tether_is_weighed_at_its_place(still):
     fit = dataclasses.replace(null_model, effects=(tether,), values=(values,), point=point)
     (found,) = _as_simpler(problem, [tether, mass], [fit])
     assert found.name == "attached_mass" and found.point == pytest.approx(point[[0, 3, 4, 5, 6]])
+
+
+def test_a_stated_number_that_is_not_credible_beside_an_effect_is_weighed_as_an_effect_of_its_own(still):
+    problem, null_model = still
+    modulus, drag, mass = (effect(name) for name in ("modulus", "drag", "attached_mass"))
+    strained = dataclasses.replace(null_model, effects=(drag,), point=np.array([3.5, 20.0]))
+    alone = dataclasses.replace(null_model, effects=(modulus,), point=np.array([3.5, 1.0]))
+    credible = dataclasses.replace(strained, point=np.array([1.2, 20.0]))
+    (found,) = _as_pairs(problem, [modulus, mass, drag], [null_model, strained, alone, credible])
+    assert found.effects == (modulus, drag)
+    assert found.point == pytest.approx([0.0, 3.5, 20.0])  # tolerance and scale are the same
+    assert _as_pairs(problem, [drag], [strained]) == []
+
+
+def test_drag_on_a_body_that_is_described_half_as_stiff_is_named_with_its_modulus(made):
+    twin, record = made
+    recorded, drag = record("drag", (600.0,)), effect("drag")
+    soft = [
+        dataclasses.replace(t, setup=dataclasses.replace(t.setup, youngs_modulus=t.setup.youngs_modulus / 2))
+        for t in recorded.trials
+    ]
+    problem = FitProblem(dataclasses.replace(recorded, trials=tuple(soft)), twin)
+    null_model, end = problem.fit([((), None), ((drag,), np.array([3.5, 20.0]))], rounds=8)
+    verdict = weighed(problem, [effect("modulus"), drag], null_model, [end], report=quiet)
+    assert verdict.kind == "explained"
+    (chosen,) = verdict.chosen
+    assert chosen.name == "drag + modulus"
+    numbers = {e.name: v[0] for e, v in zip(chosen.fit.effects, chosen.fit.values, strict=True)}
+    assert numbers == pytest.approx({"modulus": math.log(2), "drag": 600.0}, rel=0.02)
 
 
 def test_ends_of_one_name_count_once_where_they_are_the_same_place(still):

@@ -20,6 +20,8 @@ PUSH = 0.5
 # How far in front of a plane a node is looked at, and within what distance it touches, in cells.
 LOOK = 2
 TOUCH = 1 / 1024
+# Argument from which on the error function is constant: one to 2e-6.
+FAR = 4
 
 
 def response(u0, u1, u2, n0, n1, n2, stick, friction, hold):
@@ -308,34 +310,55 @@ def quadratic_drag_adjoint(u, sink, r_bar):
     return u_bar, -u * abs(u) * u_bar
 
 
+def error_function(x):
+    """Of a number that is not negative, within 5e-4: equation 7.1.27 of Abramowitz and Stegun, in steps of 1/1024."""
+    z = min(x, x * 0 + FAR)
+    root = 1 + z * (0.2783203125 + z * (0.23046875 + z * (0.0009765625 + z * 0.078125)))
+    return 1 - 1 / (root * root * root * root)
+
+
+def error_function_adjoint(x, r_bar):
+    """Adjoint of :func:`error_function`: the gradient by x."""
+    z = min(x, x * 0 + FAR)
+    root = 1 + z * (0.2783203125 + z * (0.23046875 + z * (0.0009765625 + z * 0.078125)))
+    slope = 0.2783203125 + z * (0.4609375 + z * (0.0029296875 + z * 0.3125))
+    x_bar = x * 0
+    if x < FAR:
+        x_bar = 4 * r_bar * slope / (root * root * root * root * root)
+    return x_bar
+
+
 def softening(x, largest, depth, span):
-    """How a solid softens below its largest stretch so far, after Mullins.
+    """How a solid softens below its largest stretch so far (Mullins), after Ogden and Roxburgh (1999).
+
+    With 1 / depth their r, and span / 2 times the shear modulus their m, energies are those of a neo-Hookean solid.
 
     Args:
         x: Stretch, I1b - 3.
         largest: Its largest value before.
         depth: Largest share of the shear modulus that is lost.
-        span: By how much less than its largest the stretch is where half of that is lost, above 0.
+        span: By how much less than its largest the stretch is where erf(1) of that, 84 %, is lost; above 0.
 
     Returns:
         The share of the shear modulus that is left, and the largest stretch with this one.
     """
     below = max(largest - x, x * 0)
-    return 1 - depth * below / (below + span), x + below
+    return 1 - depth * error_function(below / span), x + below
 
 
 def softening_adjoint(x, largest, depth, span, left_bar, largest_bar):
     """Adjoint of :func:`softening`: gradients by stretch, largest stretch before, depth and span."""
     below = max(largest - x, x * 0)
-    back = 1 / (below + span)
+    ratio = below / span
+    ratio_bar = error_function_adjoint(ratio, -left_bar * depth)
     below_bar = x * 0
     if below > 0:
-        below_bar = largest_bar - left_bar * depth * span * back * back
+        below_bar = largest_bar + ratio_bar / span
     return (
         largest_bar - below_bar,
         below_bar,
-        -left_bar * below * back,
-        left_bar * depth * below * back * back,
+        -left_bar * error_function(ratio),
+        -ratio_bar * ratio / span,
     )
 
 

@@ -82,7 +82,7 @@ class Stiffening(Hypothesis):
 
 
 class Softening(Hypothesis):
-    """Stress is lower below the largest stretch so far (Mullins)."""
+    """Stress is lower below the largest stretch so far (Mullins), by the law of Ogden and Roxburgh (1999)."""
 
     name, affected_quantity, model_form_deviation = "softening", "stress below the largest stretch so far", LAW
     quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))

@@ -2,12 +2,13 @@
 
 Probabilities are of what is missing, whether it matters or not. In the set, what changes the motion by less than
 matters goes by its name where nothing is not credible beside it and trials left out are predicted better with it; else
-it counts as nothing.
+it counts as nothing. So does what the second of two effects adds to the first.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
@@ -66,10 +67,14 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     least = MATTERS * data.size
     matters = max(least, VISIBLE * data.noise)
     names, left = {c.name: c for c in candidates}, max(weighing.unexplained, data.noise)
+
+    def foretells(c: Candidate, d: Candidate) -> bool:
+        return compared(data, c.best, d.best, weighing.kappa)[0] > 0
+
     shares = {NOTHING: probabilities[NOTHING], UNKNOWN: probabilities[UNKNOWN]}
     told, small = dict(shares), []
     for c in candidates:
-        counted, called = _meaning(c, names, left, data.noise, least, null.near.numerics.size)
+        counted, called = _meaning(c, names, left, data.noise, least, null.near.numerics.size, foretells)
         shares[counted] = shares.get(counted, 0.0) + c.probability
         told[called] = told.get(called, 0.0) + c.probability
         if called == NOTHING:
@@ -124,12 +129,18 @@ def _credible(probabilities: dict[str, float]) -> list[str]:
 
 
 def _meaning(
-    c: Candidate, names: dict[str, Candidate], left: float, noise: float, least: float, error: float
+    c: Candidate,
+    names: dict[str, Candidate],
+    left: float,
+    noise: float,
+    least: float,
+    error: float,
+    foretells: Callable[[Candidate, Candidate], bool],
 ) -> tuple[str, str]:
     """What a candidate counts as, and what its probability is told of.
 
-    What does not matter counts as nothing. Its probability is told all the same, unless the twin may err by as much.
-    What leaves much, more than noise and than the twin may err, is not missing.
+    What does not matter counts as nothing, also as one of two. Its probability is told all the same, unless the twin
+    may err by as much. What leaves much, more than noise and than the twin may err, is not missing.
 
     Args:
         c: The candidate.
@@ -138,22 +149,28 @@ def _meaning(
         noise: Its standard deviation [m].
         least: Change of the motion that matters [m].
         error: What the twin may err by without an effect [m].
+        foretells: Whether the first of two predicts trials that are left out better than the second.
     """
     own = c.best.near.numerics.size
+
+    def sure(d: Candidate) -> bool:
+        return c.probability > CREDIBLE * (c.probability + d.probability)
+
     # An extension that moves as what it extends, as far as it matters, adds nothing; nor does one that does so as
-    # far as the twin tells, unless evidence is for it.
-    plain = []
-    for d in (names[n] for n in c.best.near.model.simpler if n in names):
-        sure = c.probability > CREDIBLE * (c.probability + d.probability)
-        if apart(c.best, d.best) < (least if sure else max(least, own)):
-            plain.append(d)
+    # far as the twin tells, unless evidence is for it. But it stands for a stated number that is not credible.
+    model = c.best.near.model
+    simpler = [names[n] for n in model.simpler if n in names and names[n].credible]
+    plain = [d for d in simpler if apart(c.best, d.best) < (least if sure(d) else max(least, own))]
     name = max(plain, key=lambda d: d.ln_evidence).name if plain else c.name
+    # What a second effect adds is told as an effect by itself is.
+    adds = all(sure(d) and apart(c.best, d.best) > own and foretells(c, d) for d in plain)
+    called = c.name if len(model.effects) > 1 and adds else name
     unexplained = c.left > max(UNEXPLAINED * left, noise, error, own)
     if c.size < max(least, own):
-        return NOTHING, NOTHING if unexplained or c.size < own else name
+        return NOTHING, NOTHING if unexplained or c.size < own else called
     if unexplained:
         return UNKNOWN, UNKNOWN
     if c.left > max(c.size, own):
         # It moves less than what it leaves: not it is missing, but what else there is, if that is seen.
-        return (UNKNOWN, UNKNOWN) if left > noise else (NOTHING, name)
-    return name, name
+        return (UNKNOWN, UNKNOWN) if left > noise else (NOTHING, called)
+    return name, called

@@ -11,6 +11,7 @@ VISIBLE = 3.0  # times the noise: what is larger is seen in a plot by eye, so th
 STRENGTH = 3.0  # noticeable changes (Quantity.scale): width of the prior of an effect that is missing
 FREEDOM = 4.0  # degrees of freedom of priors that are not to be trusted in their tails: 10 widths are still credible
 TOLERANCE = 0.5  # standard deviation of a belief over its stated tolerance, which thus holds in 95 of 100 setups
+BELIEVED = 1.45  # tolerances by which a stated number may be off and still be credible: 2.9 standard deviations
 MISSING = 0.5  # prior probability that something is missing; names share it evenly, a pair has 1/n of a name's share
 COMMON = 0.5  # share of a discrepancy's variance that all markers have in common: bodies move in modes, not by markers
 LASTING = 0.25  # share of the noise's variance that lasts from sample to sample, as trackers drift

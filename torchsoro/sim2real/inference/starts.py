@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
+from torchsoro.sim2real.inference.decision import BELIEVED
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.likelihood import EDGE, Request
+from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.twin.twin import Twin
 
-BELIEVED = 1 + 3 * EDGE  # tolerances by which a stated number may be off and still be credible
 FAINT = 4.0  # gain in log-likelihood below which an effect is not worth a fit
 STARTS = 3  # searches of each effect, from probe points that differ; and one of each other form of it
 EARLY_ABOVE = (

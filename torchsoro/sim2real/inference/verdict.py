@@ -15,6 +15,7 @@ from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
+from torchsoro.sim2real.inference.decision import BELIEVED
 from torchsoro.sim2real.inference.evidence import Posterior
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction, predictions
@@ -147,7 +148,7 @@ def weighed(
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     simpler = [*_as_beliefs(problem, null_model, ends), *_as_simpler(problem, effects, ends)]
-    known = weigh(problem, [null_model, *strained, *simpler, *ends])
+    known = weigh(problem, [null_model, *strained, *simpler, *_as_pairs(problem, effects, ends), *ends])
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.leading
     leading = at_mode(problem, _fit_of(known, best), told(data, best))
@@ -210,6 +211,27 @@ def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> li
             if len(fit.effects) == 1 and isinstance(fit.effects[0], type(stated)) and abs(off) <= 1:
                 point = np.where(np.arange(len(problem.common)) == k, off, fit.point[: len(problem.common)])
                 found.append(dataclasses.replace(null_model, point=point, errors=fit.errors))
+    return found
+
+
+def _as_pairs(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequence[Fit]) -> list[Fit]:
+    """Ends of searches at which a stated number is not credible, as that effect and the number as another.
+
+    A search among pairs does not tell them, as they leave the same.
+    """
+    found, known = [], len(problem.common)
+    for fit in ends:
+        for k, (stated, tolerance) in enumerate(problem.common):
+            released = next((e for e in effects if type(e) is type(stated)), None)
+            names = [e.name for e in fit.effects]
+            if released is None or len(names) != 1 or released.name in names or abs(fit.point[k]) <= BELIEVED:
+                continue
+            both = tuple(e for e in effects if e in (released, *fit.effects))
+            own = {released: fit.point[k : k + 1] * tolerance / released.quantities[0].scale}
+            own |= {fit.effects[0]: fit.point[known:]}
+            rest = np.where(np.arange(known) == k, 0.0, fit.point[:known])
+            point = np.concatenate([rest, *(own[e] for e in both)])
+            found.append(dataclasses.replace(fit, effects=both, point=point))
     return found
 
 

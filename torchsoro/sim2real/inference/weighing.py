@@ -14,9 +14,9 @@ Where the most probable model leaves a discrepancy that matters, none is right, 
 how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
 not known, of root mean square r, left by a model with K numbers of its own, have the likelihood (Schwarz 1978)
 
-    ln p = -N ln r - K/2 ln N.
+    ln p = -N ln r - K/2 ln N,
 
-So it does between modes of one name.
+times what the prior says of stated numbers. So it does between modes of one name, by r alone.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
@@ -38,7 +38,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import MISSING
+from torchsoro.sim2real.inference.decision import BELIEVED, MISSING
 from torchsoro.sim2real.inference.evidence import Model, Posterior, adjusted, ln_strained, mode_of, products
 from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
@@ -59,6 +59,7 @@ class Candidate:
         left: What it leaves of the recordings, see :func:`remainder` [m].
         ln_evidence: Summed over modes, adjusted.
         probability: Posterior.
+        credible: Whether its stated numbers are within their tolerances, or little beyond.
     """
 
     modes: tuple[Posterior, ...]
@@ -66,6 +67,7 @@ class Candidate:
     left: float
     ln_evidence: float
     probability: float
+    credible: bool = True
 
     @property
     def name(self) -> str:
@@ -207,6 +209,17 @@ class Weighing:
         return {name: tuple(modes) for name, modes in found.items()}
 
     @cached_property
+    def _beliefs(self) -> dict[str, np.ndarray]:
+        """Stated numbers that are told with the first mode of each name, in tolerances."""
+        modes = {name: first for name, (first, *_) in self.groups.items()}
+        return {name: told(self.data, p).at[: p.near.model.beliefs] for name, p in modes.items()}
+
+    def _strain(self, name: str) -> float:
+        """Ln of the prior density of these over that at most."""
+        at = self._beliefs[name]
+        return ln_strained(self.groups[name][0].near.model, at, range(len(at)))
+
+    @cached_property
     def best(self) -> Posterior:
         """The most probable of all."""
         return max((*map(self._one_of, self._looks_at_effects), self.null), key=lambda p: p.ln_evidence)
@@ -238,14 +251,10 @@ class Weighing:
         def ln_within(name: str, size: float) -> float:
             return ln_prior[name] + ln_evidence_within(self.data, self.groups[name][0].near, size, count)
 
-        stated = {
-            name: ln_strained(mode.near.model, told(self.data, mode).at, range(mode.near.model.beliefs))
-            for name, (mode, *_) in self.groups.items()
-        }
         for name, (mode, *_) in self.groups.items():
             # What moves the body by no more than the twin may err, or leaves more, is no name for the difference.
             if size_of(self.change(mode)) > priced and left[name] <= mode.near.numerics.size:
-                most = max(stated[name] - stated[first], 0.0)
+                most = max(self._strain(name) - self._strain(first), 0.0)
                 # What an extension leaves tells nothing of an error along the number that it has more.
                 along = priced if name in best.near.model.simpler else error
                 ln_odds = ln_within(name, along) - ln_within(first, along)
@@ -300,7 +309,7 @@ class Weighing:
             for name, modes in groups.items():
                 own = len(modes[0].near.model.own)
                 size = math.hypot(left[name], self.data.noise)
-                rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count)
+                rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count) + self._strain(name)
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         if groups:
             probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior, left)
@@ -311,6 +320,7 @@ class Weighing:
                 left=left[name],
                 ln_evidence=_summed(modes),
                 probability=probabilities[name],
+                credible=bool((np.abs(self._beliefs[name]) <= BELIEVED).all()),
             )
             for name, modes in groups.items()
         ]

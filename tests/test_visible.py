@@ -1,0 +1,38 @@
+"""What would have been seen, and what would make it visible."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from swings import recorded, weighed
+
+from torchsoro.sim2real.inference.decision import MATTERS, VISIBLE
+from torchsoro.sim2real.inference.evidence import infer
+from torchsoro.sim2real.inference.visible import limit, remedies
+
+
+def test_an_effect_of_the_limit_is_near_the_credible_probability():
+    data, nothing, drag = recorded(0.0, 12)
+    weighing = weighed(data, nothing, drag)
+    seen = limit(data, weighing.null, drag.slopes, 1.0, weighing.names)
+    size = float(np.sqrt(np.mean([J**2 for J in drag.slopes])))
+    probabilities = []
+    for share in (0.5, 2.0):
+        # The mean recording with an effect of this size, without its noise.
+        change = tuple(share * seen / size * J[..., 0] for J in drag.slopes)
+        near = [dataclasses.replace(m, residuals=change, at=np.zeros(len(m.at))) for m in (nothing, drag)]
+        probabilities.append(weighed(data, *near).candidates()[0]["drag"])
+    assert probabilities[0] < 0.5
+    assert probabilities[1] > 0.95
+
+
+def test_remedies_name_what_hides_an_effect():
+    data, nothing, drag = recorded(0.0, 13)
+    wanted = max(MATTERS * data.size, VISIBLE * data.noise)
+    still = infer(data, nothing)
+    kappa = next(k for k in np.geomspace(1, 1e6, 100) if limit(data, still, drag.slopes, k, 10) > 1.5 * wanted)
+    found = remedies(data, still, drag.slopes, float(kappa), 10)
+    assert found["twin"] == 2.0  # kappa is of the twin's error
+    assert found["motion"] == 2.0
+    assert found["trials"] == 4.0
