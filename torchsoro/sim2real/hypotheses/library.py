@@ -27,6 +27,7 @@ from torchsoro.sim2real.hypotheses.outer_effects import (
     InitialRigidMotion,
     InitialTilt,
     Sliding,
+    StribeckFriction,
     WallOffset,
 )
 from torchsoro.sim2real.hypotheses.supply_effects import (
@@ -49,6 +50,7 @@ def library() -> tuple[Hypothesis, ...]:
         *(
             Sliding,
             Friction,
+            StribeckFriction,
             Adhesion,
             WallOffset,
             GravityTilt,
