@@ -37,13 +37,13 @@ def on_a_gpu(
 ):
     for i in range(COUNT):
         f, q, b = matrix(F, i), matrix(Q, i), matrix(B, i)
-        put(out, i, 0, stress.piola(f, q, bulk, shear, shear, factor, void_fraction))
-        by_F, by_Q, by_bulk, by_solid, by_shear, by_factor, by_void = stress.piola_adjoint(
-            f, q, bulk, shear, shear, factor, void_fraction, b
+        put(out, i, 0, stress.piola(f, q, bulk, shear, factor, void_fraction))
+        by_F, by_Q, by_bulk, by_shear, by_factor, by_void = stress.piola_adjoint(
+            f, q, bulk, shear, factor, void_fraction, b
         )
         put(out, i, 9, by_F)
         put(out, i, 18, by_Q)
-        out[i, 27], out[i, 28], out[i, 29], out[i, 30] = by_bulk, by_solid + by_shear, by_factor, by_void
+        out[i, 27], out[i, 28], out[i, 29], out[i, 30] = by_bulk, by_shear, by_factor, by_void
         if void_fraction < 1:
             least = stress.least_ratio(void_fraction)
             put(out, i, 31, stress.pull_back(f, least))
@@ -67,10 +67,8 @@ def in_lanes(F, Q, B, given, out):
              load(B[6], i), load(B[7], i), load(B[8], i))  # fmt: skip
         v = load(given, i)
         bulk, shear, factor = 0 * v + BULK, 0 * v + SHEAR, 0 * v + FACTOR
-        P, cof, ratio = piola(f, q, bulk, (shear, shear), factor, v)
-        by_F, by_Q, by_bulk, (by_shear, by_void_shear), by_factor, by_void = piola_adjoint(
-            f, cof, ratio, q, bulk, (shear, shear), factor, v, b
-        )
+        P, cof, ratio = piola(f, q, bulk, shear, factor, v)
+        by_F, by_Q, by_bulk, by_shear, by_factor, by_void = piola_adjoint(f, cof, ratio, q, bulk, shear, factor, v, b)
         least = least_ratio(v)
         S = pull_back(f, least)
         # An off-diagonal component counts twice in the full tensor, once here.
@@ -81,7 +79,7 @@ def in_lanes(F, Q, B, given, out):
         for k, value in enumerate(by_Q):
             store(out[18 + k], i, value)
         store(out[24], i, by_bulk)
-        store(out[25], i, by_shear + by_void_shear)
+        store(out[25], i, by_shear)
         store(out[26], i, by_factor)
         store(out[27], i, by_void)
         for k, value in enumerate((*S, *S_bar, *V)):

@@ -61,7 +61,7 @@ def run_tensor(a: Reals, b: Reals, cof: Reals, dot: Reals, back: Reals, scratch:
 @ti.kernel
 def run_solid(F: Reals, Q: Reals, bulk: ti.f64, shear: ti.f64, void_fraction: ti.f64, P: Reals, S: Reals, n: ti.i32):
     for i in range(n):
-        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, shear, 1, void_fraction))
+        put(P, i, stress.piola(matrix(F, i), matrix(Q, i), bulk, shear, 1, void_fraction))
         if void_fraction < 1:
             put(S, i, stress.pull_back(matrix(F, i), stress.least_ratio(void_fraction)))
 
@@ -80,13 +80,13 @@ def run_solid_adjoint(
 ):
     for i in range(n):
         shear = moduli[3 * i + 1]
-        f, q, by_bulk, by_solid, by_shear, _, void_fraction = stress.piola_adjoint(
-            matrix(F, i), matrix(Q, i), moduli[3 * i], shear, shear, 1, moduli[3 * i + 2], matrix(bar, i)
+        f, q, by_bulk, by_shear, _, void_fraction = stress.piola_adjoint(
+            matrix(F, i), matrix(Q, i), moduli[3 * i], shear, 1, moduli[3 * i + 2], matrix(bar, i)
         )
         put(F_bar, i, f)
         put(Q_bar, i, q)
         moduli_bar[3 * i] = by_bulk
-        moduli_bar[3 * i + 1] = by_solid + by_shear
+        moduli_bar[3 * i + 1] = by_shear
         moduli_bar[3 * i + 2] = void_fraction
         put(S_bar, i, stress.pull_back_adjoint(matrix(F, i), stress.least_ratio(moduli[3 * i + 2]), matrix(bar, i)))
 

@@ -37,7 +37,7 @@ def run_solid(F: Reals, Q: Reals, law: Reals, P: Reals, S: Reals, n: ti.i32):
         least = stress.least_ratio(law[c + VOID_FRACTION])
         factor = stress.stiffening(f, least, law[c + LINEAR], law[c + SQUARE])
         mu = law[c + SHEAR]
-        p = stress.piola(f, matrix(Q, i), law[c + BULK], mu, mu, factor, law[c + VOID_FRACTION])
+        p = stress.piola(f, matrix(Q, i), law[c + BULK], mu, factor, law[c + VOID_FRACTION])
         tensor.store_matrix(P, 9 * i, 1, p)
         tensor.store_matrix(S, 9 * i, 1, factor * stress.pull_back(f, least))
 
@@ -49,14 +49,14 @@ def run_adjoint(F: Reals, Q: Reals, law: Reals, P_bar: Reals, S_bar: Reals, F_ba
         least = stress.least_ratio(law[c + VOID_FRACTION])
         factor = stress.stiffening(f, least, law[c + LINEAR], law[c + SQUARE])
         mu = law[c + SHEAR]
-        by_F, _Q, bulk, solid_shear, shear, factor_bar, void_fraction = stress.piola_adjoint(
-            f, matrix(Q, i), law[c + BULK], mu, mu, factor, law[c + VOID_FRACTION], matrix(P_bar, i)
+        by_F, _Q, bulk, shear, factor_bar, void_fraction = stress.piola_adjoint(
+            f, matrix(Q, i), law[c + BULK], mu, factor, law[c + VOID_FRACTION], matrix(P_bar, i)
         )
         by_F += stress.pull_back_adjoint(f, least, factor * matrix(S_bar, i))
         factor_bar += tensor.contract(matrix(S_bar, i), stress.pull_back(f, least))
         by_factor, linear, square = stress.stiffening_adjoint(f, least, law[c + LINEAR], law[c + SQUARE], factor_bar)
         tensor.store_matrix(F_bar, 9 * i, 1, by_F + by_factor)
-        law_bar[c + BULK], law_bar[c + SHEAR], law_bar[c + VOID_FRACTION] = bulk, solid_shear + shear, void_fraction
+        law_bar[c + BULK], law_bar[c + SHEAR], law_bar[c + VOID_FRACTION] = bulk, shear, void_fraction
         law_bar[c + LINEAR], law_bar[c + SQUARE] = linear, square
 
 

@@ -198,7 +198,7 @@ class Body:
             [..., N, 2], of any sign; 0 if None, which is neo-Hookean. The Maxwell elements stiffen alike.
         softening: Depth d and range r of a solid that is softer below its largest stretch so far (Mullins; Ogden and
             Roxburgh 1999): of mu only 1 - d erf(u / r) is left, where u is by how much x is less than its largest
-            [..., 2]; none if None. Total formulation only.
+            [..., 2]; none if None. Maxwell elements do not soften. Total formulation only.
         air_stiffness: Pressure that the air in each hollow chamber of the lattice loses as its volume doubles
             [..., hollow chambers] Pa; 0 if None. Hollow chambers hold no particles, and follow in number those that do.
             Total formulation only.

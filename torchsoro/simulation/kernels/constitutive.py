@@ -107,7 +107,7 @@ def stress(
             Q = history_sum(state, at + HISTORY * particles, particles, prony, prony_at, elements)
         shear, void_fraction = coefficients[mat + SHEAR * particles], coefficients[mat + VOID_FRACTION * particles]
         factor = stiffness(stiffens, F, least_ratio(void_fraction), coefficients, mat, particles)
-        tau = piola(F, Q, bulk, shear, shear, factor, void_fraction) @ F.transpose()
+        tau = piola(F, Q, bulk, shear, factor, void_fraction) @ F.transpose()
     else:
         tau = plus_identity(tau, -J * gas_pressure(J, bulk, pressure[pressure_at + kind]))
     eta = coefficients[mat + VISCOSITY * particles]
@@ -158,17 +158,17 @@ def stress_adjoint(
         shear = coefficients[mat + SHEAR * particles]
         void_fraction = coefficients[mat + VOID_FRACTION * particles]
         factor = stiffness(stiffens, F, least_ratio(void_fraction), coefficients, mat, particles)
-        by_F, Q_bar, bulk_bar, solid_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
-            F, Q, bulk, shear, shear, factor, void_fraction, tau_bar @ F
+        by_F, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
+            F, Q, bulk, shear, factor, void_fraction, tau_bar @ F
         )
-        F_bar += by_F + tau_bar.transpose() @ piola(F, Q, bulk, shear, shear, factor, void_fraction)
+        F_bar += by_F + tau_bar.transpose() @ piola(F, Q, bulk, shear, factor, void_fraction)
         if ti.static(stiffens):
             F_bar += stiffness_adjoint(
                 F, least_ratio(void_fraction), coefficients, coefficients_bar, mat, particles, factor_bar
             )
         add(False, coefficients_bar, mat + VOID_FRACTION * particles, void_bar)
         add(False, coefficients_bar, mat + BULK * particles, bulk_bar)
-        add(False, coefficients_bar, mat + SHEAR * particles, solid_bar + shear_bar)
+        add(False, coefficients_bar, mat + SHEAR * particles, shear_bar)
         for e in range(elements):
             place = (HISTORY + 6 * e) * particles
             H_bar = load_symmetric_adjoint(bar, here + place, particles)

@@ -205,7 +205,7 @@ def piola(F, Q, bulk, shear, factor, void_fraction):
         F: Deformation gradient.
         Q: Sum of g H over the Maxwell elements.
         bulk: Bulk modulus.
-        shear: Shear modulus of the solid, and of the void.
+        shear: Shear modulus.
         factor: By which the solid stiffens with stretch.
         void_fraction: 0 to 1.
     """
@@ -217,9 +217,9 @@ def piola(F, Q, bulk, shear, factor, void_fraction):
     root = inverse_cube_root(J)
     A = times(F, (J * Q[0] + factor, J * Q[1] + factor, J * Q[2] + factor, J * Q[3], J * Q[4], J * Q[5]))
     solid = 1 - void_fraction
-    m = solid * shear[0] * root * root
+    m = solid * shear * root * root
     beta = (solid * bulk * 0.5 * (J * (J - 1) + log) - m * contract(F, A) * (1 / 3)) * back
-    void = void_fraction * shear[1]
+    void = void_fraction * shear
     slope, _ = void_slope(ratio, back)
     beta = beta - void * slope
     P = plus(m, A, beta, cof)
@@ -228,7 +228,7 @@ def piola(F, Q, bulk, shear, factor, void_fraction):
 
 @law
 def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
-    """Adjoint of :func:`piola`: gradients by F, Q, bulk, both shear moduli, factor and void fraction."""
+    """Adjoint of :func:`piola`: gradients by F, Q, both moduli, factor and void fraction."""
     least = least_ratio(void_fraction)
     J = larger(ratio, least)
     back = 1 / J
@@ -239,7 +239,7 @@ def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
     FA = plus(factor, F, J, FQ)
     spread = contract(F, FA) * (1 / 3)
     volumetric = 0.5 * (J * (J - 1) + log)
-    alpha = shear[0] * shrink
+    alpha = shear * shrink
     beta = (bulk * volumetric - alpha * spread) * back
     along = contract(P_bar, cof)
     stretch = contract(P_bar, F)
@@ -251,7 +251,7 @@ def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
     J_bar = select(ratio < least, 0 * J, J_bar + contract(B, FQ))
     solid = 1 - void_fraction
     slope, curvature = void_slope(ratio, back)
-    void = void_fraction * shear[1]
+    void = void_fraction * shear
     BQ = times(B, Q)
     turned = cross(F, P_bar)
     F_bar = plus(factor * solid, B, J * solid, BQ)
@@ -270,12 +270,12 @@ def piola_adjoint(F, cof, ratio, Q, bulk, shear, factor, void_fraction, P_bar):
     )
     by_bulk, by_shear = pressure_bar * volumetric, alpha_bar * shrink
     void_work = stretch - slope * along
-    void_bar = select(void_fraction < 1, shear[1] * void_work - (bulk * by_bulk + shear[0] * by_shear), 0 * void_work)
+    void_bar = select(void_fraction < 1, shear * void_work - (bulk * by_bulk + shear * by_shear), 0 * void_work)
     return (
         F_bar,
         Q_bar,
         solid * by_bulk,
-        (solid * by_shear, void_fraction * void_work),
+        solid * by_shear + void_fraction * void_work,
         solid * contract(B, F),
         void_bar,
     )

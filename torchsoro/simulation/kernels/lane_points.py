@@ -227,7 +227,7 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
     bulk, shear = load(numbers, n + 16 * BULK), load(numbers, n + 16 * SHEAR)
     factor = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
     least = least_ratio(void_fraction)
-    solid = shear
+    left = 0 * volume + 1
     if flags[0] or flags[1]:
         ratio = volume_ratio(F)
         if flags[0]:
@@ -237,13 +237,12 @@ def point(G, rates, at, numbers, n, past, before, future, after, elements, maxwe
             x, _ = excess(F, larger(ratio, least))
             left, largest = softening(x, load(past, before + end), load(softens, 0), load(softens, 16))
             store(future, after + end, select(void_fraction < 1, largest, 0 * largest))
-            solid = shear * left
     S = (factor, factor, factor, factor, factor, factor)
     if elements > 0:
         T = pull_back(F, least)
         S = (factor * T[0], factor * T[1], factor * T[2], factor * T[3], factor * T[4], factor * T[5])
     Q = added(S, past, before, future, after, elements, maxwell, m)
-    P, _, J = piola(F, Q, bulk, (solid, shear), factor, void_fraction)
+    P, _, J = piola(F, Q, bulk, shear, factor * left, void_fraction)
     if flags[2]:
         eta, zeta = load(numbers, n + 16 * VISCOSITY), load(numbers, n + 16 * VOLUME_VISCOSITY)
         P = plus(1.0, P, 1.0, viscous_piola(F, plain(rates, at), eta, zeta))

@@ -80,7 +80,7 @@ def point_adjoint(
     ratio = F[0] * cof[0] + F[1] * cof[1] + F[2] * cof[2]
     least = least_ratio(void_fraction)
     there = select(void_fraction < 1, 0 * volume + 1, 0 * volume)
-    factor, left, solid = there, 0 * volume + 1, shear
+    factor, left = there, 0 * volume + 1
     x, shrink, linear, square = 0 * volume, 0 * volume, 0 * volume, 0 * volume
     depth, reach = 0 * volume, 0 * volume + 1
     end = 96 * elements
@@ -92,7 +92,6 @@ def point_adjoint(
         if flags[1]:
             depth, reach = load(softens, 0), load(softens, 16)
             left, _ = softening(x, load(past, before + end), depth, reach)
-            solid = shear * left
     T = (0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor, 0 * factor)
     Q0, Q1, Q2, Q3, Q4, Q5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
     if elements > 0:
@@ -105,12 +104,12 @@ def point_adjoint(
         Q2, Q3 = Q2 + g * load(past, i + 32) + gb * S[2], Q3 + g * load(past, i + 48) + gb * S[3]
         Q4, Q5 = Q4 + g * load(past, i + 64) + gb * S[4], Q5 + g * load(past, i + 80) + gb * S[5]
     W = plus(-1.0, W, 0.0, W)
-    F_bar, R, bulk_bar, (solid_bar, void_bar), factor_bar, fraction_bar = piola_adjoint(
-        F, cof, ratio, (Q0, Q1, Q2, Q3, Q4, Q5), bulk, (solid, shear), factor, void_fraction, W
+    F_bar, R, bulk_bar, shear_bar, whole_bar, fraction_bar = piola_adjoint(
+        F, cof, ratio, (Q0, Q1, Q2, Q3, Q4, Q5), bulk, shear, factor * left, void_fraction, W
     )
-    work = bulk * bulk_bar + solid * solid_bar + shear * void_bar
+    work = bulk * bulk_bar + shear * shear_bar
     F_bar = plus(volume, F_bar, 0.0, F_bar)
-    factor_bar = there * volume * factor_bar
+    factor_bar = there * volume * left * whole_bar
     # S_bar gathers from all elements.
     Z0, Z1, Z2, Z3, Z4, Z5 = 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume, 0 * volume
     for e in range(elements):
@@ -148,7 +147,6 @@ def point_adjoint(
         B6 = (factor * Z0, factor * Z1, factor * Z2, factor * Z3, factor * Z4, factor * Z5)
         F_bar = plus(1.0, F_bar, 1.0, pull_back_adjoint(F, cof, ratio, least, B6))
         factor_bar = factor_bar + there * (Z0 * T[0] + Z1 * T[1] + Z2 * T[2] + Z3 * T[3] + Z4 * T[4] + Z5 * T[5])
-    shear_bar = left * solid_bar + void_bar
     if flags[0] or flags[1]:
         x_bar = factor_bar * (linear + 2 * square * x)
         if flags[0]:
@@ -157,7 +155,7 @@ def point_adjoint(
         if flags[1]:
             later = select(void_fraction < 1, load(bars, after + end), 0 * x)
             by_x, largest_bar, depth_bar, reach_bar = softening_adjoint(
-                x, load(past, before + end), depth, reach, volume * shear * solid_bar, later
+                x, load(past, before + end), depth, reach, volume * factor * whole_bar, later
             )
             add(sums.softening, s_sums, depth_bar)
             add(sums.softening, s_sums + 16, reach_bar)

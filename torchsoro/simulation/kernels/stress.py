@@ -196,45 +196,41 @@ def void_work(F, P_bar):
 
 
 @ti.func
-def piola(F, Q, bulk, solid, shear, factor, void_fraction):
-    """First Piola stress of a solid of which a share ``void_fraction`` (0 to 1) is void; void does not stiffen.
-
-    ``solid`` is the solid's shear modulus, ``shear`` that of void: the same, unless the solid has softened.
-    """
+def piola(F, Q, bulk, shear, factor, void_fraction):
+    """First Piola stress of a solid of which a share ``void_fraction`` (0 to 1) is void; void does not stiffen."""
     P = F * 0
     if void_fraction < 1:
-        P = (1 - void_fraction) * solid_piola(F, Q, bulk, solid, factor, least_ratio(void_fraction))
+        P = (1 - void_fraction) * solid_piola(F, Q, bulk, shear, factor, least_ratio(void_fraction))
     if void_fraction > 0:
         P += void_fraction * void_piola(F, shear)
     return P
 
 
 @ti.func
-def piola_adjoint(F, Q, bulk, solid, shear, factor, void_fraction, P_bar):
-    """Adjoint of :func:`piola`: gradients by F, Q, bulk modulus, both shear moduli, factor and void_fraction.
+def piola_adjoint(F, Q, bulk, shear, factor, void_fraction, P_bar):
+    """Adjoint of :func:`piola`: gradients by F, Q, both moduli, factor and void_fraction.
 
     At a void fraction of exactly 0 the last is the derivative from above; at exactly 1 it is 0.
     """
     F_bar = F * 0
     Q_bar = F * 0
     bulk_bar = shear * 0
-    solid_bar = shear * 0
     shear_bar = shear * 0
     factor_bar = shear * 0
     void_bar = shear * 0
     if void_fraction < 1:
-        by_F, by_Q, by_bulk, by_solid, by_factor = solid_piola_adjoint(
-            F, Q, bulk, solid, factor, least_ratio(void_fraction), P_bar
+        by_F, by_Q, by_bulk, by_shear, by_factor = solid_piola_adjoint(
+            F, Q, bulk, shear, factor, least_ratio(void_fraction), P_bar
         )
         F_bar, Q_bar = (1 - void_fraction) * by_F, (1 - void_fraction) * by_Q
-        bulk_bar, solid_bar = (1 - void_fraction) * by_bulk, (1 - void_fraction) * by_solid
+        bulk_bar, shear_bar = (1 - void_fraction) * by_bulk, (1 - void_fraction) * by_shear
         factor_bar = (1 - void_fraction) * by_factor
         # Both laws are linear in their moduli.
-        void_bar = shear * void_work(F, P_bar) - (bulk * by_bulk + solid * by_solid)
+        void_bar = shear * void_work(F, P_bar) - (bulk * by_bulk + shear * by_shear)
     if void_fraction > 0:
         F_bar += void_fraction * void_piola_adjoint(F, shear, P_bar)
-        shear_bar = void_fraction * void_work(F, P_bar)
-    return F_bar, Q_bar, bulk_bar, solid_bar, shear_bar, factor_bar, void_bar
+        shear_bar += void_fraction * void_work(F, P_bar)
+    return F_bar, Q_bar, bulk_bar, shear_bar, factor_bar, void_bar
 
 
 @ti.func

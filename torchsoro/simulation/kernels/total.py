@@ -229,8 +229,7 @@ def stress_point(block: ti.template(), q, t, b, p):
         F = plus_identity(tile_gradient(block, 0, q), 1)
         if kind < 0:
             Q = F * 0
-            factor = void_fraction * 0 + 1
-            solid = shear
+            factor, left = void_fraction * 0 + 1, void_fraction * 0 + 1
             if void_fraction < 1:
                 least = least_ratio(void_fraction)
                 if ti.static(block.features & STIFFENS):
@@ -240,7 +239,6 @@ def stress_point(block: ti.template(), q, t, b, p):
                     if head[HISTORIES] > 6 * elements:
                         left, largest = softened(block, excess(F, least), at + 6 * elements * points, b)
                         state[out + 6 * elements * points] = largest
-                        solid = shear * left
                 if elements > 0:
                     S = factor * pull_back(F, least)
                     Z = load_symmetric(state, at, points)
@@ -260,7 +258,7 @@ def stress_point(block: ti.template(), q, t, b, p):
             if ti.static(block.features & SHARED_AIR):
                 if kind <= ENCLOSES and fixed[mat + AIR_SHARE * points] > 0 and not F.determinant() > 0:
                     ti.atomic_min(block.ints[COLLAPSED], t)
-            P = volume * piola(F, Q, bulk, solid, shear, factor, void_fraction)
+            P = volume * piola(F, Q, bulk, shear, factor * left, void_fraction)
         else:
             for c in range(head[HISTORIES]):
                 state[out + c * points] = 0

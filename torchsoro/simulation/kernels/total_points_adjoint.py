@@ -183,23 +183,22 @@ def stress_point_adjoint(block: ti.template(), q, t, b, p):
             if ti.static(block.features & STIFFENS):
                 linear, square = fixed[mat + STIFFENING * points], fixed[mat + (STIFFENING + 1) * points]
                 factor = stiffening(F, least, linear, square)
-            solid, x, x_bar = shear, void_fraction * 0, void_fraction * 0
+            left, x, x_bar = void_fraction * 0 + 1, void_fraction * 0, void_fraction * 0
             if void_fraction < 1:
                 if ti.static(block.features & SOFTENS):
                     x = excess(F, least)
                     left, _ = softened(block, x, maxwell + 6 * elements * points, b)
-                    solid = shear * left
                 if elements > 0:
                     S = factor * pull_back(F, least)
                     for e in range(elements):
                         number = head[ELEMENT] + (b * elements + e) * PRONY
                         Z = load_symmetric(state, maxwell + 6 * e * points, points)
                         Q += fixed[number + PRONY_MODULUS] * (Z + fixed[number + PRONY_GAIN] * S)
-            by_F, Q_bar, bulk_bar, solid_bar, shear_bar, factor_bar, void_bar = piola_adjoint(
-                F, Q, bulk, solid, shear, factor, void_fraction, P_bar
+            by_F, Q_bar, bulk_bar, shear_bar, whole_bar, void_bar = piola_adjoint(
+                F, Q, bulk, shear, factor * left, void_fraction, P_bar
             )
-            F_bar = by_F
-            work = bulk * bulk_bar + solid * solid_bar + shear * shear_bar
+            F_bar, factor_bar = by_F, left * whole_bar
+            work = bulk * bulk_bar + shear * shear_bar
             add(False, sums, mat_bar + BULK * points, bulk_bar)
             add(False, sums, mat_bar + VOID_FRACTION * points, void_bar)
             if void_fraction < 1:
@@ -210,13 +209,12 @@ def stress_point_adjoint(block: ti.template(), q, t, b, p):
                         factor_bar += contract(S_bar, pull_back(F, least))
                 if ti.static(block.features & SOFTENS):
                     last = 6 * elements * points
-                    x_bar = softened_adjoint(block, x, maxwell + last, history + last, b, p, points, shear * solid_bar)
+                    x_bar = softened_adjoint(block, x, maxwell + last, history + last, b, p, points, factor * whole_bar)
                     F_bar += excess_adjoint(F, least, x_bar)
-                    solid_bar *= solid / shear
             else:
                 for c in range(head[HISTORIES]):
                     bar[history + c * points] = 0
-            add(False, sums, mat_bar + SHEAR * points, solid_bar + shear_bar)
+            add(False, sums, mat_bar + SHEAR * points, shear_bar)
             if ti.static(block.features & STIFFENS):
                 by_F, linear_bar, square_bar = stiffening_adjoint(F, least, linear, square, factor_bar)
                 F_bar += by_F
