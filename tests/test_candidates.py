@@ -246,14 +246,14 @@ def test_a_coefficient_of_friction_within_its_tolerance_is_a_belief(sliding):
     assert fit is not None
     assert list(fit.ln_factors) == ["ln_modulus", "ln_friction"]
     assert fit.ln_factors["ln_friction"] == pytest.approx(math.log(1.05), abs=0.01)
-    for form in (e for e in library() if isinstance(e, Friction)):
-        assert model_of(sliding, (form,)).released == (1,)  # beside the modulus; the belief is held
+    friction = next(e for e in library() if isinstance(e, Friction))
+    assert model_of(sliding, (friction,)).released == (1,)  # beside the modulus; the belief is held
 
 
 @pytest.mark.parametrize("named", [False, True])
 def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(sliding, named):
     """Whether friction is a belief or an effect, beside which the belief is held."""
-    effects = tuple(e for e in library() if named and type(e) is Friction)
+    effects = tuple(e for e in library() if named and isinstance(e, Friction))
     (fit,) = sliding.fit([(effects, None)], rounds=4)
     assert fit is not None
     (model,) = near(sliding, [fit], closely=True)

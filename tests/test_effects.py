@@ -9,13 +9,10 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from ringing import EDGE, two_trials
 
-from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.body_effects import LoadInertia, TautTether
-from torchsoro.sim2real.hypotheses.outer_effects import InitialPose, StribeckFriction
+from torchsoro.sim2real.hypotheses.outer_effects import InitialPose
 from torchsoro.sim2real.hypotheses.supply_effects import OrificeLeak, PressureLag, ThrottledLoss
-from torchsoro.sim2real.twin.batch import simulate
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.loads import Force
@@ -119,26 +116,3 @@ def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
     assert pull is pulled.loads[1]
     assert torch.allclose(left.value, 0.1 * scenario.gravity * (1 - values))
     assert torch.allclose(mass.mass, 0.1 * values[:, 0])
-
-
-def test_friction_at_rest_is_that_of_each_variation_and_leaves_the_others_as_they_are(tmp_path):
-    """A bar that slides with and without: together in a batch, and each by itself."""
-    trial = two_trials(tmp_path)[1]
-    floor = PlaneTable(point=(0.0, 0.0, trial.setup.origin[2]), normal=(0.0, 0.0, 1.0), friction=0.4)
-    setup = dataclasses.replace(trial.setup, clamps=(), planes=(floor,), velocity=(0.2, 0.0, 0.0), duration=0.1)
-    twin = Twin(setup, edge=EDGE, across=2)
-    scenario = twin.scenario(dataclasses.replace(trial, setup=setup))
-    values = torch.tensor([[0.1, 0.5, -3.0], [-0.2, 0.0, -3.0]], dtype=torch.float64)
-    effect = StribeckFriction()
-    both = effect(scenario, values, twin)
-    (plane,) = both.planes
-    assert both.batch == 2
-    assert plane.friction.tolist() == pytest.approx((0.4 * values[:, 0].exp()).tolist())
-    assert plane.static_friction.tolist() == pytest.approx((0.4 * values[:, 0].exp() * (1 + values[:, 1])).tolist())
-    together = [m.position for m in simulate(twin, [scenario, both])]
-    apart = [simulate(twin, [s])[0].position for s in (scenario, effect(scenario, values[:1], twin))]
-    np.testing.assert_allclose(together[0], apart[0], atol=1e-9)
-    np.testing.assert_allclose(together[1][:1], apart[1], atol=1e-9)
-    # More at rest, it slides less far.
-    way = [float((m[-1] - m[0])[..., 0].mean()) for m in (together[1][0], together[0][0], together[1][1])]
-    assert 0 < way[0] < way[1] < way[2]

@@ -27,7 +27,6 @@ from torchsoro.sim2real.hypotheses.outer_effects import (
     InitialRigidMotion,
     InitialTilt,
     Sliding,
-    StribeckFriction,
     WallOffset,
 )
 from torchsoro.sim2real.hypotheses.supply_effects import (
@@ -50,7 +49,6 @@ def library() -> tuple[Hypothesis, ...]:
         *(
             Sliding,
             Friction,
-            StribeckFriction,
             Adhesion,
             WallOffset,
             GravityTilt,

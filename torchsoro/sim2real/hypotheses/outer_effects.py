@@ -80,38 +80,6 @@ class Friction(Hypothesis):
         return any(not g.sticks for g in scenario.planes)
 
 
-class StribeckFriction(Friction):
-    """Planes hold what rests more than what slides: mu (1 + a / (1 + (v / s)^2)), v the speed along them (Stribeck)."""
-
-    ratios = frozenset({"coefficient", "stribeck_speed_m_s"})
-    quantities = (
-        *Friction.quantities,
-        Quantity("static_excess", "1", 0.1, 0.0, 20.0),
-        Quantity("ln_speed", "ln m/s", 1.0, -9.0, 0.0),
-    )
-    starts = tuple((factor, 2.0, -3.5) for factor in (2.0, -2.0, 6.0, -6.0, 11.0))
-
-    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
-        """The coefficient of what slides, by how much that at rest is larger, and the speed at which half of it is."""
-        excess, speed = float(values[1]), math.exp(values[2])
-        more = {"static_excess": (excess, "1"), "stribeck_speed_m_s": (speed, "m/s")}
-        return {**super().reported(values, scenario, twin), **more}
-
-    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """Of planes that do not stick."""
-        if not bool(values.any()):
-            return scenario
-        factor, excess, speed = values[:, 0].exp(), 1 + values[:, 1], values[:, 2].exp()
-
-        def change(g: Plane) -> dict[str, Tensor]:
-            if not isinstance(g.friction, Tensor):
-                return {}
-            sliding = g.friction * factor
-            return {"friction": sliding, "static_friction": sliding * excess, "stribeck_speed": speed}
-
-        return _planes(scenario, change)
-
-
 class Adhesion(Hypothesis):
     """Planes hold the body back as it lifts off, with the same traction as far as they reach (Dugdale)."""
 

@@ -60,9 +60,8 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
     low, high = problem.bounds(effects)
     released: list[int] = []
     for effect in effects:
-        same = next((one for one, _ in problem.common if isinstance(effect, type(one))), None)
-        if same is not None:
-            released += range(len(priors), len(priors) + len(same.quantities))
+        if any(isinstance(effect, type(one)) for one, _ in problem.common):
+            released += range(len(priors), len(priors) + len(effect.quantities))
         for i, q in enumerate(effect.quantities):
             shape = i > 0 and q.least < 0 and not effect.joint
             width = math.inf if shape else STRENGTH

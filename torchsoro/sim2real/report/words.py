@@ -63,8 +63,6 @@ QUANTITIES = {
     "air_stiffness_pa": "pressure lost as the chamber doubles its volume",
     "density_drag_kg_m3": "density of the fluid times drag coefficient",
     "coefficient": "friction coefficient",
-    "static_excess": "by how much more it is at rest",
-    "stribeck_speed_m_s": "speed at which half of that is left",
     "traction": "adhesive traction",
     "reach_m": "reach of the adhesion",
     "energy_j_m2": "energy of separation",
@@ -100,8 +98,7 @@ MAIN = {
     "adhesion": ("energy_j_m2",),
 }
 
-# Quantities of unit 1 that people state in percent.
-PERCENT = {"fraction", "fraction_at_highest", "depth", "share", "static_excess"}
+PERCENT = {"fraction", "fraction_at_highest", "depth", "share"}  # quantities of unit 1 that people state in percent
 
 # Units people use: factor on the SI value, and name; the first row whose upper limit is above the value.
 _UNITS = {

@@ -292,17 +292,10 @@ class _Group:
         def numbers(name: str) -> Tensor:
             return self.rows(lambda s: torch.as_tensor(getattr(s.planes[number], name)), 0)
 
-        def at_rest(s: Scenario) -> Tensor:
-            plane = s.planes[number]
-            return torch.as_tensor(plane.friction if plane.static_friction is None else plane.static_friction)
-
-        grips = any(self.scenarios[i].planes[number].static_friction is not None for i, _ in self.lanes)
         return Plane(
             normal=like.normal,
             offset=numbers("offset"),
             friction="stick" if like.sticks else numbers("friction"),
-            static_friction=self.rows(at_rest, 0) if grips else None,
-            stribeck_speed=numbers("stribeck_speed"),
             adhesion=numbers("adhesion"),
             reach=numbers("reach"),
             landing=like.landing,

@@ -66,13 +66,13 @@ class Scenario:
         ranks = [(self.youngs_modulus, 1), (self.poisson_ratio, 0), (self.density, 1), (self.stiffening, 1)]
         ranks += [(self.air_stiffness, 1), (self.gravity, 1)]
         ranks += [(self.softening, 1), (self.displacement, 2), (self.velocity, 2)]
-        for g in self.planes:
-            given = (g.offset, g.adhesion, g.reach, g.friction, g.static_friction, g.stribeck_speed)
-            ranks += [(t, 0) for t in given if isinstance(t, Tensor)]
+        ranks += [
+            (t, 0) for g in self.planes for t in (g.offset, g.adhesion, g.reach, g.friction) if isinstance(t, Tensor)
+        ]
         for load in self.loads:
             named = {"value": 1, "mass": 0, "stiffness": 0, "coefficient": 0, "share": 1}
-            amounts = [(getattr(load, name, None), rank) for name, rank in named.items()]
-            ranks += [(t, rank) for t, rank in amounts if isinstance(t, Tensor)]
+            given = [(getattr(load, name, None), rank) for name, rank in named.items()]
+            ranks += [(t, rank) for t, rank in given if isinstance(t, Tensor)]
         if self.prony is not None:
             ranks.append((self.prony.moduli, 1))
         if self.pressure is not None:
