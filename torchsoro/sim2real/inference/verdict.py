@@ -215,20 +215,21 @@ def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> li
 
 
 def _as_pairs(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequence[Fit]) -> list[Fit]:
-    """Ends of searches at which a stated number is not credible, as that effect and the number as another.
+    """Ends of searches with a stated number that is not credible, as pairs of the effect and that number as another.
 
-    A search among pairs does not tell them, as they leave the same.
+    A search among pairs does not keep them, as they leave the same.
     """
     found, known = [], len(problem.common)
     for fit in ends:
+        if len(fit.effects) != 1:
+            continue
+        (effect,) = fit.effects
         for k, (stated, tolerance) in enumerate(problem.common):
             released = next((e for e in effects if type(e) is type(stated)), None)
-            names = [e.name for e in fit.effects]
-            if released is None or len(names) != 1 or released.name in names or abs(fit.point[k]) <= BELIEVED:
+            if released is None or released.name == effect.name or abs(fit.point[k]) <= BELIEVED:
                 continue
-            both = tuple(e for e in effects if e in (released, *fit.effects))
-            own = {released: fit.point[k : k + 1] * tolerance / released.quantities[0].scale}
-            own |= {fit.effects[0]: fit.point[known:]}
+            own = {effect: fit.point[known:], released: fit.point[[k]] * tolerance / released.quantities[0].scale}
+            both = tuple(e for e in effects if e in own)
             rest = np.where(np.arange(known) == k, 0.0, fit.point[:known])
             point = np.concatenate([rest, *(own[e] for e in both)])
             found.append(dataclasses.replace(fit, effects=both, point=point))

@@ -67,7 +67,7 @@ class Candidate:
     left: float
     ln_evidence: float
     probability: float
-    credible: bool = True
+    credible: bool
 
     @property
     def name(self) -> str:
