@@ -163,8 +163,9 @@ def _meaning(
     plain = [d for d in simpler if apart(c.best, d.best) < (least if sure(d) else max(least, own))]
     name = max(plain, key=lambda d: d.ln_evidence).name if plain else c.name
     # What a second effect adds is told as an effect by itself is.
-    adds = all(sure(d) and apart(c.best, d.best) > own and foretells(c, d) for d in plain)
-    called = c.name if len(model.effects) > 1 and adds else name
+    pair = len(model.effects) > 1
+    adds = pair and all(sure(d) and apart(c.best, d.best) > own and foretells(c, d) for d in plain)
+    called = c.name if adds else name
     unexplained = c.left > max(UNEXPLAINED * left, noise, error, own)
     if c.size < max(least, own):
         return NOTHING, NOTHING if unexplained or c.size < own else called

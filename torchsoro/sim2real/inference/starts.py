@@ -64,15 +64,21 @@ def likely(looks: Sequence[Look], null_model: Fit, most: int) -> list[Task]:
     return [*first, *more][:most]
 
 
-def unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], null_model: Fit) -> list[Task]:
-    """Starts for an unconstrained modulus or pressure, where the null model needs one beyond its tolerance."""
+def unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], fit: Fit) -> list[Task]:
+    """Starts with a stated number that a fit of one effect, or of none, needs far beyond its tolerance, as an effect."""
     found: list[Task] = []
-    for i, (common, tolerance) in enumerate(problem.common):
-        for effect in effects:
-            if type(effect) is type(common) and abs(null_model.point[i]) > BELIEVED:
-                rest = np.where(np.arange(len(null_model.point)) == i, 0.0, null_model.point)
-                strength = null_model.point[i] * tolerance / effect.quantities[0].scale
-                found.append(((effect,), np.append(rest, strength)))
+    known = len(problem.common)
+    for k, (stated, tolerance) in enumerate(problem.common):
+        for released in effects:
+            if type(released) is not type(stated) or abs(fit.point[k]) <= BELIEVED:
+                continue
+            if released.name in [e.name for e in fit.effects]:
+                continue
+            rest = np.where(np.arange(known) == k, 0.0, fit.point[:known])
+            own = dict.fromkeys(fit.effects, fit.point[known:])
+            own[released] = fit.point[[k]] * tolerance / released.quantities[0].scale
+            both = tuple(e for e in effects if e in own)
+            found.append((both, np.concatenate([rest, *(own[e] for e in both)])))
     return found
 
 

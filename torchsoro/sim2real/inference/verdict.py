@@ -15,7 +15,6 @@ from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference import visible
 from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
 from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
-from torchsoro.sim2real.inference.decision import BELIEVED
 from torchsoro.sim2real.inference.evidence import Posterior
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction, predictions
@@ -23,6 +22,7 @@ from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.least_squares import told
 from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
+from torchsoro.sim2real.inference.starts import unconstrained
 from torchsoro.sim2real.inference.weighing import Weighing, adjustment
 
 FOLDS = 4  # trials that are left out, one after the other
@@ -219,21 +219,12 @@ def _as_pairs(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequence
 
     A search among pairs does not keep them, as they leave the same.
     """
-    found, known = [], len(problem.common)
-    for fit in ends:
-        if len(fit.effects) != 1:
-            continue
-        (effect,) = fit.effects
-        for k, (stated, tolerance) in enumerate(problem.common):
-            released = next((e for e in effects if type(e) is type(stated)), None)
-            if released is None or released.name == effect.name or abs(fit.point[k]) <= BELIEVED:
-                continue
-            own = {effect: fit.point[known:], released: fit.point[[k]] * tolerance / released.quantities[0].scale}
-            both = tuple(e for e in effects if e in own)
-            rest = np.where(np.arange(known) == k, 0.0, fit.point[:known])
-            point = np.concatenate([rest, *(own[e] for e in both)])
-            found.append(dataclasses.replace(fit, effects=both, point=point))
-    return found
+    alone = [fit for fit in ends if len(fit.effects) == 1]
+    return [
+        dataclasses.replace(fit, effects=both, point=point)
+        for fit in alone
+        for both, point in unconstrained(problem, effects, fit)
+    ]
 
 
 def _as_simpler(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequence[Fit]) -> list[Fit]:
