@@ -65,7 +65,7 @@ def likely(looks: Sequence[Look], null_model: Fit, most: int) -> list[Task]:
 
 
 def unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], fit: Fit) -> list[Task]:
-    """Starts with a stated number that a fit of one effect, or of none, needs far beyond its tolerance, as an effect."""
+    """Starts with a stated number as an effect, where a fit of one effect or none needs it far beyond its tolerance."""
     found: list[Task] = []
     known = len(problem.common)
     for k, (stated, tolerance) in enumerate(problem.common):
