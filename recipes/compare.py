@@ -1,6 +1,6 @@
 """The paper's checks on a finished robot: slopes, modulus, pressure, frequency, early designs, elements, cell, method.
 
-    python recipes/compare.py walker --out runs/compare            # an archived robot, see recipes/designs
+    python recipes/compare.py walker --out runs/compare            # an archived robot, see torchsoro/designs
     python recipes/compare.py runs/walker --out runs/compare       # one of your own
     python recipes/compare.py walker --out runs/compare --only design half_cell
     python recipes/compare.py walker --out runs/robust --scenarios 64    # friction, tilt, pressure, modulus, tube
