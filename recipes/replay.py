@@ -93,7 +93,7 @@ def main(chosen: Options) -> dict[str, float]:
     # At least one sample, so that even a small part of a cycle can be simulated.
     duration = max(1, round(chosen.cycles / base.frequency / base.sample_every)) * base.sample_every
     settle = chosen.settle if base.settle > 0 else 0.0
-    min_wall = base.min_wall if chosen.min_wall is None else chosen.min_wall
+    min_wall = base.mended_to if chosen.min_wall is None else chosen.min_wall
     touches = base.self_contact if chosen.self_contact is None else chosen.self_contact
     changes = {"duration": duration, "settle": settle, "min_wall": min_wall, "self_contact": touches}
     robot = build(dataclasses.replace(base, **changes))

@@ -29,6 +29,8 @@ from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import load_design
 from torchsoro.output.robustness import UNSEEN, compare_scenarios
+from torchsoro.simulation.ops.lanes import fewest, lay_out
+from torchsoro.simulation.ops.lattice import Lattice
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 MEMORY = 0.04  # GiB, in which twice as many lanes keep states more often
@@ -40,6 +42,11 @@ def robot_of(**changes: Any) -> Robot:
     with torch.no_grad():
         made.field.phi.copy_(torch.linspace(-0.1, 0.3, 8).reshape(8, 1, 1) + 0.05 * torch.linspace(-1, 1, 8))
     return made
+
+
+def alone(made: Robot, batch: ScenarioBatch, k: int) -> ScenarioBatch:
+    """One scenario of a batch, as often as it takes for the same bits: a lane does not see what is beside."""
+    return batch.part([k] * made.carried(1, batch.count))
 
 
 def metrics(path: Path) -> list[dict[str, str]]:
@@ -76,16 +83,17 @@ def test_scenarios_are_fresh_in_each_iteration_and_the_same_ones_when_asked_agai
     assert torch.equal(fixed.sample(7).friction, two.friction)
 
 
-def test_a_gradient_is_the_sum_over_scenarios_of_the_gradients_of_single_runs():
-    made = robot_of(clip=0.0, lightness=0.1, dt=1e-4)
+@pytest.mark.parametrize(("count", "carried"), [(5, 5), (9, 16)])
+def test_a_gradient_is_the_sum_over_scenarios_of_the_gradients_of_single_runs(count, carried):
+    made = robot_of(scenarios=count, clip=0.0, lightness=0.1, dt=1e-4)
+    assert made.carried(count) == carried
     ensemble = Ensemble(made)
     gamma = made.field()
     outcome = ensemble.judge(gamma, 3, 1.0)
     aims = loop.aim(made, outcome, 3)
     (found,) = ensemble.gradient(gamma, aims)
     batch = ensemble.sample(3)
-    # Sixteen times the same, so that a scenario is in a lane, with the same bits, whatever it is beside.
-    singles = [made(made.field(), scenarios=batch.part([k] * 16)) for k in range(5)]
+    singles = [made(made.field(), scenarios=alone(made, batch, k)) for k in range(count)]
     values = torch.cat([loop.aim(made, one, 3)[:1] for one in singles])
     assert torch.equal(aims, values)
     (wanted,) = torch.autograd.grad(-overall(made, values), made.field.phi)
@@ -101,7 +109,7 @@ def test_two_chambers_with_a_designed_timing_in_three_scenarios_have_the_gradien
     aims = loop.aim(made, ensemble.judge(gamma, 1, 1.0), 1)
     found = ensemble.gradient(gamma, aims)
     batch = ensemble.sample(1)
-    singles = [made(made.field(), scenarios=batch.part([k] * 16)) for k in range(3)]
+    singles = [made(made.field(), scenarios=alone(made, batch, k)) for k in range(3)]
     values = torch.cat([loop.aim(made, one, 1)[:1] for one in singles])
     assert torch.equal(aims, values)
     wanted = torch.autograd.grad(-overall(made, values), (made.field.phi, *designed))
@@ -124,7 +132,7 @@ def test_designed_chambers_in_three_scenarios_have_the_gradients_of_single_runs(
     aims = loop.aim(made, outcome, 1)
     found = ensemble.gradient(gamma, aims)
     batch = ensemble.sample(1)
-    singles = [made(made.density(), scenarios=batch.part([k] * 16)) for k in range(3)]
+    singles = [made(made.density(), scenarios=alone(made, batch, k)) for k in range(3)]
     assert torch.equal(outcome.intermediate, singles[0].intermediate)
     values = torch.cat([loop.aim(made, one, 1)[:1] for one in singles])
     assert torch.equal(aims, values)
@@ -179,7 +187,7 @@ def test_a_design_fell_where_those_that_fell_are_more_than_half_of_the_risk():
 
 
 def test_a_scenario_that_breaks_down_is_named_and_halves_the_step_of_all(monkeypatch):
-    made = robot_of(halvings=1)
+    made = robot_of(halvings=1, scenarios=9)
     ensemble, steps = Ensemble(made), []
     real = Robot.forward
     failures = 1
@@ -187,14 +195,14 @@ def test_a_scenario_that_breaks_down_is_named_and_halves_the_step_of_all(monkeyp
     def fragile(self: Robot, *args: Any, **how: Any) -> Outcome:
         steps.append(how["dt"])
         if len(steps) <= failures:
-            raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J <= 0", batch=7, remedy="a smaller step")
+            raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J <= 0", batch=12, remedy="a smaller step")
         return real(self, *args, **how)
 
     monkeypatch.setattr(Robot, "forward", fragile)
     assert ensemble.judge(made.field(), 0, 1.0).dt == steps[0] / 2 == steps[1]
     steps.clear()
     failures = 2
-    with pytest.raises(SimulationDiverged, match="of simulation 4: J <= 0"):  # lane 7 repeats scenario 4, the last
+    with pytest.raises(SimulationDiverged, match="of simulation 8: J <= 0"):  # lane 12 repeats scenario 8, the last
         ensemble.judge(made.field(), 0, 1.0)
 
 
@@ -323,6 +331,7 @@ ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(RECIPES.p
     "more",
     [
         {},
+        {"scenarios": 9},
         {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)},
         {"feature": 0.004},
         {"chamber_design": ("place", "size")},
@@ -350,8 +359,8 @@ def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(reci
         torchrun(2, path, **more, iterations=last - 1, resume=True), env=ENVIRONMENT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
-    recipes["walker"].main(tiny(path, **MANY, **more, iterations=last, resume=True))
-    recipes["walker"].main(tiny(tmp_path / "one", **MANY, **more, iterations=last))
+    recipes["walker"].main(tiny(path, **{**MANY, **more}, iterations=last, resume=True))
+    recipes["walker"].main(tiny(tmp_path / "one", **{**MANY, **more}, iterations=last))
     assert_same_run(path, tmp_path / "one")
 
 
@@ -382,17 +391,36 @@ def test_lanes_are_as_many_as_a_cpu_carries():
     assert torchsoro.design.robot.LANES == LANES
 
 
+@pytest.mark.parametrize("lattice", [(4, 4, 4), (8, 8, 8), (10, 12, 6)])
+def test_lanes_are_simulations_from_as_many_on_as_the_layout_says(lattice):
+    grid = Lattice.uniform(lattice, (0.0, 0.0, 0.0), 2e-3)
+    kind = torch.zeros(lattice).flatten()
+    laid = [lay_out(grid, kind, torch.full_like(kind, -1).long(), n, torch.float32).variations for n in range(1, 17)]
+    assert laid.index(True) + 1 == fewest(grid)
+    assert laid == sorted(laid)
+
+
+def test_a_part_of_few_scenarios_has_their_gradient_bit_by_bit_without_more_lanes():
+    made = robot_of(scenarios=3)
+    batch, gamma = Ensemble(made).sample(0), made.field().detach()
+    assert [made.carried(n, 3) for n in (1, 2, 3)] == [1, 2, 3] and made.carried(1, 20) == 16
+    dt = made.step(gamma, batch)
+    found = [gradients(made, gamma, batch.part(part), dt) for part in ([0, 1, 2], [0, 1], [2])]
+    assert torch.equal(torch.cat(found[1:]), found[0]) and float(found[0].abs().max()) > 0
+
+
+def gradients(made: Robot, gamma: torch.Tensor, batch: ScenarioBatch, dt: float) -> torch.Tensor:
+    """Of each scenario's travel by its own density [S, N]."""
+    rows = gamma.expand(batch.count, -1).clone().requires_grad_()
+    return torch.autograd.grad(made(rows, scenarios=batch, dt=dt).travel.sum(), rows)[0]
+
+
 def test_a_part_of_the_scenarios_keeps_states_as_often_as_all_and_has_their_gradient_bit_by_bit():
     made = robot_of(scenarios=20, memory=MEMORY)
     batch, gamma = Ensemble(made).sample(0), made.field().detach()
     dt = made.step(gamma, batch)
-
-    def of(part: list[int]) -> torch.Tensor:
-        rows = gamma.expand(len(part), -1).clone().requires_grad_()
-        return torch.autograd.grad(made(rows, scenarios=batch.part(part), dt=dt).travel.sum(), rows)[0]
-
-    whole = of([*range(20), *[19] * 12])
-    assert torch.equal(of([*range(16)]), whole[:16])
+    whole = gradients(made, gamma, batch.part([*range(20), *[19] * 12]), dt)
+    assert torch.equal(gradients(made, gamma, batch.part([*range(16)]), dt), whole[:16])
 
 
 @pytest.mark.gpu

@@ -121,6 +121,11 @@ def test_settings_want_a_scenario_for_each_variant_and_a_filter_that_is_wide_eno
         dataclasses.replace(TINY, feature=0.001, scenarios=2)
     with pytest.raises(ValueError, match=r"feature = 0\.02 m: wanted above 0 and below twice the filter radius"):
         dataclasses.replace(TINY, feature=0.02, scenarios=3)
+    walls = [
+        dataclasses.replace(TINY, **{**FEATURED, **more}).mended_to
+        for more in ({}, {"feature": 6e-3}, {"min_wall": 0.0})
+    ]
+    assert walls == [0.004, TINY.wall, 0.0] and TINY.mended_to == 0
     # A finished robot is simulated and compared without any, but not designed.
     finished = walker(dataclasses.replace(TINY, feature=0.004, scenarios=0))
     with pytest.raises(ValueError, match=r"feature = 0\.004 m with scenarios = 0: wanted at least 3 scenarios"):
@@ -140,7 +145,7 @@ def test_scenarios_meet_the_design_eroded_and_dilated_in_turn_with_the_gradients
     aims = loop.aim(made, outcome, 3)
     (found,) = ensemble.gradient(gamma, aims)
     batch, fields = ensemble.sample(3), [made.field(threshold=eta * (0, 1, -1)[k % 3]) for k in range(5)]
-    singles = [made(fields[k], scenarios=batch.part([k] * 16)) for k in range(5)]
+    singles = [made(fields[k], scenarios=batch.part([k])) for k in range(5)]
     whole = made.field()
     values = torch.stack([loop.aim(made, dataclasses.replace(one, mass=made(whole).mass), 3)[0] for one in singles])
     torch.testing.assert_close(aims, values, rtol=1e-6, atol=1e-7)
@@ -168,7 +173,9 @@ def test_a_run_tells_how_far_its_variants_go(recipes, tmp_path):
     for name in ("intermediate", "eroded", "dilated"):
         assert np.isfinite(rows[f"scenariosL_{name}"]).all()
     assert len(set(rows["scenariosL_eroded"]) | set(rows["scenariosL_dilated"])) > 2
-    assert "L" in result
+    # As thick as asked for, but where there is no room, which is told.
+    assert result["min_wall"] == pytest.approx(0.004)
+    assert result["min_wall_met"] == (result["thinnest_wall"] > 0.0039)
 
 
 def test_an_eroded_design_wears_off_at_the_faces_of_its_box():

@@ -41,7 +41,7 @@ def changed(name: str, held: Any, kind: Any) -> tuple[str, ...]:
     """What to write after a flag so that its setting changes and stays in range."""
     special = {"friction": "0.4", "dt": "0.0000125", "air_density": "2.5", "settle": "0.5"}
     special |= {"out": "elsewhere", "resolution": "1280x720", "risk": "worst", "start_from": "walker"}
-    special |= {"scenarios": "4"}
+    special |= {"scenarios": "4", "min_wall": "0.001"}
     several = {"sharpen": ("10", "20"), "amplitudes": ("0.5", "1"), "phases": ("0", "0.5"), "duties": ("0.4", "0.5")}
     several |= {"friction_range": ("0.2", "0.8"), "timing": ("phase", "duty"), "slopes": ("0", "0.1")}
     several |= {"chamber_design": ("place", "size"), "chamber_centers": ("0", "0", "0.0175") * 2}

@@ -1,8 +1,9 @@
 """Scenarios of a design run: simulated in shares, judged together, and their gradients summed in a fixed order.
 
 On a CPU a scenario's numbers do not depend on which others are simulated beside it: every share fills whole groups of
-sixteen lanes, all shares take the same substep, and gradients are kept apart until they are summed in the order of
-scenarios. So they are the same bits for any number of processes. On a GPU they agree to rounding.
+sixteen lanes, or none does where there are few scenarios; all shares take the same substep, and gradients are kept
+apart until they are summed in the order of scenarios. So they are the same bits for any number of processes. On a GPU
+they agree to rounding.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Ensemble:
         self.count = robot.settings.scenarios
         self.parts = self.processes.deal(self.count)
         self.own = self.parts[self.processes.rank]
-        spare = robot.carried(len(self.own)) - len(self.own)
+        spare = robot.carried(len(self.own), self.count) - len(self.own)
         self._places = [*self.own, *[self.own[-1]] * spare]
         self.judged = JUDGED + (TURNS if robot.settings.robot == "turner" else ())
         self._timing = {name: one for name, one in robot.supply.named_parameters() if one.requires_grad}

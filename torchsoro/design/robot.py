@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -28,12 +29,13 @@ from torchsoro.simulation.formulation import Formulation, formulation_of
 from torchsoro.simulation.loads import PointMass
 from torchsoro.simulation.material import Body, Gas, Prony, Solid
 from torchsoro.simulation.material_file import read_material
+from torchsoro.simulation.ops.lanes import fewest
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.simulator import Simulator
 from torchsoro.simulation.sums import pairwise_sum
 from torchsoro.simulation.trajectory import Start, Trajectory
 
-LANES = 16  # simulations that a CPU carries on at a time; fewer are filled up
+LANES = 16  # simulations that a CPU carries on at a time
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -414,9 +416,18 @@ class Robot(nn.Module):
         probes = torch.arange(len(rest), device=rest.device)
         return replace(trajectory, position=position, velocity=velocity, probes=probes)
 
-    def carried(self, count: int) -> int:
-        """Simulations that are carried on where so many are asked for: lanes are filled."""
-        return count + -count % LANES if self.formulation.in_lanes(self.field.phi) else count
+    def carried(self, count: int, whole: int | None = None) -> int:
+        """Simulations that are carried on where so many are asked for, as a share of so many: a CPU's lanes are filled.
+
+        Where the whole is so few that lanes are cells of each simulation, none is added.
+        """
+        if not self.formulation.in_lanes(self.field.phi) or (whole or count) < self._fewest:
+            return count
+        return count + -count % LANES
+
+    @cached_property
+    def _fewest(self) -> int:
+        return fewest(Lattice.around(self.domain.positions.double(), self.domain.cell))
 
     def simulator(self, parts: int = 1, dt: float | None = None) -> Simulator:
         """A simulator, in whose box it moves, that takes a part of the usual step; or the step ``dt`` [s]."""

@@ -265,8 +265,9 @@ class Settings:
     """Let the movie's camera follow the robot."""
     offset: AtLeastZero = 0.0
     """Thickness added to the outer surface of the printed part [m]."""
-    min_wall: AtLeastZero = 0.0
-    """Thickness up to which thin walls of the printed part are mended [m]; 0 leaves them as they are designed."""
+    min_wall: AtLeastZero | None = None
+    """Thickness up to which thin walls of the printed part are mended [m]; 0 leaves them as they are designed. If left
+    out, that of ``feature``, or of ``wall`` if that is less."""
     port: AtLeastZero = 0.0
     """Diameter of the air port [m]; 0 for two fifths of the cavity's edge."""
 
@@ -289,12 +290,12 @@ class Settings:
             raise ValueError(
                 f"offset = {self.offset:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
             )
-        if self.min_wall > 0.25 * min(self.size):
+        if self.mended_to > 0.25 * min(self.size):
             raise ValueError(
-                f"min_wall = {self.min_wall:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
+                f"min_wall = {self.mended_to:g} m: wanted at most a quarter of the body, {min(self.size) / 4:g} m"
             )
-        if self.min_wall > 0:
-            points_across(self.min_wall, self.size[0] / self.particles[0], max(self.particles))
+        if self.mended_to > 0:
+            points_across(self.mended_to, self.size[0] / self.particles[0], max(self.particles))
         self._check_chambers()
         edges = [edge - 2 * self.wall for edge in self.chamber]
         edges["xyz".index(self.chamber_axis)] /= self.chambers
@@ -438,6 +439,11 @@ class Settings:
         if self.gravity_steps == 0:
             return 1.0
         return min(1.0, (iteration // self.gravity_every) / self.gravity_steps)
+
+    @property
+    def mended_to(self) -> float:
+        """Thickness up to which thin walls of the printed part are mended [m]; 0 for none."""
+        return min(self.feature, self.wall) if self.min_wall is None else self.min_wall
 
     @property
     def target(self) -> torch.device:

@@ -232,7 +232,7 @@ def mended(robot: Robot, gamma: torch.Tensor, part: Part | None = None) -> tuple
     Returns:
         None and the design's density, where no least wall is asked for, or there is no part.
     """
-    if not robot.settings.min_wall:
+    if not robot.settings.mended_to:
         return None, gamma
     try:
         part = part or print_part(robot, gamma.cpu().numpy())
@@ -472,5 +472,5 @@ def record(
 def print_part(robot: Robot, density: np.ndarray) -> Part:
     """The printable part, with the robot's air ports."""
     s = robot.settings
-    how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.min_wall}
+    how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.mended_to}
     return fabricate(robot.domain, density, port=robot.port, **how)

@@ -176,6 +176,16 @@ def _efficiency(cells: np.ndarray, row: int, first: list[np.ndarray]) -> float:
     return len(cells) / (LANES * blocks)
 
 
+def fewest(lattice: Lattice) -> int:
+    """Simulations of a body from which on lanes are simulations; of fewer, they are cells of each."""
+    there = np.ones(lattice.points, bool) if lattice.index is None else np.zeros(lattice.points, bool)
+    if lattice.index is not None:
+        there.reshape(-1)[lattice.index.cpu().numpy()] = True
+    x, y, z = (n // 2 for n in lattice.points)
+    cells = np.argwhere(there.reshape(x, 2, y, 2, z, 2).any((1, 3, 5)))
+    return math.ceil(LANES * _efficiency(cells, lattice.shape[2], [axis.first for axis in lattice.axes]))
+
+
 def _blocks(layer: np.ndarray, row: int, first: list[np.ndarray]) -> list[tuple[int, list[tuple[int, np.ndarray]]]]:
     """Blocks of the cells of a layer: place of the first lane in the plane, and each lane that has a cell with it."""
     corner = first[1][layer[:, 1]] * row + first[2][layer[:, 2]]
