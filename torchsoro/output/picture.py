@@ -197,7 +197,8 @@ def _pictures(
     figure, canvas = canvas_of(*size)
     # Below some 600 pixels text of the usual size would run into itself.
     scale = min(1.0, size[0] / 720)
-    strip = 0.0 if motion.pressure is None else 0.17
+    below = max(0.075, 40 / size[1])  # for the numbers and the name of the time axis
+    strip = 0.0 if motion.pressure is None else below + 0.095
     axes = figure.add_axes((0.01, strip + 0.01, 0.98, 0.90 - strip))
     start = float(motion.cog[0, motion.along])
     scene = Scene(axes, motion.shape, camera, planes, motion.bounds, along=motion.along, start=start)
@@ -215,7 +216,7 @@ def _pictures(
     dot = None
     if motion.pressure is not None:
         left = max(0.075, 54 / size[0])  # for the numbers beside it
-        trace = figure.add_axes((left, 0.075, 1 - left - max(0.02, 18 / size[0]), strip - 0.075))
+        trace = figure.add_axes((left, below, 1 - left - max(0.02, 18 / size[0]), strip - below))
         dot = pressure_trace(trace, motion.time, motion.pressure)
         trace.set_xlabel("time [s]", color=INK, fontsize=9, labelpad=1)
     for i, (vertices, cavity) in enumerate(motion.placed):
