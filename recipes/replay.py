@@ -72,8 +72,9 @@ def main(chosen: Options) -> dict[str, float]:
     from torchsoro.design.reading import read_settings
     from torchsoro.design.robot import build
     from torchsoro.output import archive
-    from torchsoro.output.delivery import mending_line, numbers, show
+    from torchsoro.output.delivery import numbers, show
     from torchsoro.output.folding import folding_line
+    from torchsoro.output.printable import mending_line
     from torchsoro.storage import check_folder
 
     if chosen.archive is not None:

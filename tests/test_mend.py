@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,19 @@ import pytest
 import torch
 from tiny import TINY, tiny
 
+import torchsoro.output.printable
+from torchsoro.design import loop
 from torchsoro.design.density import thickened
 from torchsoro.design.domain import Chamber, Domain
 from torchsoro.design.port import AirPort
-from torchsoro.design.robot import walker
+from torchsoro.design.robot import Robot, walker
+from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import load_design
-from torchsoro.output.delivery import deliver, mending_line, print_part
+from torchsoro.output.delivery import deliver
 from torchsoro.output.fabricate import fabricate
 from torchsoro.output.mend import clearance
 from torchsoro.output.part import Part
+from torchsoro.output.printable import farthest, mending_line, print_part
 
 torch.set_num_threads(1)
 H = 1e-3  # particle spacing, m
@@ -172,6 +177,31 @@ def test_a_delivered_run_holds_both_densities_and_tells_both_travels(delivered):
     assert f"travel {1e3 * found['L_before']:.2f} mm before, {1e3 * found['L']:.2f} mm now" in mending_line(found)
     added = torch.from_numpy(print_part(robot, plain.numpy()).added).to(plain)
     assert torch.equal(mended, thickened(plain, added, 3.0))
+
+
+@pytest.mark.parametrize(("worths", "chosen"), [((3, 2, 1), 7), ((1, 2, 3), 5), ((1, math.inf, 2), 5), ((1, 3, 2), 4)])
+def test_of_the_last_designs_the_one_whose_part_goes_farthest_is_delivered(tmp_path, monkeypatch, worths, chosen):
+    robot = walker(tiny(tmp_path, min_wall=1.5 * 0.035 / 8))
+    designs = []
+    for k, lightest in zip((7, 4, 5, 6), (0.9, 0.8, 0.7, 0.0), strict=True):  # the last is grey
+        with torch.no_grad():
+            robot.field.phi.fill_(lightest)
+        designs.append({"iteration": k, **loop.design_of(robot)})
+    loop.take_(robot, designs[0])
+    best = robot.density().detach()
+    told = {"iteration": 7, "worth": 1.0, "violation": -0.001, "metrics": {}, "lately": [*designs[1:], designs[0]]}
+    values = iter(worths)
+
+    def worth(one: Robot, delivered: torch.Tensor) -> float:
+        if math.isinf(value := next(values)):
+            raise SimulationDiverged(step=1, time=0.1, particle=2, quantity="J <= 0", remedy="a smaller step")
+        return value
+
+    monkeypatch.setattr(torchsoro.output.printable, "_worth", worth)
+    gamma, iteration, part = farthest(robot, loop.Optimized(gamma=best, **told))
+    wanted = next(one for one in designs if one["iteration"] == chosen)
+    assert iteration == chosen and part is not None and part.report.mended is not None
+    assert torch.equal(robot.field.phi, wanted["phi"]) and torch.equal(robot.density(), gamma)
 
 
 @pytest.mark.slow

@@ -18,8 +18,8 @@ from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.port import AirPort
 from torchsoro.design.robot import walker
-from torchsoro.output.delivery import print_part
 from torchsoro.output.fabricate import fabricate
+from torchsoro.output.printable import print_part
 from torchsoro.simulation.material import Solid
 
 SIDE, RADIUS, BODY = 0.04, 0.008, 0.018  # m

@@ -19,7 +19,7 @@ from torchsoro.design.reading import read_settings
 from torchsoro.design.robot import Robot, build
 from torchsoro.output import archive
 from torchsoro.output.archive import DESIGNS, load_design, load_shape
-from torchsoro.output.delivery import print_part
+from torchsoro.output.printable import print_part
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from tiny import TINY
 from torchsoro.design.robot import climber, walker
 from torchsoro.design.training import RunFolder
 from torchsoro.output import delivery
-from torchsoro.output.delivery import drawn_planes, numbers, print_part, show, show_shape
+from torchsoro.output.delivery import drawn_planes, numbers, show, show_shape
+from torchsoro.output.printable import print_part
 
 
 def test_pictures_get_the_planes_of_the_robot():

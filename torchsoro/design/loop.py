@@ -203,6 +203,7 @@ class Optimized:
         worth: What it is worth, in cells (see :func:`worth_of`); minus infinity where ``iteration`` is None.
         violation: C above its limit; infinite where ``iteration`` is None.
         metrics: Everything logged, by column (see ``RunFolder.metrics``).
+        lately: The last designs that neither broke down nor fell, as :func:`take_` takes them, and their ``iteration``.
     """
 
     gamma: torch.Tensor
@@ -210,6 +211,7 @@ class Optimized:
     worth: float
     violation: float
     metrics: dict[str, list[float]]
+    lately: list[dict[str, Any]] = dataclasses.field(default_factory=list)
 
 
 def restore(
@@ -376,7 +378,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             timing_norm = torch.nn.utils.clip_grad_norm_(timing, s.clip or math.inf)
             # By one spacing, as a limit by one metre would be some hundreds of times as tight.
             placing_norm = spacing * torch.nn.utils.clip_grad_norm_(placing, (s.clip or math.inf) / spacing)
-            design = design_of(robot)
+            design = {"iteration": k, **design_of(robot)}
             if norm.isfinite() and timing_norm.isfinite() and placing_norm.isfinite():
                 lost = 0
                 if not (back or fell(robot, outcome)):
@@ -400,7 +402,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             worth, excess = worth_of(robot, outcome), float(violation.detach())
             counts = s.gravity_scale(k) == 1.0 and (ensemble is None or ensemble.grown(k) == 1.0)
             if counts and better(worth, excess, best, lagrangian):
-                best = {"iteration": k, "worth": worth, "violation": excess, **design}
+                best = {"worth": worth, "violation": excess, **design}
             end = time.perf_counter()
             timed = {f"supply/{name}": value for name, value in supply.numbers().items()} if timing else {}
             timed |= {"grad_norm/supply": timing_norm} if timing else {}
@@ -452,4 +454,4 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             take_(robot, best)
         none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
         told = {name: (best or none)[name] for name in none}
-        return Optimized(gamma=robot.density().detach(), metrics=run.metrics, **told)
+        return Optimized(gamma=robot.density().detach(), metrics=run.metrics, lately=good, **told)

@@ -17,23 +17,23 @@ import torch
 
 from torchsoro.command_line import parse_resolution, progress_bar
 from torchsoro.design.chambers import check_new
-from torchsoro.design.density import thickened
 from torchsoro.design.ensemble import Ensemble, Evaluation, end, evaluate
 from torchsoro.design.objective import intermediate_density, mean_stride
 from torchsoro.design.processes import Processes, joined, world_size
-from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.robot import Robot
 from torchsoro.design.rounding import changes, rounded, rounding_line, save_chambers
 from torchsoro.design.settings import Settings
 from torchsoro.design.starts import optimize_starts
 from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import begin_with, save_design
-from torchsoro.output.fabricate import fabricate, surface
+from torchsoro.output.fabricate import surface
 from torchsoro.output.folding import folded, folding_line
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
 from torchsoro.output.picture import movie, shape_image, summary
+from torchsoro.output.printable import farthest, mended, mending_line, print_part, told_of
 from torchsoro.output.web_page import FILE as PAGE
 from torchsoro.output.web_page import write_page
 from torchsoro.storage import plain_settings, write_json
@@ -88,16 +88,17 @@ def design(robot: Robot, name: str) -> dict[str, float]:
             end(processes)
             raise
         end(processes)
-    history = optimized.metrics
+    history, gamma, chosen, part = optimized.metrics, optimized.gamma, optimized.iteration, None
+    if s.mended_to and robot.placement is None:
+        gamma, chosen, part = farthest(robot, optimized)
     more = {
-        "iteration": len(history["iteration"]) - 1 if optimized.iteration is None else optimized.iteration,
+        "iteration": len(history["iteration"]) - 1 if chosen is None else chosen,
         "iterations": len(history["iteration"]),
         "forward": statistics.median(history["time/forward"]),
         "backward": statistics.median(history["time/backward"]),
         "seconds": sum(history["time/iteration"]),
         **(robot.supply.numbers() if designed_supply(robot) is not None else {}),
     }
-    gamma = optimized.gamma
     if robot.placement is not None:
         sharp = rounded(robot)
         gamma = sharp.density().detach()
@@ -105,7 +106,7 @@ def design(robot: Robot, name: str) -> dict[str, float]:
         save_design(s.out / "design.npz", sharp.domain, gamma, designed_supply(sharp))
         more |= changes(robot, sharp, history)
         robot = sharp
-    found = deliver(s.out, robot, gamma, history, name=name, chosen=optimized.iteration, more=more)
+    found = deliver(s.out, robot, gamma, history, name=name, chosen=chosen, part=part, more=more)
     print(report(found, s))
     return found
 
@@ -185,6 +186,7 @@ def deliver(
     *,
     name: str,
     chosen: int | None = None,
+    part: Part | None = None,
     more: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Write the design of a finished run into its folder, as ``design.npz``, and show it there: see :func:`show`.
@@ -198,6 +200,7 @@ def deliver(
         history: Metrics of the run, for the summary.
         name: Of the robot: names the movie and the page.
         chosen: Iteration that the design is of; the last if None.
+        part: Of a design whose settings ask for a least wall, if it has been made already.
         more: What else ``result.json`` is to tell.
 
     Returns:
@@ -208,7 +211,7 @@ def deliver(
     """
     s = robot.settings
     gamma = save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot))
-    part, delivered = mended(robot, gamma)
+    part, delivered = mended(robot, gamma, part)
     if part is not None:
         save_design(path / "design.npz", robot.domain, gamma, designed_supply(robot), delivered)
     found = None
@@ -219,26 +222,6 @@ def deliver(
     told = {**({} if found is None else found.numbers()), **(more or {})}
     how: dict[str, Any] = {"history": history, "chosen": chosen, "scenarios": found, "part": part, "more": told}
     return show(path, robot, gamma, name=name, **how)[0]
-
-
-def mended(robot: Robot, gamma: torch.Tensor, part: Part | None = None) -> tuple[Part | None, torch.Tensor]:
-    """The printable part of a design whose settings ask for a least wall, and the density of that part.
-
-    Args:
-        robot: The robot.
-        gamma: Density of the design [N].
-        part: The part, if it has been made already.
-
-    Returns:
-        None and the design's density, where no least wall is asked for, or there is no part.
-    """
-    if not robot.settings.mended_to:
-        return None, gamma
-    try:
-        part = part or print_part(robot, gamma.cpu().numpy())
-    except (ValueError, RuntimeError):  # no body to print, which is told at the end
-        return None, gamma
-    return part, thickened(gamma, torch.from_numpy(part.added).to(gamma), robot.settings.power)
 
 
 @torch.no_grad()
@@ -398,41 +381,6 @@ def save_part(path: Path, part: Part) -> None:
     write_json(path / "shape.json", part.report.as_dict())
 
 
-def told_of(part: Part, plain: Outcome) -> dict[str, float]:
-    """What is told of a part with mended walls, and of its design without.
-
-    Args:
-        part: The part.
-        plain: What the design does without.
-
-    Returns:
-        Wanted wall [m], whether it is met, the wall before [m], volume added [m3] and as a share, travel before [m].
-    """
-    done = part.report.mended
-    assert done is not None
-    return {
-        "min_wall": 1e-3 * done.min_wall_mm,
-        "min_wall_met": done.met,
-        "thinnest_wall_before": 1e-3 * done.thinnest_wall_before_mm,
-        "mended_volume": 1e-9 * done.volume_mm3,
-        "mended_share": done.share,
-        "L_before": float(plain.travel),
-    }
-
-
-def mending_line(found: Mapping[str, Any]) -> str:
-    """What mending the walls has changed, in a line; empty where none was asked for."""
-    if "min_wall" not in found:
-        return ""
-    walls = [1e3 * found[name] for name in ("min_wall", "thinnest_wall_before", "thinnest_wall")]
-    missed = "" if found["min_wall_met"] else " NOT MET"
-    return (
-        f"walls mended to {walls[0]:.2f} mm{missed}: thinnest {walls[1]:.2f} mm before, {walls[2]:.2f} mm now, by "
-        f"{1e9 * found['mended_volume']:.1f} mm3 ({100 * found['mended_share']:.2f} %); "
-        f"travel {1e3 * found['L_before']:.2f} mm before, {1e3 * found['L']:.2f} mm now\n"
-    )
-
-
 @torch.no_grad()
 def mean_pressure(robot: Robot, time: torch.Tensor) -> np.ndarray:
     """Gauge pressure of the supply at some times [S] Pa, the mean over the chambers."""
@@ -467,10 +415,3 @@ def record(
     motion.save(path / MOTION)
     # As it is read from the file: the page shows what the viewer does.
     write_page(read_motion(path / MOTION), path / PAGE)
-
-
-def print_part(robot: Robot, density: np.ndarray) -> Part:
-    """The printable part, with the robot's air ports."""
-    s = robot.settings
-    how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.mended_to}
-    return fabricate(robot.domain, density, port=robot.port, **how)
