@@ -6,6 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -179,18 +180,29 @@ def test_a_delivered_run_holds_both_densities_and_tells_both_travels(delivered):
     assert torch.equal(mended, thickened(plain, added, 3.0))
 
 
-@pytest.mark.parametrize(("worths", "chosen"), [((3, 2, 1), 7), ((1, 2, 3), 5), ((1, math.inf, 2), 5), ((1, 3, 2), 4)])
-def test_of_the_last_designs_the_one_whose_part_goes_farthest_is_delivered(tmp_path, monkeypatch, worths, chosen):
+@pytest.mark.parametrize(
+    ("worths", "thick", "chosen"),
+    [
+        ((3, 2, 1), (True, True, True), 7),
+        ((1, 2, 3), (True, True, True), 5),
+        ((1, 2, 3), (True, True, False), 4),
+        ((1, math.inf, 2), (True, True, True), 5),
+        ((3, 2, 1), (False, False, False), 7),
+    ],
+)
+def test_of_the_last_designs_the_one_whose_part_goes_farthest_is_delivered(
+    tmp_path, monkeypatch, worths, thick, chosen
+):
     robot = walker(tiny(tmp_path, min_wall=1.5 * 0.035 / 8))
     designs = []
-    for k, lightest in zip((7, 4, 5, 6), (0.9, 0.8, 0.7, 0.0), strict=True):  # the last is grey
+    for k, everywhere in zip((7, 4, 5, 6), (0.9, 0.8, 0.7, 0.0), strict=True):  # the last is grey
         with torch.no_grad():
-            robot.field.phi.fill_(lightest)
+            robot.field.phi.fill_(everywhere)
         designs.append({"iteration": k, **loop.design_of(robot)})
     loop.take_(robot, designs[0])
     best = robot.density().detach()
     told = {"iteration": 7, "worth": 1.0, "violation": -0.001, "metrics": {}, "lately": [*designs[1:], designs[0]]}
-    values = iter(worths)
+    values, reports = iter(worths), iter([SimpleNamespace(mended=SimpleNamespace(met=met)) for met in thick])
 
     def worth(one: Robot, delivered: torch.Tensor) -> float:
         if math.isinf(value := next(values)):
@@ -198,9 +210,12 @@ def test_of_the_last_designs_the_one_whose_part_goes_farthest_is_delivered(tmp_p
         return value
 
     monkeypatch.setattr(torchsoro.output.printable, "_worth", worth)
+    monkeypatch.setattr(
+        torchsoro.output.printable, "mended", lambda one, gamma: (SimpleNamespace(report=next(reports)), gamma)
+    )
     gamma, iteration, part = farthest(robot, loop.Optimized(gamma=best, **told))
     wanted = next(one for one in designs if one["iteration"] == chosen)
-    assert iteration == chosen and part is not None and part.report.mended is not None
+    assert iteration == chosen and part is not None
     assert torch.equal(robot.field.phi, wanted["phi"]) and torch.equal(robot.density(), gamma)
 
 
