@@ -325,16 +325,20 @@ def torchrun(processes: int, path: Path, **changes: Any) -> list[str]:
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(RECIPES.parent)}
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 @pytest.mark.parametrize(
     "more",
     [
         {},
-        {"scenarios": 9},
-        {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)},
-        {"feature": 0.004},
-        {"chamber_design": ("place", "size")},
+        *(
+            pytest.param(more, marks=pytest.mark.slow)
+            for more in (
+                {"scenarios": 9},
+                {"chambers": 2, "timing": ("phase", "duty"), "phases": (0.0, 0.2)},
+                {"feature": 0.004},
+                {"chamber_design": ("place", "size")},
+            )
+        ),
     ],
 )
 def test_two_processes_have_the_bits_of_one_and_a_killed_run_goes_on_in_one(recipes, tmp_path, more):

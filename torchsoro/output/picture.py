@@ -197,7 +197,7 @@ def _pictures(
     figure, canvas = canvas_of(*size)
     # Below some 600 pixels text of the usual size would run into itself.
     scale = min(1.0, size[0] / 720)
-    below = max(0.075, 40 / size[1])  # for the numbers and the name of the time axis
+    below = max(0.075, 36 / size[1])  # for the numbers and the name of the time axis
     strip = 0.0 if motion.pressure is None else below + 0.095
     axes = figure.add_axes((0.01, strip + 0.01, 0.98, 0.90 - strip))
     start = float(motion.cog[0, motion.along])
