@@ -10,7 +10,6 @@ import numpy as np
 import torch
 
 from torchsoro.design.density import thickened
-from torchsoro.design.ensemble import evaluate, overall
 from torchsoro.design.loop import Optimized, design_of, take_, worth_of
 from torchsoro.design.objective import intermediate_density
 from torchsoro.design.robot import Outcome, Robot
@@ -32,17 +31,18 @@ def farthest(robot: Robot, optimized: Optimized) -> tuple[torch.Tensor, int | No
         optimized: What its run has ended with.
 
     Returns:
-        Density of the design [N], its iteration, and the part; those of the best where no other is better, or where
-        none can be printed.
+        Density of the design [N], its iteration, and the part; those of the best where no other is better. The part is
+        None where none can be printed, and where there is no other design, which is not mended here then.
     """
-    s, first = robot.settings, {"iteration": optimized.iteration, **design_of(robot)}
+    first = {"iteration": optimized.iteration, **design_of(robot)}
     others = [one for one in optimized.lately if one.get("iteration") not in (None, optimized.iteration)]
+    if optimized.iteration is None or not others:
+        return optimized.gamma, optimized.iteration, None
     found: list[tuple[bool, float, dict[str, Any], torch.Tensor, Part | None]] = []
-    for design in [first, *others[:: max(1, math.ceil(len(others) / LATELY))]]:
+    for design in [first, *others[:: math.ceil(len(others) / LATELY)]]:
         take_(robot, design)
         gamma = robot.density().detach()
-        within = float(intermediate_density(gamma, robot.design)) <= s.c_max
-        if design is not first and (optimized.iteration is None or not within):
+        if design is not first and float(intermediate_density(gamma, robot.design)) > robot.settings.c_max:
             continue
         part, delivered = mended(robot, gamma)
         done = None if part is None else part.report.mended
@@ -57,13 +57,10 @@ def farthest(robot: Robot, optimized: Optimized) -> tuple[torch.Tensor, int | No
 
 
 def _worth(robot: Robot, gamma: torch.Tensor) -> float:
-    """What a density is worth, in cells, in the run's scenarios if it has any; a turner's in its own one."""
+    """What a density is worth, in cells, in the run's scenarios if it has any."""
     s = robot.settings
-    if not s.scenarios or s.robot == "turner":
-        return worth_of(robot, robot(gamma))
-    found = evaluate(robot, gamma, s.distribution.sample(s.scenarios, s.scenario_seed))
-    way = torch.from_numpy(np.nan_to_num(found.travel - s.upright * found.fall, nan=-s.size[0]))
-    return float(overall(robot, way)) / robot.domain.cell
+    batch = s.distribution.sample(s.scenarios, s.scenario_seed) if s.scenarios else None
+    return worth_of(robot, robot(gamma, scenarios=batch))
 
 
 def print_part(robot: Robot, density: np.ndarray) -> Part:
