@@ -266,6 +266,36 @@ def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(slidi
         assert sizes[k] > 0.5 * sizes[1 - k]
 
 
+def test_larger_cells_tell_what_changes_in_the_finer_twin(sliding):
+    shift = 0.02, -0.01
+    problem = sliding.only(sliding.trials, discretization=DiscretizationError(shift=shift))
+    density = effect("density")
+    points = np.array([[0.1, 0.0, 0.0], [0.1, 1.0, 0.0], [0.1, -2.0, 1.0]])
+    bare = DiscretizationError(shift=shift)
+    ((coarse,), (fine,)) = (
+        p.simulate([((density,), points)])
+        for p in (problem.only(problem.trials, discretization=bare), problem.by(problem.fine))
+    )
+    (mixed,) = problem.finely().beside([((density,), points)])
+    responses = problem.finely().probe([density], problem.finely().base())[0]
+    assert len(responses) > 0
+    for a, b, found in zip(coarse, fine, mixed, strict=True):
+        np.testing.assert_allclose(found.position[0], b.position[0], atol=1e-7)
+        np.testing.assert_allclose(found.position[1:] - found.position[:1], a.position[1:] - a.position[:1], atol=1e-7)
+        # What they change is a measure of what the finer twin does.
+        for one, other in zip(found.position[1:], b.position[1:], strict=True):
+            assert np.abs(one - other).max() < 0.25 * np.abs(other - b.position[0]).max()
+    with pytest.raises(ValueError, match="wanted a twin with smaller cells"):
+        sliding.only(sliding.trials, fine=None).finely()
+
+
+def test_a_fit_whose_derivatives_are_those_of_larger_cells_ends_where_one_by_the_finer_twin_does(sliding):
+    fits = [p.fit([((), None)], rounds=8)[0] for p in (sliding.finely(), sliding.by(sliding.fine))]
+    mixed, fine = (f for f in fits if f is not None)
+    np.testing.assert_allclose(mixed.point, fine.point, atol=0.1)
+    assert mixed.chi2 < 1.02 * fine.chi2  # which is rough
+
+
 def test_cells_that_are_as_good_count_where_bodies_touch(on_a_plane):
     known = measure(on_a_plane.experiment, on_a_plane.twin, on_a_plane.fine)
     assert set(known.between) == {t.name for t in on_a_plane.trials}

@@ -38,17 +38,23 @@ def test_an_orifice_takes_its_share_of_the_highest_steady_pressure_and_less_of_a
     assert q**2 / 0.25 <= 1 - share + 1e-12
 
 
-@given(share=st.floats(0.0, 0.9), part=st.floats(0.01, 1.0), sign=st.sampled_from((1.0, -1.0)))
-def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_one(made, share, part, sign):
+@given(
+    share=st.floats(0.0, 0.9),
+    evenness=st.floats(-1.0, 1.0),
+    part=st.floats(0.01, 1.0),
+    sign=st.sampled_from((1.0, -1.0)),
+)
+def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_one(made, share, evenness, part, sign):
     highest = 1e4
     twin, scenario = supplied(made, [sign * part * highest, sign * highest, 0.0])
-    values = torch.tensor([[share], [0.0]], dtype=torch.float64)
+    values = torch.tensor([[share, evenness], [0.0, evenness]], dtype=torch.float64)
     found = ThrottledLoss()(scenario, values, twin).pressure.pressure[:, 0]
     assert float(found[0, 1]) == pytest.approx(sign * highest * (1 - share), rel=1e-9)
-    # What is missing is what air that seeps away in proportion to p loses in the throttle.
-    p = abs(float(found[0, 0]))
-    assert p + share / (1 - share) ** 2 * p**2 / highest == pytest.approx(part * highest, rel=1e-9)
-    assert p >= part * highest * (1 - share) * (1 - 1e-12)
+    # What is missing beside an even share is what air that seeps away in proportion to p loses in the throttle.
+    p, even = abs(float(found[0, 0])), share * (1 + evenness) / 2
+    throttle = (share - even) / (1 - share) ** 2
+    assert p + throttle * p**2 / highest == pytest.approx((1 - even) * part * highest, rel=1e-9)
+    assert (1 - share) * (1 - 1e-12) <= p / (part * highest) <= (1 - even) * (1 + 1e-12)
     assert float(found[0, 2]) == 0.0
     assert torch.equal(found[1], scenario.pressure.pressure)
 

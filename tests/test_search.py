@@ -100,7 +100,7 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
         return [(abs(float(x[1]) - 11.0) + 2 * (e is c), e, x) for e, x in started]
 
     monkeypatch.setattr(search, "looked_at", look)
-    problem: Any = SimpleNamespace(fine="twin", by=lambda twin: Fine())
+    problem: Any = SimpleNamespace(finely=Fine)
     ends = [fit((c,), np.array([0.0, 11.0]), 20.0), fit((a, b), np.zeros(3), 1.0)]
     search._by_finer(problem, effects, nothing, ends, lambda line: None)
     # A few starts by responses of each effect, and where single effects have ended before.

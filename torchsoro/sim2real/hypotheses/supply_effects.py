@@ -42,15 +42,15 @@ class PressureGain(Hypothesis):
 
 
 class ThrottledLoss(Hypothesis):
-    """A throttle takes a share that grows with the pressure: p_supply = p + b p^2 / P, P the highest supply.
+    """A share is lost at any pressure, and a throttle takes more the higher it is: (1 - c) p_supply = p + b p^2 / P.
 
-    Air that seeps away behind it in proportion to p loses b p^2 / P in the throttle (turbulent flow). Of a steady
-    supply P, the share a is lost, where b = a / (1 - a)^2.
+    P is the highest supply. Air that seeps away behind a throttle in proportion to p loses b p^2 / P in it (turbulent
+    flow). Of a steady supply P the share a is lost, where b = (a - c) / (1 - a)^2 and c = a (1 + evenness) / 2.
     """
 
     name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
-    quantities = (Quantity("fraction_at_highest", "1", 0.05, 0.0, 19.0),)
-    starts = ((2.0,), (6.0,))
+    quantities = (Quantity("fraction_at_highest", "1", 0.05, 0.0, 19.0), Quantity("evenness", "1", 0.5, -2.0, 2.0))
+    starts = ((2.0, -1.0), (6.0, -1.0))
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """By the name of the other form."""
@@ -61,10 +61,12 @@ class ThrottledLoss(Hypothesis):
         assert scenario.pressure is not None
         supply = _chambers(scenario.pressure).double()
         share = values[:, 0].clamp(0, 0.99)
-        throttle = (share / (1 - share) ** 2)[:, None, None]
+        steady = share * (1 + values[:, 1].clamp(-1, 1)) / 2
+        throttle = ((share - steady) / (1 - share) ** 2)[:, None, None]
         most = supply.abs().amax(-1, keepdim=True).clamp(min=_faint(scenario))
-        # The root of b q^2 + q = |p_supply| / P, in a form that does not cancel where b is small.
-        behind = 2 * supply / (1 + torch.sqrt(1 + 4 * throttle * supply.abs() / most))
+        left = supply * (1 - steady)[:, None, None]
+        # The root of b q^2 + q = |left| / P, in a form that does not cancel where b is small.
+        behind = 2 * left / (1 + torch.sqrt(1 + 4 * throttle * left.abs() / most))
         return scenario.replace(pressure=dataclasses.replace(scenario.pressure, pressure=behind))
 
     def applies(self, scenario: Scenario, twin: Twin) -> bool:

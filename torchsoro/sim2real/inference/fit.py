@@ -5,13 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Answer, GaussNewton, Point
-from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood
+from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.probing import ranked_starts
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
+from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.kernels.lanes import LANES
 
 # Damping of the step that leaves a trial out: an unknown that the other trials hardly determine stays as it was.
@@ -60,7 +64,49 @@ class Fit:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FitProblem(Likelihood):
-    """Recordings and a twin, to which effects are fitted; see :class:`Likelihood` for its arguments."""
+    """Recordings and a twin, to which effects are fitted; see :class:`Likelihood` for its other arguments.
+
+    Attributes:
+        coarser: A twin with larger cells by which changes of the motion are simulated, and what its stated numbers are
+            shifted by there, see :meth:`beside`; none for the twin itself.
+    """
+
+    coarser: tuple[Twin, tuple[float, ...]] | None = None
+
+    def finely(self) -> Self:
+        """The same by the finer twin as it is, which nothing corrects, with changes of the motion by the twin of now.
+
+        Raises:
+            ValueError: without a finer twin.
+        """
+        if self.fine is None:
+            raise ValueError("fine: none, wanted a twin with smaller cells")
+        return dataclasses.replace(self.by(self.fine), coarser=(self.twin, tuple(self.shift)))
+
+    @cached_property
+    def _coarsely(self) -> Self | None:
+        """The same by the twin with larger cells."""
+        if self.coarser is None:
+            return None
+        twin, shift = self.coarser
+        return self.only(self.trials, twin=twin, coarser=None, discretization=DiscretizationError(shift=shift))
+
+    def beside(self, requests: Sequence[Request]) -> list[list[MarkerTrajectory]]:
+        """As :meth:`simulate`, but what other points change of the first of each request is simulated by larger cells.
+
+        A response to a small change is a difference of motions, of which larger cells change a share only.
+
+        Args:
+            requests: Effects and points.
+        """
+        coarsely = self._coarsely
+        if coarsely is None:
+            return self.simulate(requests)
+        found = self.simulate([(effects, points[:1]) for effects, points in requests])
+        several = [k for k, (_, points) in enumerate(requests) if len(points) > 1]
+        for k, motions in zip(several, coarsely.simulate([requests[k] for k in several]), strict=True):
+            found[k] = [_changed(m.alone(), m, at.alone()) for m, at in zip(motions, found[k], strict=True)]
+        return found
 
     def base(self, known: Fit | None = None) -> Point:
         """The point that responses are taken at: the setup as stated, or a fit without effects.
@@ -74,7 +120,7 @@ class FitProblem(Likelihood):
         asked = next(search)
         try:
             while True:
-                asked = search.send(Answer(motions=self.simulate([asked])[0]))
+                asked = search.send(Answer(motions=self.beside([asked])[0]))
         except StopIteration as end:
             point, _ = end.value
         if point is None:
@@ -99,10 +145,21 @@ class FitProblem(Likelihood):
             ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in own]))
             for e, own in zip(effects, points, strict=True)
         ]
-        simulated = self.simulate(requests)
+        simulated = self._responses(requests, base)
         return [
             ranked_starts(self, e, own, len(through_zero), WEAK, motions, base)
             for e, own, through_zero, motions in zip(effects, points, linear, simulated, strict=True)
+        ]
+
+    def _responses(self, requests: Sequence[Request], base: Point) -> list[list[MarkerTrajectory]]:
+        """Motions at points beside a base without an effect, see :meth:`beside`."""
+        coarsely = self._coarsely
+        if coarsely is None:
+            return self.simulate(requests)
+        middle, *found = coarsely.simulate([((), base.at[None]), *requests])
+        return [
+            [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]
+            for motions in found
         ]
 
     def fit(
@@ -135,12 +192,13 @@ class FitProblem(Likelihood):
         asked = {i: next(search) for i, search in enumerate(searches)}
         while asked:
             order = list(asked)
-            # Where there is room in a batch, derivatives take hardly longer than the step by itself.
+            # Where there is room in a batch, or larger cells do for them, derivatives take hardly longer than the step.
             wide = sum(1 + solvers[i].unknowns for i in order) * len(self.trials)
-            answers = self.simulate([asked[i] for i in order])
+            eager = self.coarser is not None or wide <= ROOM
+            answers = self.beside([asked[i] for i in order])
             for i, motions in zip(order, answers, strict=True):
                 try:
-                    asked[i] = searches[i].send(Answer(motions=motions, eager=wide <= ROOM))
+                    asked[i] = searches[i].send(Answer(motions=motions, eager=eager))
                 except StopIteration as end:
                     ends[i] = end.value
                     del asked[i]
@@ -187,3 +245,9 @@ class FitProblem(Likelihood):
             point=point.at,
             end=point,
         )
+
+
+def _changed(one: MarkerTrajectory, others: MarkerTrajectory, at: MarkerTrajectory) -> MarkerTrajectory:
+    """A motion with what others [B, ...] change of one, where all of them are sound."""
+    sound = others.sound & bool(one.sound.all()) & bool(at.sound.all())
+    return dataclasses.replace(others.plus(one, -1.0).plus(at), sound=sound)

@@ -154,8 +154,7 @@ def _by_finer(
     correction makes up for cells that are off by as much as effects are. Searches begin where chi-squared itself is
     least, of where responses promise most, where the search before has ended, and evenly spread points.
     """
-    assert problem.fine is not None
-    fine = problem.by(problem.fine)
+    fine = problem.finely()
     begin = [((), null_model.point), *null_starts(fine)]
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:
