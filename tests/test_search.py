@@ -90,9 +90,8 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     nothing.errors = np.zeros(2)
     monkeypatch.setattr(search.dataclasses, "replace", lambda one, **_: one)
     monkeypatch.setattr(search, "null_starts", lambda problem: [])
-    monkeypatch.setattr(
-        search, "screened", lambda *_: [(5.0, a, np.array([0.0, 1.0])), (50.0, b, np.array([0.0, 1.0]))]
-    )
+    spread = [(9.0, a, 2.0), (5.0, a, 1.0), (6.0, a, 1.5), (50.0, b, 1.0)]
+    monkeypatch.setattr(search, "screened", lambda *_: [(chi2, e, np.array([0.0, x])) for chi2, e, x in spread])
     looked: list[Any] = []
 
     def look(problem: Any, started: Any) -> list[Any]:
@@ -103,12 +102,12 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     problem: Any = SimpleNamespace(finely=Fine)
     ends = [fit((c,), np.array([0.0, 11.0]), 20.0), fit((a, b), np.zeros(3), 1.0)]
     search._by_finer(problem, effects, nothing, ends, lambda line: None)
-    # A few starts by responses of each effect, and where single effects have ended before.
-    assert [x[1] for e, x in looked if e is a] == [10.0 + k for k in range(PROMISING)]
+    # A few starts by responses of each effect, the best of spread points, and where single effects have ended before.
+    assert [x[1] for e, x in looked if e is a] == [*(10.0 + k for k in range(PROMISING)), 1.0, 1.5]
     assert [x[1] for e, x in looked if e is c] == [10.0, 11.0, 11.0]
     starts = {effects[0]: float(point[1]) for effects, point in begun[1]}
     assert starts == {a: 11.0, b: 11.0, c: 11.0}
-    # Of a, neither the spread point, which leaves 5, nor the first start, which leaves 1.
+    # Of a, neither a spread point nor the first start, which leaves 1.
     assert [e.name for (e,), _ in begun[1]] == ["lag", "drag", "mass"]
 
 

@@ -108,6 +108,17 @@ class FitProblem(Likelihood):
             found[k] = [_changed(m.alone(), m, at.alone()) for m, at in zip(motions, found[k], strict=True)]
         return found
 
+    def responses(self, requests: Sequence[Request], base: Point) -> list[list[MarkerTrajectory]]:
+        """As :meth:`simulate`, of points beside a base without an effect; what they change of it by larger cells."""
+        coarsely = self._coarsely
+        if coarsely is None:
+            return self.simulate(requests)
+        middle, *found = coarsely.simulate([((), base.at[None]), *requests])
+        return [
+            [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]
+            for motions in found
+        ]
+
     def base(self, known: Fit | None = None) -> Point:
         """The point that responses are taken at: the setup as stated, or a fit without effects.
 
@@ -145,21 +156,10 @@ class FitProblem(Likelihood):
             ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in own]))
             for e, own in zip(effects, points, strict=True)
         ]
-        simulated = self._responses(requests, base)
+        simulated = self.responses(requests, base)
         return [
             ranked_starts(self, e, own, len(through_zero), WEAK, motions, base)
             for e, own, through_zero, motions in zip(effects, points, linear, simulated, strict=True)
-        ]
-
-    def _responses(self, requests: Sequence[Request], base: Point) -> list[list[MarkerTrajectory]]:
-        """Motions at points beside a base without an effect, see :meth:`beside`."""
-        coarsely = self._coarsely
-        if coarsely is None:
-            return self.simulate(requests)
-        middle, *found = coarsely.simulate([((), base.at[None]), *requests])
-        return [
-            [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]
-            for motions in found
         ]
 
     def fit(

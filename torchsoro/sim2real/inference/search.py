@@ -36,7 +36,7 @@ MOST = 10  # searches that are begun, at most
 MOST_VALLEYS = 24  # the same where most end in valleys nearby
 FINER = 8  # effects that are then searched for by the finer twin
 FINER_ROUNDS = 3  # of it
-PROMISING = 2  # of an effect's starts by its responses, that are simulated
+PROMISING = 2  # of an effect's starts by its responses, and of spread points, that are simulated by the finer twin
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
@@ -152,25 +152,28 @@ def _by_finer(
 
     What the finer twin adds to the motion as stated holds as long as nodes touch when they do there, so that no
     correction makes up for cells that are off by as much as effects are. Searches begin where chi-squared itself is
-    least, of where responses promise most, where the search before has ended, and evenly spread points.
+    least, of where responses promise most, from evenly spread points, too, and where the search before has ended.
     """
     fine = problem.finely()
-    begin = [((), null_model.point), *null_starts(fine)]
+    one = fine.only(fine.trials[:1])  # the others are as good, and take as long
+    begin = [((), null_model.point), *null_starts(one)]
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:
         return [], []
     best = min(nothing, key=lambda fit: fit.chi2)
-    one = fine.only(fine.trials[:1])  # the others are as good, and take as long
     base = one.base(dataclasses.replace(best, errors=np.zeros(len(one.observation.deviations))))
     started = [
         (effect, start)
         for effect, own in zip(effects, one.probe(effects, base), strict=True)
         for _, start in own[:PROMISING]
     ]
+    spread: dict[Hypothesis, list[np.ndarray]] = {}
+    for _, effect, point in sorted(screened(one, best, effects, base), key=lambda look: look[0]):
+        spread.setdefault(effect, []).append(point)
+    started += [(effect, point) for effect, own in spread.items() for point in own[:PROMISING]]
     started += [(f.effects[0], f.point) for f in ends if len(f.effects) == 1]
-    looks = sorted([*screened(one, best, effects), *looked_at(one, started)], key=lambda look: look[0])
     first: dict[Hypothesis, Task] = {}  # of a name, each form by itself
-    for _, effect, point in looks:
+    for _, effect, point in sorted(looked_at(one, started), key=lambda look: look[0]):
         first.setdefault(effect, ((effect,), point))
     tasks = list(first.values())[:FINER]
     found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))

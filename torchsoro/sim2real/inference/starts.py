@@ -10,6 +10,7 @@ import torch
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.decision import BELIEVED
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
+from torchsoro.sim2real.inference.gauss_newton import Point
 from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -82,10 +83,18 @@ def unconstrained(problem: FitProblem, effects: Sequence[Hypothesis], fit: Fit) 
     return found
 
 
-def screened(problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]) -> list[Look]:
+def screened(
+    problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis], base: Point | None = None
+) -> list[Look]:
     """Chi-squared of each effect at evenly spread points, where the effect stands in for what is stated, and beside it.
 
     In turn, modulus and pressure are as stated, and as they explain most by themselves.
+
+    Args:
+        problem: Recordings and twin.
+        null_model: The fit without an effect.
+        effects: Which.
+        base: Of whose motions the points are taken to change what they do with larger cells; each is simulated if None.
     """
     stated = np.stack([np.zeros_like(null_model.point), null_model.point])
     started = []
@@ -93,25 +102,35 @@ def screened(problem: FitProblem, null_model: Fit, effects: Sequence[Hypothesis]
         points = spread(problem.twin, effect)
         turn = np.arange(len(points)) // len(effect.starts) % 2
         started += [(effect, np.concatenate([stated[k], x])) for k, x in zip(turn, points, strict=True)]
-    return looked_at(problem, started)
+    return looked_at(problem, started, base)
 
 
-def looked_at(problem: FitProblem, started: Sequence[tuple[Hypothesis, np.ndarray]]) -> list[Look]:
-    """Chi-squared of effects at points, with no measurement errors; without those that break down."""
+def looked_at(
+    problem: FitProblem, started: Sequence[tuple[Hypothesis, np.ndarray]], base: Point | None = None
+) -> list[Look]:
+    """Chi-squared of effects at points, with no measurement errors; without those that break down.
+
+    Args:
+        problem: Recordings and twin.
+        started: Effects and points.
+        base: See :func:`screened`.
+    """
     points: dict[Hypothesis, list[np.ndarray]] = {}
     for effect, point in started:
         points.setdefault(effect, []).append(point)
     asked = [((effect,), np.stack(own)) for effect, own in points.items()]
-    left = _simulated(problem, asked, np.zeros(len(problem.observation.deviations)))
+    left = _simulated(problem, asked, np.zeros(len(problem.observation.deviations)), base)
     return [
         (chi2, effects[0], own[k]) for (effects, own), at in zip(asked, left, strict=True) for k, chi2 in at.items()
     ]
 
 
-def _simulated(problem: FitProblem, asked: Sequence[Request], errors: np.ndarray) -> list[dict[int, float]]:
+def _simulated(
+    problem: FitProblem, asked: Sequence[Request], errors: np.ndarray, base: Point | None = None
+) -> list[dict[int, float]]:
     """Chi-squared at the points of each request by their number, without those that break down."""
     found = []
-    for motions in problem.simulate(asked):
+    for motions in problem.simulate(asked) if base is None else problem.responses(asked, base):
         sound = map(int, np.flatnonzero(np.all([m.sound for m in motions], axis=0)))
         found.append({k: problem.measure([m.alone(k) for m in motions], errors)[0] for k in sound})
     return found
