@@ -94,7 +94,7 @@ class FitProblem(Likelihood):
     def beside(self, requests: Sequence[Request]) -> list[list[MarkerTrajectory]]:
         """As :meth:`simulate`, but what other points change of the first of each request is simulated by larger cells.
 
-        A response to a small change is a difference of motions, of which larger cells change a share only.
+        Larger cells change a motion by as much as effects do, but the difference of two motions by a share of it only.
 
         Args:
             requests: Effects and points.

@@ -94,7 +94,8 @@ def screened(
         problem: Recordings and twin.
         null_model: The fit without an effect.
         effects: Which.
-        base: Of whose motions the points are taken to change what they do with larger cells; each is simulated if None.
+        base: Without an effect, to whose motions is added what points change with larger cells; if None, each point is
+            simulated as it is.
     """
     stated = np.stack([np.zeros_like(null_model.point), null_model.point])
     started = []
