@@ -100,7 +100,7 @@ def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(name, stick):
     assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), name)
 
 
-@pytest.mark.parametrize("elements", [0, 1, 5])
+@pytest.mark.parametrize("elements", [pytest.param(0, marks=pytest.mark.slow), 1, 5])
 def test_gradcheck_of_the_kernels_of_a_gpu_with_other_numbers_of_maxwell_elements(elements):
     p = problem(formulation="total", elements=elements, lanes=False)
     assert check(p, "state", "coefficients", *(["prony"] if elements else []))
@@ -143,7 +143,7 @@ LATTICES = {
     **{"x".join(map(str, shape.nodes)): (filled(shape), False) for shape in layout.SHAPES},
 }
 # Each takes 12 s to compile, on a core that does nothing else.
-AT_ONCE = {("wide", torch.float64), ("whole", torch.float64)}
+AT_ONCE = {("whole", torch.float64)}
 
 
 @pytest.mark.parametrize(
