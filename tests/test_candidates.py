@@ -267,18 +267,18 @@ def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(slidi
 
 
 def test_larger_cells_tell_what_changes_in_the_finer_twin(sliding):
-    shift = 0.02, -0.01
-    problem = sliding.only(sliding.trials, discretization=DiscretizationError(shift=shift))
+    problem = sliding.only(sliding.trials, discretization=DiscretizationError(shift=(0.02, -0.01)))
+    finely = problem.finely()
     density = effect("density")
     points = np.array([[0.1, 0.0, 0.0], [0.1, 1.0, 0.0], [0.1, -2.0, 1.0]])
-    bare = DiscretizationError(shift=shift)
-    ((coarse,), (fine,)) = (
-        p.simulate([((density,), points)])
-        for p in (problem.only(problem.trials, discretization=bare), problem.by(problem.fine))
-    )
-    (mixed,) = problem.finely().beside([((density,), points)])
-    responses = problem.finely().probe([density], problem.finely().base())[0]
-    assert len(responses) > 0
+    ((coarse,), (fine,)) = (p.simulate([((density,), points)]) for p in (problem, problem.by(problem.fine)))
+    (mixed,) = finely.beside([((density,), points)])
+    base = finely.base()
+    assert len(finely.probe([density], base)[0]) > 0
+    # Without the effect, what is added to the motions of the base is nothing.
+    (responses,) = finely.responses([((density,), np.append(base.at, 0.0)[None])], base)
+    for found, at in zip(responses, base.motions, strict=True):
+        np.testing.assert_allclose(found.position[0], at.position, atol=1e-7)
     for a, b, found in zip(coarse, fine, mixed, strict=True):
         np.testing.assert_allclose(found.position[0], b.position[0], atol=1e-7)
         np.testing.assert_allclose(found.position[1:] - found.position[:1], a.position[1:] - a.position[:1], atol=1e-7)

@@ -106,7 +106,7 @@ class Found:
 # -------------------------------------------------------------------------------------------------------------- panels
 def millimetres(length: float) -> str:
     """A length in m, without a minus before zero."""
-    return f"{round(1e3 * length, 1) + 0.0:.1f} mm"
+    return f"{1e3 * length:z.1f} mm"
 
 
 def pressure(motion: DrawnMotion) -> np.ndarray:

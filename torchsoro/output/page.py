@@ -270,7 +270,7 @@ def gait_panels(
         advance = motion.travel[i] - motion.travel[picked[0]]
         fill = motion.fill(i)
         color = INK if fill is None else PRESSURE(fill)
-        title = f"t/T = {round(phase, 2) + 0.0:.2f}   {advance:+.2f} mm"  # no "-0.00"
+        title = f"t/T = {phase:z.2f}   {advance:+.2f} mm"
         view.set_title(title, fontsize=10, color=color, pad=2, weight="bold")
     figure.text(
         0.03,

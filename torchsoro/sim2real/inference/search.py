@@ -152,7 +152,7 @@ def _by_finer(
 
     What the finer twin adds to the motion as stated holds as long as nodes touch when they do there, so that no
     correction makes up for cells that are off by as much as effects are. Searches begin where chi-squared itself is
-    least, of where responses promise most, from evenly spread points, too, and where the search before has ended.
+    least, of the starts and evenly spread points of which responses promise most, and of where the search before ended.
     """
     fine = problem.finely()
     one = fine.only(fine.trials[:1])  # the others are as good, and take as long
