@@ -187,6 +187,21 @@ def test_where_no_model_is_right_the_one_that_leaves_less_is_told(wrong):
     assert (found.chosen, found.partly) == (("leak",), True)
 
 
+@pytest.mark.parametrize(("priced", "drag"), [(0.1, 0.0), (0.15, 1.0)])
+def test_evidence_is_heard_beside_size_for_a_name_that_leaves_no_more_than_the_twin_may_err(wrong, priced, drag):
+    """How much more or less probable than the one that leaves less is the one that evidence is for."""
+    data, *models = wrong
+    models = [models[0], models[1]("drag"), models[2]("leak")]
+    twin = TwinError(amplitude=np.full_like(data.amplitudes[0], priced), time=0.01)
+    weighing = weighed(data, *(dataclasses.replace(m, numerics=twin) for m in models))
+    evidence = {p.near.model.name: p.ln_evidence for p in weighing.effects}
+    assert weighing.best.matters and evidence["drag"] - evidence["leak"] > 40
+    probabilities, candidates = weighing.candidates()
+    left = {c.name: c.left for c in candidates}
+    assert left["leak"] < left["drag"] and (left["drag"] < priced) == bool(drag)
+    assert probabilities["drag"] == pytest.approx(drag * probabilities["leak"], abs=1e-9)
+
+
 def test_where_no_model_is_right_a_stated_number_that_is_off_is_held_against_a_name(wrong):
     """A name that leaves a fiftieth less, by a belief within its deviation, or at three of them."""
     data, nothing, _, rough = wrong

@@ -100,7 +100,7 @@ def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(name, stick):
     assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), name)
 
 
-@pytest.mark.parametrize("elements", [pytest.param(0, marks=pytest.mark.slow), 1, 5])
+@pytest.mark.parametrize("elements", [*(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1)), 5])
 def test_gradcheck_of_the_kernels_of_a_gpu_with_other_numbers_of_maxwell_elements(elements):
     p = problem(formulation="total", elements=elements, lanes=False)
     assert check(p, "state", "coefficients", *(["prony"] if elements else []))

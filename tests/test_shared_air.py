@@ -28,6 +28,7 @@ def test_gradcheck_by_shares_of_air_and_what_acts_on_them(name, lanes):
     assert check(with_shared_air(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes)), name)
 
 
+@pytest.mark.slow
 def test_both_engines_give_the_same_motion_and_gradients_by_shares():
     found = []
     for lanes in (True, False):

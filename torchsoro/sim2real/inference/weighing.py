@@ -26,6 +26,9 @@ probable as the first, but for how much less it strains beliefs: that a stated n
 improbable whatever the twin errs by. An extension has a number more, by which it fits the twin's error as well: beside
 what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
 are compared in the same way.
+
+Where size decides and both leave no more than the twin may err, evidence is as good a judge as size, since it knows how
+that error varies. A name for which it is by D is at least 1 - exp(-D) times as probable as the first.
 """
 
 from __future__ import annotations
@@ -235,9 +238,20 @@ class Weighing:
         return math.log(MISSING / (self.names + 1)) - pair
 
     def _bounded(
-        self, probabilities: dict[str, float], ln_prior: dict[str, float], left: dict[str, float]
+        self,
+        probabilities: dict[str, float],
+        by_evidence: dict[str, float],
+        ln_prior: dict[str, float],
+        left: dict[str, float],
     ) -> dict[str, float]:
-        """Probabilities of names that add up to as much, no farther apart than the twin's error allows."""
+        """Probabilities of names that add up to as much, no farther apart than the twin's error allows.
+
+        Args:
+            probabilities: By evidence, or by size.
+            by_evidence: Their logarithms by evidence, up to a constant.
+            ln_prior: Of names.
+            left: What they leave [m].
+        """
         first = max(probabilities, key=lambda name: probabilities[name])
         best = self.groups[first][0]
         priced = best.near.numerics.size
@@ -259,6 +273,8 @@ class Weighing:
                 along = priced if name in best.near.model.simpler else error
                 ln_odds = ln_within(name, along) - ln_within(first, along)
                 ln_p[name] = max(ln_p[name], ln_p[first] + min(ln_odds, most))
+                if (gain := by_evidence[name] - by_evidence[first]) > 0:
+                    ln_p[name] = max(ln_p[name], ln_p[first] + math.log(-math.expm1(-gain)))
         whole = sum(probabilities.values())
         return {name: whole * p for name, p in normalised(ln_p).items()}
 
@@ -312,7 +328,7 @@ class Weighing:
                 rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count) + self._strain(name)
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         if groups:
-            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_prior, left)
+            probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_p, ln_prior, left)
         found = [
             Candidate(
                 modes=tuple(modes),
