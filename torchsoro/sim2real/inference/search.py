@@ -35,7 +35,7 @@ PARTLY = 4.0  # duration of a simulation in a search, which fills some lanes onl
 MOST = 10  # searches that are begun, at most
 MOST_VALLEYS = 24  # the same where most end in valleys nearby
 FINER = 8  # effects that are then searched for by the finer twin
-FINER_ROUNDS = 3  # of it
+FINER_ROUNDS = 3  # of these, before the best are completed
 PROMISING = 2  # of an effect's starts by its responses, and of spread points, that are simulated by the finer twin
 BEHIND = 0.1  # share of the best search's gain, by which another may be behind and still be completed
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
@@ -160,7 +160,9 @@ def _by_finer(
     nothing = [f for f in fine.fit(begin, errors=null_model.errors, rounds=FINER_ROUNDS) if f is not None]
     if not nothing:
         return [], []
-    best = min(nothing, key=lambda fit: fit.chi2)
+    least = min(nothing, key=lambda fit: fit.chi2)
+    (best,) = _completed(fine, [least], least.errors)
+    nothing = [best if f is least else f for f in nothing]
     base = one.base(dataclasses.replace(best, errors=np.zeros(len(one.observation.deviations))))
     started = [
         (effect, start)
@@ -177,10 +179,16 @@ def _by_finer(
         first.setdefault(effect, ((effect,), point))
     tasks = list(first.values())[:FINER]
     found = _best(fine.fit(tasks, errors=best.errors, rounds=FINER_ROUNDS, settle=False))
-    leading = [(f.effects, f.point) for f in found[:AHEAD]]
-    found = _best([*found, *fine.fit(leading, errors=best.errors, rounds=FINER_ROUNDS, settle=False)])
+    # Names that are alike differ by less than the rounds before gain.
+    found = _best([*found, *_completed(fine, found[:AHEAD], best.errors)])
     report(f"by the finer twin: nothing {best.chi2:.0f}, " + ", ".join(f"{f.name} {f.chi2:.0f}" for f in found))
     return nothing, found
+
+
+def _completed(problem: FitProblem, fits: Sequence[Fit], errors: np.ndarray) -> list[Fit]:
+    """Searches that ended for want of rounds, gone on with; what breaks down stays as it was."""
+    again = problem.fit([(f.effects, f.point) for f in fits], errors=errors, rounds=ROUNDS, settle=False)
+    return [before if after is None else after for before, after in zip(fits, again, strict=True)]
 
 
 def _refined(
