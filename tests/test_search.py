@@ -65,6 +65,7 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     effects: Any = [Effect("lag"), Effect("drag"), Effect("mass")]
     a, b, c = effects
     begun: list[Any] = []
+    completed: list[Any] = []
 
     class Fine:
         trials = ("first", "second")
@@ -82,9 +83,11 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
             return [[(float(k), np.array([0.0, 10.0 + k])) for k in range(4)] for _ in effects]
 
         def fit(self, tasks: Any, *, rounds: int, **_: Any) -> list[Any]:
-            assert rounds == FINER_ROUNDS
-            begun.append(tasks)
-            return [fit(e, np.zeros(1) if x is None else x, 10.0) for e, x in tasks]
+            """Ends that are better after more rounds, unless they break down."""
+            (begun if rounds == FINER_ROUNDS else completed).append(tasks)
+            less = 0.0 if rounds == FINER_ROUNDS else 5.0
+            return [fit(e, np.zeros(1) if x is None else x, 10.0 - less) if not less or c not in e else None
+                    for e, x in tasks]  # fmt: skip
 
     nothing = fit((), np.zeros(1), 500.0)
     nothing.errors = np.zeros(2)
@@ -101,7 +104,7 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     monkeypatch.setattr(search, "looked_at", look)
     problem: Any = SimpleNamespace(finely=Fine)
     ends = [fit((c,), np.array([0.0, 11.0]), 20.0), fit((a, b), np.zeros(3), 1.0)]
-    search._by_finer(problem, effects, nothing, ends, lambda line: None)
+    none, found = search._by_finer(problem, effects, nothing, ends, lambda line: None)
     # A few starts by responses of each effect, the best of spread points, and where single effects have ended before.
     assert [x[1] for e, x in looked if e is a] == [*(10.0 + k for k in range(PROMISING)), 1.0, 1.5]
     assert [x[1] for e, x in looked if e is c] == [10.0, 11.0, 11.0]
@@ -109,6 +112,10 @@ def test_the_finer_twin_begins_where_chi_squared_is_least_of_responses_ends_and_
     assert starts == {a: 11.0, b: 11.0, c: 11.0}
     # Of a, neither a spread point nor the first start, which leaves 1.
     assert [e.name for (e,), _ in begun[1]] == ["lag", "drag", "mass"]
+    # The best are completed; what breaks down then stays as it was.
+    assert [[e for e, _ in tasks] for tasks in completed] == [[()], [(a,), (b,), (c,)]]
+    assert [f.chi2 for f in none] == [5.0]
+    assert [(f.name, f.chi2) for f in found] == [("lag", 5.0), ("drag", 5.0), ("mass", 10.0)]
 
 
 class Swallowed(GaussNewton):
