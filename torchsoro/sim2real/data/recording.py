@@ -119,7 +119,7 @@ def write_table(path: Path, columns: Mapping[str, np.ndarray]) -> None:
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(columns)
-    for row in zip(*columns.values(), strict=True):  # adding 0 makes -0 a 0
+    for row in zip(*columns.values(), strict=True):
         table.writerow("" if math.isnan(value) else f"{value:z.9g}" for value in row)
     path.parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as file:

@@ -28,7 +28,8 @@ what it extends, the error is as large as it is priced. Nothing and what moves t
 are compared in the same way.
 
 Where size decides and both leave no more than the twin may err, evidence is as good a judge as size, since it knows how
-that error varies. A name for which it is by D is at least 1 - exp(-D) times as probable as the first.
+that error varies. A name whose ln evidence is higher by D, adjusted, is at least 1 - exp(-D) times as probable as the
+first.
 """
 
 from __future__ import annotations
