@@ -241,6 +241,17 @@ def test_an_effect_that_leaves_no_more_than_the_twin_may_err_is_told():
     assert (found.kind, found.chosen) == ("explained", ("drag",))
 
 
+@pytest.mark.parametrize(("deviation", "kind"), [(57.0, "unknown_physics"), (124.0, "cannot_tell")])
+def test_a_name_that_predicts_trials_left_out_surely_worse_than_nothing_is_not_it(deviation, kind, monkeypatch):
+    monkeypatch.setattr(conclusion, "compared", lambda *_: (-150.0, deviation))
+    data, nothing, drag = recorded(0.0, 4, effect=0.3)
+    found = conclude(weighed(data, nothing, drag), limit=0.0)
+    assert found.kind == kind
+    likely = max(found.probabilities, key=lambda name: found.probabilities[name])
+    assert likely == ("unknown" if kind == "unknown_physics" else "drag")
+    assert sum(found.probabilities.values()) == pytest.approx(1.0)
+
+
 def test_numbers_that_are_told_leave_the_least_where_a_discrepancy_matters():
     data, _, drag = recorded(0.3, 16, effect=0.6)
     found = infer(data, drag)

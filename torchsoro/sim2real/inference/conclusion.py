@@ -2,7 +2,8 @@
 
 Probabilities are of what is missing, whether it matters or not. In the set, what changes the motion by less than
 matters goes by its name where nothing is not credible beside it and trials left out are predicted better with it; else
-it counts as nothing. So does what the second of two effects adds to the first.
+it counts as nothing. So does what the second of two effects adds to the first. Where something is missing, and the
+first of the set predicts trials left out surely worse than nothing does, no name of the set is it.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
+from statistics import NormalDist
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, compared
@@ -92,6 +94,9 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     if NOTHING in chosen or predictive[0] <= 0:
         chosen = _credible(shares)
         predictive = gain(chosen[0])
+    if NOTHING not in chosen and predictive[0] < -NormalDist().inv_cdf(CREDIBLE) * predictive[1]:
+        told[UNKNOWN] += sum(told.pop(name, 0.0) for name in chosen if name != UNKNOWN)
+        chosen = [UNKNOWN]
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"
     elif chosen == [NOTHING]:
