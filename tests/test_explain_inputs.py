@@ -373,6 +373,15 @@ def test_a_model_knows_by_what_stated_friction_is_off(folder, line, coefficient)
     assert plane.friction.item() == pytest.approx(coefficient)
 
 
+@pytest.mark.parametrize(("device", "wanted"), [("cuda", "cuda"), ("cpu", "cpu"), ("auto", "cpu")])
+def test_a_trial_is_predicted_where_it_is_asked_for(folder, monkeypatch, device, wanted):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torchsoro.sim2real.inference.model.simulate", lambda twin, *_, **__: pytest.fail(twin.device))
+    options = Options(predict=folder / "model.toml", trial=folder / "new" / "trial.toml", out=folder.parent / "m.csv")
+    with pytest.raises(pytest.fail.Exception, match=f"^{wanted}$"):
+        pipeline.predict_markers(dataclasses.replace(options, device=device))
+
+
 def test_a_trial_to_predict_must_be_named_and_there(folder):
     options = Options(predict=folder / "model.toml", out=folder.parent / "m.csv")
     with pytest.raises(ValueError, match=r"predict, trial: wanted a model\.toml, and the trial\.toml"):

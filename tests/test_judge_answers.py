@@ -174,6 +174,29 @@ def test_an_interrupted_ask_keeps_no_answer_and_ends_its_tools(judge, tmp_path):
             os.kill(int(path.name.removeprefix("pid-")), 0)
 
 
+def test_further_arguments_are_those_of_both_commands(judge, tmp_path):
+    case = tmp_path / "batch" / "cases" / "case-0"
+    (case / "heldout" / "c").mkdir(parents=True)
+    (case / "heldout" / "c" / "trial.toml").write_text("")
+    (case / "setup.toml").write_text("")
+    tool = tmp_path / "tool.py"
+    tool.write_text(
+        "import pathlib, sys\n"
+        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1])\n"
+        "if '--predict' in sys.argv:\n"
+        "    out.write_text(' '.join(sys.argv[-2:]))\n"
+        "else:\n"
+        "    out.mkdir()\n"
+        "    (out / 'model.toml').write_text('')\n"
+        "    (out / 'explanation.json').write_text('{\"verdict\": \"' + ' '.join(sys.argv[-2:]) + '\"}')\n"
+    )
+    command = f"{sys.executable} {tool}"
+    judge.ask.ask(tmp_path / "batch", answers=tmp_path / "answers", tool=command, extra="--device cuda")
+    answer = tmp_path / "answers" / "case-0"
+    assert json.loads((answer / "explanation.json").read_text())["verdict"] == "--device cuda"
+    assert (answer / "predicted.csv").read_text() == "--device cuda"
+
+
 def test_ask_takes_what_is_no_explanation_for_a_failure(judge, tmp_path):
     (tmp_path / "batch" / "cases" / "case-0").mkdir(parents=True)
     (tmp_path / "batch" / "cases" / "case-0" / "setup.toml").write_text("")

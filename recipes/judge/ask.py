@@ -3,9 +3,9 @@
     python recipes/judge/ask.py runs/judge/test --answers runs/judge/answers --tool "python recipes/explain.py"
     python recipes/judge/ask.py BATCH --answers ANSWERS --gpus 4 --workers 32 --extra="--device cuda --threads 2"
 
-Runs ``TOOL CASE --out DIR`` and then, where it left a model.toml, ``TOOL --predict DIR/model.toml --trial TRIAL.toml
---out CSV`` for the trial whose markers stay sealed. Interrupted, the same command goes on; an answer is never asked
-for twice.
+Runs ``TOOL CASE --out DIR EXTRA`` and then, where it left a model.toml, ``TOOL --predict DIR/model.toml --trial
+TRIAL.toml --out CSV EXTRA`` for the trial whose markers stay sealed. Interrupted, the same command goes on; an answer
+is never asked for twice.
 """
 
 from __future__ import annotations
@@ -161,9 +161,9 @@ def answer(
             shutil.copy(out / "model.toml", part / "model.toml")
             trials = sorted(copy.glob("heldout/*/trial.toml"))
             for trial in trials[:1]:
-                csv = part / "predicted.csv"
-                model = str(out / "model.toml")
-                wrong = _call([*tool, "--predict", model, "--trial", str(trial), "--out", str(csv)], timeout, variables)
+                asked = ["--predict", str(out / "model.toml"), "--trial", str(trial)]
+                asked += ["--out", str(part / "predicted.csv"), *extra]
+                wrong = _call([*tool, *asked], timeout, variables)
                 if wrong:
                     found["prediction_error"] = wrong
         (part / "explanation.json").write_text(json.dumps(found, indent=1))
@@ -188,7 +188,7 @@ def ask(
         batch: Folder that seal.py made.
         answers: Folder for the answers, one for each tool or baseline.
         tool: Command line.
-        extra: Further arguments.
+        extra: Further arguments, of both commands.
         workers: Cases side by side; with more than one, tell the tool to use one thread (``--extra``). What may
             take longest is begun first.
         gpus: Share the workers out to so many GPUs of this machine, and let those on one GPU compute side by side by

@@ -28,7 +28,7 @@ from torchsoro.sim2real.inference.model import predict_trial, read_model, write_
 from torchsoro.sim2real.inference.next_experiment import next_experiment
 from torchsoro.sim2real.inference.phases import mismatches
 from torchsoro.sim2real.inference.verdict import judge
-from torchsoro.sim2real.inputs import Inputs, check_numbers, read_inputs
+from torchsoro.sim2real.inputs import Inputs, check_device, check_numbers, chosen, read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.progress import Progress, span
 from torchsoro.sim2real.report.body import body_motion
@@ -70,11 +70,12 @@ def predict_markers(options: Options) -> dict[str, np.ndarray]:
     if options.predict is None or options.trial is None:
         raise ValueError("predict, trial: wanted a model.toml, and the trial.toml to predict")
     check_numbers(options)
+    check_device(options.device)
     out = Path(options.out)
     check_folder("out", out.parent, [out.name])
     model = read_model(Path(options.predict))
-    threads = options.threads or THREADS
-    columns = predict_trial(model, Path(options.trial), Path(options.predict), threads)
+    threads, device = options.threads or THREADS, chosen(options.device, 0.0)
+    columns = predict_trial(model, Path(options.trial), Path(options.predict), threads, device)
     write_table(out, columns)
     return columns
 

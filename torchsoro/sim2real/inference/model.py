@@ -134,7 +134,9 @@ def read_model(path: Path, effects: Sequence[Hypothesis] | None = None) -> Model
     return Model(tables=tables, setup=setup_of(tables, path), effects=tuple(found), **dict(file.model))
 
 
-def predict_trial(model: Model, trial: Path, source: Path, threads: int = THREADS) -> dict[str, np.ndarray]:
+def predict_trial(
+    model: Model, trial: Path, source: Path, threads: int = THREADS, device: str = "cpu"
+) -> dict[str, np.ndarray]:
     """Markers in a trial that nobody has recorded yet, by the finer twin alone: no ``simulated.csv`` counts here.
 
     Args:
@@ -142,6 +144,7 @@ def predict_trial(model: Model, trial: Path, source: Path, threads: int = THREAD
         trial: Its trial.toml; a pressure.csv stands beside it where the body has a chamber.
         source: Where the model comes from, for messages.
         threads: That simulate.
+        device: Where it is simulated, "cpu" or "cuda".
 
     Returns:
         Columns of a markers.csv.
@@ -152,7 +155,7 @@ def predict_trial(model: Model, trial: Path, source: Path, threads: int = THREAD
     if trial.name != "trial.toml" or not trial.is_file():
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
-    twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across)
+    twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across, device=device)
     motion = simulate(twin, [model.apply(twin.scenario(told), twin)], threads=threads)[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")
