@@ -80,11 +80,11 @@ COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
-    *("faced", "ties", "pushes", "wall_chunks", "fluid", "watched", "sample_at"),
+    *("faced", "ties", "pushes", "wall_chunks", "wall_rows", "fluid", "watched", "sample_at"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
 VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
-FACED, TIES, PUSHES, WALL_CHUNKS, FLUID, WATCHED, SAMPLE_AT = range(26, 33)
+FACED, TIES, PUSHES, WALL_CHUNKS, WALL_ROWS, FLUID, WATCHED, SAMPLE_AT = range(26, 34)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
@@ -100,7 +100,7 @@ ANY_LOAD = LOADED + STIFFENS + SOFTENS + IMMERSED + TIED + PUSHED_NODES
 BUFFERS = {
     "integers": (
         *("kind", "plane_kind", "firsts", "tiles", "chamber_start", "slot_start", "slot_chamber", "sources"),
-        *("near_nodes", "wall_chunk", "wall_kind", "wall_start", "wall_entry", "near_number"),
+        *("near_nodes", "wall_chunk", "wall_kind", "wall_row", "wall_count", "wall_entry", "near_number"),
     ),
     "fixed": (
         *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
@@ -118,20 +118,22 @@ BUFFERS = {
         )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(33, 42)
-WALL_CHUNK, WALL_KIND, WALL_START, WALL_ENTRY, NEAR_NUMBER = range(42, 47)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(47, 56)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(56, 63)
-PRESSURE, GRAVITY, FORCE = range(63, 66)
-VOLUMES, PUSHED, SEEN = range(66, 69)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(69, 75)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(75, 79)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(79, 87)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(87, 90)
-HEAD = 90
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(34, 43)
+WALL_CHUNK, WALL_KIND, WALL_ROW, WALL_COUNT, WALL_ENTRY, NEAR_NUMBER = range(43, 49)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(49, 58)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(58, 65)
+PRESSURE, GRAVITY, FORCE = range(65, 68)
+VOLUMES, PUSHED, SEEN = range(68, 71)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(71, 77)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(77, 81)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(81, 89)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(89, 92)
+HEAD = 92
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
-# nodes the weight and two slopes; what it hands to its nodes at most: five vectors.
+# nodes the weight and two slopes; what it hands to its nodes at most: five vectors. Number by number, so that threads
+# that work on neighbours read what lies together; so do what nodes near walls add up, the first of all of them, then
+# the second, ...
 WALL_INTEGERS = 3
 WALL = 4 + 3 * 27
 WALL_VECTORS = 15

@@ -28,14 +28,14 @@ from torchsoro.simulation.kernels.layout import (
     TIES_BAR,
     TILE,
     VOLUMES,
-    WALL,
     WALL_CHUNK,
     WALL_CHUNKS,
+    WALL_COUNT,
     WALL_ENTRY,
-    WALL_INTEGERS,
     WALL_KIND,
     WALL_NUMBERS,
-    WALL_START,
+    WALL_ROW,
+    WALL_ROWS,
     WALL_VECTORS,
     WALL_WEIGHTS,
 )
@@ -128,21 +128,27 @@ def tied(block: ti.template(), b, i, nodes):
 
 
 @ti.func
+def wall_places(head: ti.template()):
+    """Places of wall points in the chunks."""
+    return head[WALL_CHUNKS] * TILE
+
+
+@ti.func
 def wall_point(block: ti.template(), w, at):
     """Place of a wall point, and its two tangents, from displacements that begin at a place of the states."""
     head, fixed = ti.static((block.head, block.fixed))
-    m = nodes_per_axis(head)
-    number, kind = head[WALL_NUMBERS] + w * WALL, head[WALL_KIND] + w * WALL_INTEGERS
-    corner, axis = at + block.ints[kind], block.ints[kind + 2]
-    x = load_vector(fixed, number, 1)
+    m, places = nodes_per_axis(head), wall_places(head)
+    number, kind = head[WALL_NUMBERS] + w, head[WALL_KIND] + w
+    corner, axis = at + block.ints[kind], block.ints[kind + 2 * places]
+    x = load_vector(fixed, number, places)
     one, two = x * 0, x * 0
     for row in range(9):
         for k in ti.static(range(3)):  # loads of three nodes at a time
-            v = number + 4 + 3 * (3 * row + k)
+            v = number + (4 + 3 * (3 * row + k)) * places
             d = load_vector(block.state, corner + (row // 3 * m[1] + row % 3) * m[2] + k, product(m))
             x += fixed[v] * d
-            one += fixed[v + 1] * d
-            two += fixed[v + 2] * d
+            one += fixed[v + places] * d
+            two += fixed[v + 2 * places] * d
     for c in ti.static(range(3)):
         if axis == (c + 2) % 3:
             one[c] += 1
@@ -154,19 +160,19 @@ def wall_point(block: ti.template(), w, at):
 @ti.func
 def wall_pull(block: ti.template(), b, w):
     """Gradient by the forces, at a wall point."""
-    m = nodes_per_axis(block.head)
-    corner = block.head[FORCES] + b * 3 * product(m) + block.ints[block.head[WALL_KIND] + w * WALL_INTEGERS]
+    m, places = nodes_per_axis(block.head), wall_places(block.head)
+    corner = block.head[FORCES] + b * 3 * product(m) + block.ints[block.head[WALL_KIND] + w]
     pull = load_vector(block.fixed, 0, 1) * 0
     for n in range(27):
-        weight = block.fixed[block.head[WALL_NUMBERS] + w * WALL + 4 + 3 * n]
+        weight = block.fixed[block.head[WALL_NUMBERS] + (4 + 3 * n) * places + w]
         pull += weight * load_vector(block.back, corner + (n // 9 * m[1] + n // 3 % 3) * m[2] + n % 3, product(m))
     return pull
 
 
 @ti.func
 def wall_vectors(block: ti.template(), b, w):
-    """Where what a wall point hands to its nodes lies."""
-    return block.head[NORMALS] + (b * block.head[WALL_CHUNKS] * TILE + w) * WALL_VECTORS
+    """Where what a wall point hands to its nodes lies: component by component, so many places apart."""
+    return block.head[NORMALS] + b * WALL_VECTORS * wall_places(block.head) + w
 
 
 @ti.func
@@ -191,8 +197,9 @@ def wall_pass(block: ti.template(), item, t):
         q = thread(block, each)
         w = chunk * TILE + q
         x, one, two = wall_point(block, w, at)
-        n = block.fixed[head[WALL_NUMBERS] + w * WALL + 3] * one.cross(two)
-        store_vector(block.scratch, wall_vectors(block, b, w), 1, n)
+        places = wall_places(head)
+        n = block.fixed[head[WALL_NUMBERS] + 3 * places + w] * one.cross(two)
+        store_vector(block.scratch, wall_vectors(block, b, w), places, n)
         block.pad[block.base + q] = x.dot(n) / 3
     wall_total(block, b, chunk)
 
@@ -201,16 +208,17 @@ def wall_pass(block: ti.template(), item, t):
 def wall_pressed(block: ti.template(), t, b, w):
     """Pressure times area vector of a wall point, whose chamber's volume is at TOTALS of the pad."""
     head, ints = ti.static((block.head, block.ints))
-    k = ints[head[WALL_KIND] + w * WALL_INTEGERS + 1]
+    places = wall_places(head)
+    k = ints[head[WALL_KIND] + places + w]
     p = chamber_pressure(block, t, block.pad[block.base + TOTALS + k], b * head[CHAMBERS] + k)
-    return p * load_vector(block.scratch, wall_vectors(block, b, w), 1)
+    return p * load_vector(block.scratch, wall_vectors(block, b, w), places)
 
 
 @ti.func
 def walls_at_hand(block: ti.template()):
     """Whether what wall points hand over has room in the pad, behind the volumes of the chambers."""
     room = ti.static(block.tile.pad - AT_HAND)
-    return block.head[WALL_CHUNKS] * TILE * 3 <= room and block.head[CHAMBERS] <= ti.static(AT_HAND - TOTALS)
+    return wall_places(block.head) * 3 <= room and block.head[CHAMBERS] <= ti.static(AT_HAND - TOTALS)
 
 
 @ti.func
@@ -219,7 +227,7 @@ def stage_walls(block: ti.template(), t, b):
     if walls_at_hand(block):
         for each in range(block.q0, block.q1):
             w = thread(block, each)
-            while w < block.head[WALL_CHUNKS] * TILE:
+            while w < wall_places(block.head):
                 store_vector(block.pad, block.base + AT_HAND + 3 * w, 1, wall_pressed(block, t, b, w))
                 w += TILE
         sync(block.gpu)
@@ -230,16 +238,18 @@ def wall_force(block: ti.template(), t, b, i):
     """Force of the pressure in hollow chambers on node i, against which it must be held."""
     head, ints = ti.static((block.head, block.ints))
     found = load_vector(block.fixed, 0, 1) * 0
-    first, last, staged = ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1], walls_at_hand(block)
-    for bundle in range((last - first + 3) // 4):
-        for k in ti.static(range(4)):  # loads of four wall points at a time
-            e = ti.min(first + 4 * bundle + k, last - 1)
-            w, weight = ints[head[WALL_ENTRY] + e] // 27, block.fixed[head[WALL_WEIGHTS] + e]
-            weight = ti.select(first + 4 * bundle + k < last, weight, weight * 0)
-            if staged:
-                found -= weight * load_vector(block.pad, block.base + AT_HAND + 3 * w, 1)
-            else:
-                found -= weight * wall_pressed(block, t, b, w)
+    row, staged = ints[head[WALL_ROW] + i], walls_at_hand(block)
+    if row >= 0:
+        count = ints[head[WALL_COUNT] + row]
+        for bundle in range((count + 3) // 4):
+            for k in ti.static(range(4)):  # loads of four wall points at a time
+                e = ti.min(4 * bundle + k, count - 1) * head[WALL_ROWS] + row
+                w, weight = ints[head[WALL_ENTRY] + e] // 27, block.fixed[head[WALL_WEIGHTS] + e]
+                weight = ti.select(4 * bundle + k < count, weight, weight * 0)
+                if staged:
+                    found -= weight * load_vector(block.pad, block.base + AT_HAND + 3 * w, 1)
+                else:
+                    found -= weight * wall_pressed(block, t, b, w)
     return found
 
 
@@ -250,21 +260,21 @@ def wall_pass_adjoint(block: ti.template(), item, t):
     b, chunk = item // head[WALL_CHUNKS], item % head[WALL_CHUNKS]
     for each in range(block.q0, block.q1):
         q = thread(block, each)
-        w = chunk * TILE + q
-        one_chamber = b * head[CHAMBERS] + block.ints[head[WALL_KIND] + w * WALL_INTEGERS + 1]
+        w, places = chunk * TILE + q, wall_places(head)
+        one_chamber = b * head[CHAMBERS] + block.ints[head[WALL_KIND] + places + w]
         volume = block.kept[head[VOLUMES] + t * head[BATCH] * head[CHAMBERS] + one_chamber]
         p = chamber_pressure(block, t, volume, one_chamber)
         x, one, two = wall_point(block, w, (t * head[BATCH] + b) * state_length(head))
         pull = wall_pull(block, b, w)
-        area = block.fixed[head[WALL_NUMBERS] + w * WALL + 3]
+        area = block.fixed[head[WALL_NUMBERS] + 3 * places + w]
         n = area * one.cross(two)
         out = wall_vectors(block, b, w)
         # By the volume: with weights, and with both slopes; by the force: with both slopes.
-        store_vector(block.scratch, out, 1, n / 3)
-        store_vector(block.scratch, out + 3, 1, area / 3 * two.cross(x))
-        store_vector(block.scratch, out + 6, 1, area / 3 * x.cross(one))
-        store_vector(block.scratch, out + 9, 1, p * area * two.cross(pull))
-        store_vector(block.scratch, out + 12, 1, p * area * pull.cross(one))
+        store_vector(block.scratch, out, places, n / 3)
+        store_vector(block.scratch, out + 3 * places, places, area / 3 * two.cross(x))
+        store_vector(block.scratch, out + 6 * places, places, area / 3 * x.cross(one))
+        store_vector(block.scratch, out + 9 * places, places, p * area * two.cross(pull))
+        store_vector(block.scratch, out + 12 * places, places, p * area * pull.cross(one))
         block.pad[block.base + q] = pull.dot(n)
     wall_total(block, b, chunk)
 
@@ -273,15 +283,20 @@ def wall_pass_adjoint(block: ti.template(), item, t):
 def wall_spread(block: ti.template(), b, i):
     """What the wall points around node i add to the gradient by its place."""
     head, ints, scratch = ti.static((block.head, block.ints, block.scratch))
-    found = load_vector(block.fixed, 0, 1) * 0
-    for e in range(ints[head[WALL_START] + i], ints[head[WALL_START] + i + 1]):
-        w, n = ints[head[WALL_ENTRY] + e] // 27, ints[head[WALL_ENTRY] + e] % 27
-        k = ints[head[WALL_KIND] + w * WALL_INTEGERS + 1]
-        by_volume = chamber_volume_bar(block, block.pad[block.base + TOTALS + k], b * head[CHAMBERS] + k)
-        values = load_vector(block.fixed, head[WALL_NUMBERS] + w * WALL + 4 + 3 * n, 1)
-        at = wall_vectors(block, b, w)
-        for c in ti.static(range(3)):
-            found += by_volume * values[c] * load_vector(scratch, at + 3 * c, 1)
-        for c in ti.static(range(2)):
-            found += values[1 + c] * load_vector(scratch, at + 9 + 3 * c, 1)
+    found, places = load_vector(block.fixed, 0, 1) * 0, wall_places(head)
+    row = ints[head[WALL_ROW] + i]
+    if row >= 0:
+        for k in range(ints[head[WALL_COUNT] + row]):
+            e = ints[head[WALL_ENTRY] + k * head[WALL_ROWS] + row]
+            w, n = e // 27, e % 27
+            chamber = ints[head[WALL_KIND] + places + w]
+            by_volume = chamber_volume_bar(
+                block, block.pad[block.base + TOTALS + chamber], b * head[CHAMBERS] + chamber
+            )
+            values = load_vector(block.fixed, head[WALL_NUMBERS] + (4 + 3 * n) * places + w, places)
+            at = wall_vectors(block, b, w)
+            for c in ti.static(range(3)):
+                found += by_volume * values[c] * load_vector(scratch, at + 3 * c * places, places)
+            for c in ti.static(range(2)):
+                found += values[1 + c] * load_vector(scratch, at + (9 + 3 * c) * places, places)
     return found

@@ -170,36 +170,44 @@ def wall_tables(lattice: Lattice, gas: int, pairs: int) -> tuple[list[np.ndarray
 
     Returns:
         In the order of ``layout.BUFFERS``: the number of each chunk among what chambers sum; lowest node, chamber and
-        axis of each wall point; where those of each node begin, and for each of these 27 times the wall point and which
-        of its nodes it is. And the chamber of each chunk.
+        axis of each wall point [WALL_INTEGERS, places]; of each node its row, -1 for none; of each row, how many wall
+        points it adds up, and for each of them [most, rows] 27 times the wall point and which of its nodes it is. And
+        the chamber of each chunk.
     """
     points, of = wall_slots(lattice)
-    kind = np.zeros((len(points), layout.WALL_INTEGERS), int)
+    kind = np.zeros((layout.WALL_INTEGERS, len(points)), int)
     there, walls = np.flatnonzero(points >= 0), lattice.walls
     node = np.zeros((0, 27), int)
     if walls is not None:
         p = points[there]
         node = walls.nodes.numpy()[p]
-        kind[there] = np.stack([node[:, 0], gas + walls.chambers.numpy()[p], walls.axes.numpy()[p]], 1)
+        kind[:, there] = np.stack([node[:, 0], gas + walls.chambers.numpy()[p], walls.axes.numpy()[p]])
     entry = (27 * there[:, None] + np.arange(27)).reshape(-1)
     order = np.argsort(node.reshape(-1), kind="stable")
-    start = _starts(node.reshape(-1), lattice.nodes)
-    return [pairs + np.arange(len(of)), kind, start, entry[order]], gas + of
+    count = np.bincount(node.reshape(-1), minlength=lattice.nodes)
+    near = np.flatnonzero(count)
+    row = np.full(lattice.nodes, -1)
+    row[near] = np.arange(len(near))
+    entries = np.zeros((count.max(initial=0), len(near)), int)
+    within = np.arange(len(order)) - np.repeat(np.cumsum(count) - count, count)
+    entries[within, np.repeat(row[near], count[near])] = entry[order]
+    return [pairs + np.arange(len(of)), kind, row, count[near], entries], gas + of
 
 
 def wall_numbers(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of wall points, in the order of :func:`wall_slots`: place, area, values [places, WALL].
+    """Numbers of wall points, in the order of :func:`wall_slots`: place, area, values [WALL, places].
 
-    Beside them the weight of each of the entries of :func:`wall_tables`.
+    Beside them the weight of each of the entries of :func:`wall_tables` [most, rows].
     """
     points, _ = wall_slots(lattice)
-    found, there = np.zeros((len(points), layout.WALL)), points >= 0
+    found, there = np.zeros((layout.WALL, len(points))), points >= 0
     if lattice.walls is not None:
         w = lattice.walls
         places, areas, values = (t.numpy()[points[there]] for t in (w.places, w.areas, w.values))
-        found[there] = np.concatenate([places, areas[:, None], values.reshape(len(values), -1)], 1)
-    *_, entry = wall_tables(lattice, 0, 0)[0]
-    return found, found[entry // 27, 4 + 3 * (entry % 27)]
+        found[:, there] = np.concatenate([places, areas[:, None], values.reshape(len(values), -1)], 1).T
+    *_, count, entry = wall_tables(lattice, 0, 0)[0]
+    weights = found[4 + 3 * (entry % 27), entry // 27]
+    return found, np.where(np.arange(len(entry))[:, None] < count, weights, 0.0)
 
 
 def _starts(sorted_or_not: np.ndarray, count: int) -> np.ndarray:

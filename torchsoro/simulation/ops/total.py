@@ -96,6 +96,7 @@ class TotalSegmentIntegrator:
         tiles, chunks = self.tiles.count, -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
         self.wall_chunks = len(self.tables.views[layout.WALL_CHUNK - layout.KIND])
+        self.wall_rows = len(self.tables.views[layout.WALL_COUNT - layout.KIND])
         in_chambers = len(self.tables.views[layout.SLOT_CHAMBER - layout.KIND]) + self.wall_chunks
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
@@ -103,7 +104,7 @@ class TotalSegmentIntegrator:
         self.blocks = min(most_blocks(like.device, self.tiles.shape, like.dtype), items) if self.gpu else 0
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
-        vectors = self.batch, self.wall_chunks * layout.TILE, layout.WALL_VECTORS
+        vectors = self.batch, layout.WALL_VECTORS, self.wall_chunks * layout.TILE
         repulsion = self.batch, 3, self.nodes if scene.self_contact else 0
         self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors, repulsion)
         self.kept = Arena.zeros("kept", like, (0,), (0,), (0,))
@@ -298,7 +299,8 @@ class TotalSegmentIntegrator:
             **{"batch": self.batch, "elements": self.elements, "chambers": self.chambers, "groups": self.groups},
             **{"springs": int(self.scene.springs), "viscous": int(self.scene.viscous), "planes": self.planes},
             **{"slots": self.slots, "blocks": self.blocks, "steps": self.steps, "histories": self.history},
-            **{"faced": int(self.lattice.faces is not None), "ties": self.ties, "wall_chunks": self.wall_chunks},
+            **{"faced": int(self.lattice.faces is not None), "ties": self.ties},
+            **{"wall_chunks": self.wall_chunks, "wall_rows": self.wall_rows},
             **{"pushes": self.scene.forces - self.groups, "fluid": int(self.scene.immersed)},
             **{"watched": self.watched, "sample_at": layout.HEAD + len(self.tables.buffer)},
             **{name: int(value) for name, value in more.items()},
