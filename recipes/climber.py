@@ -1,8 +1,8 @@
 """A block between two walls becomes a climber: four arms and two legs in the paper, from nothing but the gradient.
 
     python recipes/climber.py                            # coarse, on a laptop
-    python recipes/climber.py --preset paper             # the paper's size; chosen by itself on a GPU
-    python recipes/climber.py --gravity-steps 0          # without the continuation in gravity
+    python recipes/climber.py --preset paper --out runs/paper    # the paper's size; chosen by itself on a GPU
+    python recipes/climber.py --gravity-steps 0 --out runs/whole # without the continuation in gravity
     python recipes/climber.py --resume                   # go on after Ctrl-C or a kill
     tensorboard --logdir runs                            # watch it
 

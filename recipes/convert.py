@@ -1,7 +1,7 @@
 """Turn what a tracking program wrote into the markers.csv of an experiment that recipes/explain.py can explain.
 
     python recipes/convert.py marksDLC.csv --out my-experiment/trials/a/markers.csv --fps 100 --scale 0.0005
-    python recipes/convert.py "mass A.txt" "mass B.txt" --out my-experiment/trials/a/markers.csv --rename "mass A=tip"
+    python recipes/convert.py A.txt B.txt --out my-experiment/trials/a/markers.csv --rename "mass A=tip" "mass B=middle"
     python recipes/convert.py walk.c3d --out my-experiment/trials/a/markers.csv --axes=x,z,-y
 
 Reads data files of Tracker (physlets.org), CSV of DeepLabCut and C3D of motion capture, recognized by ending and first

@@ -4,7 +4,7 @@
     python recipes/material.py sweeps.csv --out runs/resin --reference 21.8 --band 0.8 50 --dt 1e-5
     python recipes/material.py relaxation.csv --out runs/resin --deformation tension
     python recipes/material.py creep.csv --out runs/resin --deformation shear
-    python recipes/walker.py --material runs/resin/material.toml           # a robot of it
+    python recipes/walker.py --material runs/resin/material.toml --dt auto --out runs/mine     # a robot of it
 
 Sweeps at several temperatures are shifted to one (time-temperature superposition), the master curve is fitted by
 Maxwell elements, and of these as many are kept as the step, the cell and the robot's frequencies ask for. Written are

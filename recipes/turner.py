@@ -1,8 +1,8 @@
 """A cube with two chambers side by side becomes a robot that turns, left or right by the phase of its chambers alone.
 
     python recipes/turner.py                             # coarse, on a laptop
-    python recipes/turner.py --preset paper              # the paper's size; chosen by itself on a GPU
-    python recipes/turner.py --timing --phases 0 0.5     # with phases that are given, for the body alone
+    python recipes/turner.py --preset paper --out runs/paper    # the paper's size; chosen by itself on a GPU
+    python recipes/turner.py --timing --phases 0 0.5 --out runs/given  # with given phases, for the body alone
     python recipes/turner.py --resume                    # go on after Ctrl-C or a kill
     tensorboard --logdir runs                            # watch it
 

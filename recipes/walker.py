@@ -1,9 +1,9 @@
 """A cube with an air chamber becomes a walker, by gradient through the simulator.
 
     python recipes/walker.py                                  # coarse, on a laptop
-    python recipes/walker.py --preset paper                   # the paper's size; chosen by itself on a GPU
+    python recipes/walker.py --preset paper --out runs/paper  # the paper's size; chosen by itself on a GPU
     python recipes/walker.py --slope 0.3 --out runs/uphill    # uphill, in a folder of its own
-    python recipes/walker.py --chambers 2 --timing phase duty  # two chambers, whose timing is designed, too
+    python recipes/walker.py --chambers 2 --timing phase duty --out runs/two    # two chambers, timing designed, too
     python recipes/walker.py --resume                         # go on after Ctrl-C or a kill
     python recipes/walker.py --resume --amend --learning-rate 0.01    # go on with another setting, which is noted
     tensorboard --logdir runs                                 # watch it

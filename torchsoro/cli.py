@@ -19,7 +19,19 @@ from types import ModuleType
 
 from torchsoro.version import VERSION
 
-COMMANDS = ("view", "walker", "climber", "turner", "replay", "compare", "material", "explain", "convert", "benchmark")
+COMMANDS = (
+    "view",
+    "walker",
+    "climber",
+    "turner",
+    "replay",
+    "compare",
+    "material",
+    "film",
+    "convert",
+    "explain",
+    "benchmark",
+)
 """Recipes in the order of ``--help``; a recipe that is not there is left out."""
 
 

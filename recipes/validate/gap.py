@@ -38,6 +38,7 @@ from torchsoro.design.robot import Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.output.archive import find, load_design
 from torchsoro.output.fabricate import surface
+from torchsoro.sim2real.data.from_design import believed, far_apart
 from torchsoro.simulation.loads import Drag, Load, PointMass, Spring
 from torchsoro.simulation.material import Body, Prony
 
@@ -106,28 +107,6 @@ def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tupl
     return body, [], {}
 
 
-def believed(options: Options, robot: Robot, stiffness: float) -> str:
-    """Tables of setup.toml without markers and recording; ``stiffness`` of the air in the model [Pa]."""
-    s = robot.settings
-    known = [] if options.hide == "relaxation" else elements(robot)
-    tables = [
-        f'title = "{s.robot}"\ngravity = {list(robot.gravity)}\nduration = {options.settle + options.duration}\n',
-        '[body]\nshape = "mesh"\nfile = "body.stl"\n',
-        f"[material]\ndensity = {robot.solid.density}\nyoungs_modulus = {robot.solid.youngs_modulus}\n"
-        f"poisson_ratio = {robot.solid.poisson_ratio}\nprony = {known}\n",
-    ]
-    for chamber in robot.domain.chambers:
-        half = np.array(chamber.size) / 2 - chamber.wall
-        box = [(np.array(chamber.center) + side * half).tolist() for side in (-1, 1)]
-        tables.append(f'[[chamber]]\nname = "{chamber.name}"\nbox = {box}\nair_stiffness = {stiffness}\n')
-    for plane in robot.planes:
-        normal = [float(plane.side) * (a == plane.axis) for a in range(3)]
-        point = [float(plane.offset) * (a == plane.axis) for a in range(3)]
-        friction = '"stick"' if plane.sticks else plane.friction
-        tables.append(f"[[plane]]\npoint = {point}\nnormal = {normal}\nfriction = {friction}\n")
-    return "\n".join(tables)
-
-
 def simulate(robot: Robot, body: Body, loads: list[Load], probes: torch.Tensor, rate: float) -> dict[str, np.ndarray]:
     """Times [T] s and positions of the marker particles [T, M, 3] m of a trial."""
     motion = robot.simulator()(
@@ -161,15 +140,6 @@ def columns(track: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {"time_s": track["time"], **named}
 
 
-def spread(places: np.ndarray, count: int) -> list[int]:
-    """Indices of positions [N, 3] far from each other."""
-    chosen = [0]
-    while len(chosen) < min(count, len(places)):
-        near = np.linalg.norm(places[:, None] - places[chosen], axis=-1).min(1)
-        chosen.append(int(near.argmax()))
-    return chosen
-
-
 def main(options: Options) -> dict[str, Any]:
     """Simulate the robot and write the experiment.
 
@@ -194,7 +164,7 @@ def main(options: Options) -> dict[str, Any]:
         body, loads, truth = hidden(options, robot, body, base.air_stiffness)
         side = torch.nonzero((body.chamber < 0) & (body.position[:, 1] < robot.domain.origin[1] + robot.domain.spacing))
         side = side.squeeze(-1)
-        probes = side[spread(body.position[side].cpu().numpy(), MARKERS)]
+        probes = side[far_apart(body.position[side].cpu().numpy(), MARKERS)]
         track = simulate(robot, body, loads, probes, RATE)
         track["place"] += options.noise * rng.standard_normal(track["place"].shape)
         time = torch.arange(0.0, float(track["time"][-1]) + 2e-3, 1e-3, dtype=torch.float64)
@@ -209,7 +179,9 @@ def main(options: Options) -> dict[str, Any]:
         )
         print(f"{name}: moved by {1e3 * np.abs(track['place'] - track['place'][0]).max():.1f} mm")
     places = body.position[probes].cpu().numpy().tolist()
-    text = believed(options, robot, air)
+    known = [] if options.hide == "relaxation" else elements(robot)
+    length = options.settle + options.duration
+    text = believed(robot, title=robot.settings.robot, duration=length, prony=known, air_stiffness=air)
     write(options.out, setup(text, {f"m{i}": at for i, at in enumerate(places)}, options.noise), trials)
     trimesh.Trimesh(*surface(robot.domain, gamma.cpu().numpy())).export(options.out / "body.stl")
     (options.out.parent / f"{options.out.name}-truth.json").write_text(json.dumps(truth, indent=2) + "\n")
