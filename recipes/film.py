@@ -1,7 +1,7 @@
 """Prepare the experiment of a robot that was designed: what is believed of it, at which pressures, and its markers.
 
     python recipes/film.py walker --out my-experiment        # an archived robot, or a run's folder
-    python recipes/convert.py trackedA.csv --out my-experiment/trials/full/markers.csv --fps 240 --scale 0.0005
+    python recipes/convert.py walkDLC.csv --out my-experiment/trials/a/markers.csv --fps 240 --scale 0.0005
     python recipes/explain.py my-experiment --out runs/explained
 
 Writes setup.toml with the body (body.stl), its material, chambers and ground as designed, a folder with a pressure.csv

@@ -352,3 +352,13 @@ def test_a_measurement_error_far_off_costs_its_prior_however_little_the_samples_
     hardly, without = (adjusted(data, p, 1e9).none.mode.ln_evidence for p in (found, bare))
     lost = prior.ln_density(float(found.none.mode.at[0])) - prior.ln_density(0.0)
     assert lost < -15 and hardly - without == pytest.approx(lost, abs=1e-3)
+
+
+@pytest.mark.parametrize("kappa", [1.0, 1.3, 3.0, 10.0])
+def test_a_number_that_the_recording_does_not_tell_takes_nothing_from_evidence_and_adds_nothing(kappa):
+    data, _, drag = recorded(0.0, 3, effect=0.3)
+    model = Model(effects=("drag",), priors=(Prior(1.0), Prior(np.inf, low=0.0, high=10.0)), own=(0, 1))
+    slopes = tuple(np.concatenate([J, np.zeros_like(J)], -1) for J in drag.slopes)
+    placed = dataclasses.replace(drag, model=model, at=np.array([0.0, 5.0]), slopes=slopes)
+    found, bare = (adjusted(data, infer(data, m), kappa).ln_evidence for m in (placed, drag))
+    assert found == pytest.approx(bare, abs=0.02)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from swings import recorded, weighed
 
 from torchsoro.sim2real.inference.decision import MATTERS, VISIBLE
 from torchsoro.sim2real.inference.evidence import infer
-from torchsoro.sim2real.inference.visible import limit, remedies
+from torchsoro.sim2real.inference.visible import FACTORS, limit, remedies
 
 
 def test_an_effect_of_the_limit_is_near_the_credible_probability():
@@ -34,5 +35,27 @@ def test_remedies_name_what_hides_an_effect():
     kappa = next(k for k in np.geomspace(1, 1e6, 100) if limit(data, still, drag.slopes, k, 10) > 1.5 * wanted)
     found = remedies(data, still, drag.slopes, float(kappa), 10)
     assert found["twin"] == 2.0  # kappa is of the twin's error
-    assert found["motion"] == 2.0
     assert found["trials"] == 4.0
+    # What matters grows with the motion, but is no less than what is seen by eye; and falls with the noise likewise.
+    now = limit(data, still, drag.slopes, float(kappa), 10)
+    assert found["motion"] == next(f for f in FACTORS if now <= max(f * MATTERS * data.size, VISIBLE * data.noise))
+
+
+def test_less_noise_is_advised_where_it_makes_what_matters_then_visible():
+    data, nothing, drag = recorded(0.0, 13)
+    still = infer(data, nothing)
+
+    def told(noise):
+        return limit(dataclasses.replace(data, noise=noise), still, drag.slopes, kappa, 10)
+
+    def matters(noise):
+        return max(MATTERS * data.size, VISIBLE * noise)
+
+    kappa = 1.0
+    while told(data.noise) <= 1.5 * matters(data.noise):
+        kappa *= 1.1
+    # With half of the noise half as much would be seen, but half as much would matter, too.
+    factor = remedies(data, still, drag.slopes, kappa, 10).get("noise", math.inf)
+    assert factor > 2
+    for other in FACTORS:
+        assert (told(data.noise / other) <= matters(data.noise / other)) == (other >= factor)

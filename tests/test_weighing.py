@@ -16,6 +16,7 @@ from torchsoro.sim2real.inference.evidence import (
     TwinError,
     infer,
 )
+from torchsoro.sim2real.inference.least_squares import ln_evidence_within
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
 from torchsoro.sim2real.inference.weighing import adjustment
@@ -126,3 +127,13 @@ def test_a_mode_that_was_found_twice_counts_once():
     once, twice = weighed(data, nothing, drag), weighed(data, nothing, drag, drag)
     assert len(twice.groups["drag"]) == 1
     assert twice.candidates()[0] == once.candidates()[0]
+
+
+@pytest.mark.parametrize("samples", [30, 400])
+def test_an_error_tells_as_much_as_its_independent_numbers_whatever_the_rate_of_the_camera(samples):
+    data, nothing, _ = recorded(0.0, 1, count=samples)
+    exact = dataclasses.replace(data, noise=1e-9)
+    slow = tuple(0.1 * np.sqrt(2) * np.sin(2 * np.pi * t.time)[:, None, None] * np.ones((1, 3, 2)) for t in data.trials)
+    some, none = (dataclasses.replace(nothing, residuals=r) for r in (slow, tuple(0 * r for r in slow)))
+    odds = ln_evidence_within(exact, some, 0.1, 8.0) - ln_evidence_within(exact, none, 0.1, 8.0)
+    assert odds == pytest.approx(-4.0, rel=0.05)

@@ -23,7 +23,6 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
 from torchsoro.sim2real.inference.heldout import at_clocks_of
 from torchsoro.sim2real.inference.isolability import isolability
-from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
 from torchsoro.sim2real.inference.phases import mismatches
@@ -166,7 +165,10 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     simulated = {p.trial for p in before}
     everything = [t for t in (*trials, *kept) if t.name in simulated]
     if not everything:
-        raise ValueError(BREAKS)
+        found = ", ".join(c.name for c in verdict.chosen) or verdict.kind
+        raise ValueError(
+            f"experiment: by what was found ({found}) no trial can be simulated, wanted --effects without it"
+        )
     if len(everything) < len(trials) + len(kept):
         progress.note("Trials that cannot be simulated with what was found are not shown.")
     # With the error that the simulation has as it is corrected, not that of the twin in the search.

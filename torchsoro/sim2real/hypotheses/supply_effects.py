@@ -49,6 +49,7 @@ class ThrottledLoss(Hypothesis):
     """
 
     name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
+    nonnegative = frozenset({"fraction"})
     quantities = (Quantity("fraction_at_highest", "1", 0.05, 0.0, 19.0), Quantity("evenness", "1", 0.5, -2.0, 2.0))
     starts = ((2.0, -1.0), (6.0, -1.0))
 
@@ -191,6 +192,7 @@ class OrificeLeak(Hypothesis):
     """
 
     name, affected_quantity, model_form_deviation = "leak", "chamber pressure", LAW
+    nonnegative = frozenset({"fraction"})
     quantities = (
         Quantity("fraction_at_highest", "1", 0.05, 0.0, 19.0),
         Quantity("time_constant_s", "s", 0.01, 0.0, 100.0),

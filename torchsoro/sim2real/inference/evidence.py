@@ -5,10 +5,10 @@
 x are strengths, places, beliefs and measurement errors with their priors; S_num is the covariance that the twin's own
 error is priced at, and c the share of it that there is; s is the size of what the model does not explain, as a share of
 the motion, and tau its correlation time. Given s, tau and c, x is integrated out by Laplace's approximation
-(:mod:`torchsoro.sim2real.inference.laplace`); they follow by restricted maximum likelihood. Without c, a model whose
-twin is priced a factor higher would lose the logarithm of that factor with each sample. No law of an effect is nature's
-to the last digit: s is at least what does not matter, so that differences between candidates that do not matter decide
-nothing.
+(:mod:`torchsoro.sim2real.inference.laplace`); they follow by maximum likelihood of the residual at the mode. Without c,
+a model whose twin is priced a factor higher would lose the logarithm of that factor with each sample. No law of an
+effect is nature's to the last digit: s is at least what does not matter, so that differences between candidates that do
+not matter decide nothing.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import numpy as np
 from scipy.optimize import minimize
 
 from torchsoro.sim2real.inference.decision import COMMON, LASTING
-from torchsoro.sim2real.inference.laplace import Mode, posterior
+from torchsoro.sim2real.inference.laplace import Mode, ln_box, posterior
 from torchsoro.sim2real.inference.observed import Data, Motions, independent
-from torchsoro.sim2real.inference.priors import Prior
+from torchsoro.sim2real.inference.priors import Prior, bounds
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, integrated, tempered, total
 
 NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
@@ -340,12 +340,13 @@ def _ln_own_occam(model: Model, mode: Mode, kappa: float) -> float:
     own = list(model.own)
     if not own:
         return 0.0
-    priors, at = [model.priors[k] for k in own], mode.at[own]
+    priors, at = tuple(model.priors[k] for k in own), mode.at[own]
     weight = np.diag([p.weight(x) for p, x in zip(priors, at, strict=True)])
     precision = (np.linalg.inv(mode.covariance[np.ix_(own, own)]) - weight) / kappa + weight
     ln_prior = sum(p.ln_density(x) for p, x in zip(priors, at, strict=True))
     volume = 0.5 * (len(own) * math.log(2 * math.pi) - float(np.linalg.slogdet(precision)[1]))
-    return min(0.0, ln_prior + volume)
+    # A number that the likelihood does not tell has its whole range, and no more, which would make up for others.
+    return min(0.0, ln_prior + volume + ln_box(at, np.linalg.inv(precision), *bounds(priors)))
 
 
 def mode_of(data: Data, near: Linearised, discrepancy: Discrepancy, kappa: float = 1.0) -> Mode:

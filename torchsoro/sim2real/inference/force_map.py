@@ -99,7 +99,7 @@ class ForceMap:
         windows: Where the windows of each trial begin, and the last one ends [T, W + 1] s.
         forces: [T, P, W, 3] N, constant in a window; zero on patches that are not needed.
         deviations: Standard deviation of each [T, P, W, 3] N; infinite on patches that are not needed.
-        misfits: That a force on each patch by itself would leave [P].
+        chi2s: That a force on each patch by itself would leave [P].
         share: Of the chi-squared that the forces take away by the linear response; measurement errors, modulus and
             pressure are fitted along, with and without them.
         simulated: The same by a simulation with these forces; far below ``share`` if the response is not linear.

@@ -28,7 +28,7 @@ class Solution:
         chi2: Left over.
         forces: [T, P, W, 3], in steps of those that were simulated; zero on patches that were not chosen.
         deviations: Standard deviation of each; infinite there.
-        misfits: That each patch by itself leaves [P]; empty where that was not asked for.
+        chi2s: That each patch by itself leaves [P]; empty where that was not asked for.
     """
 
     criterion: float

@@ -5,8 +5,9 @@ For a recording y, a prediction that is h + J (x - x0) near x0, errors of covari
     ln Z = ln p(y | x*) + ln p(x*) + (x* - m)' H (x* - m) / 2 + K/2 ln 2 pi - 1/2 ln det H + ln P(low < x < high),
 
 where x* is the mode within the bounds, H = J' C^-1 J + diag w is minus the second derivative of the log posterior
-there, m its mode if there were no bounds, and P the probability of the bounds under N(m, H^-1). It is exact for a
-linear prediction with normal priors, one bound included.
+there (for Student's t, w is the weight of iterated least squares, which is larger), m its mode if there were no bounds,
+and P the probability of the bounds under N(m, H^-1). It is exact for a linear prediction with normal priors, one bound
+included.
 
 Far outside of the bounds, P is tiny, and no approximation of it is good enough. Unknowns that the recording presses
 against a bound, where ln p falls by g per unit away from it, are integrated from there one by one,

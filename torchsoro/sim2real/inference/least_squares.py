@@ -11,10 +11,10 @@ import math
 
 import numpy as np
 
-from torchsoro.sim2real.inference.evidence import Discrepancy, Linearised, Posterior, TwinError, grams
+from torchsoro.sim2real.inference.evidence import Linearised, Posterior, grams
 from torchsoro.sim2real.inference.laplace import Mode, posterior
 from torchsoro.sim2real.inference.observed import Data, independent, size_of
-from torchsoro.sim2real.inference.state_space import tempered, total
+from torchsoro.sim2real.inference.state_space import Gram, tempered, total
 
 SETTLED = 5  # rounds in which the size of what is left and its weight agree to a percent
 
@@ -40,9 +40,14 @@ def told(data: Data, found: Posterior, kappa: float = 1.0, but: int | None = Non
     return posterior(total(parts), near.at, near.model.priors)
 
 
-def _exact(near: Linearised) -> Linearised:
-    """The same by a twin without an error."""
-    return dataclasses.replace(near, numerics=TwinError(amplitude=np.zeros_like(near.numerics.amplitude)))
+def _alike(near: Linearised, error: float) -> list[Gram]:
+    """Products of residual and slopes of each trial, with independent errors of one size [m] in all samples."""
+    found = []
+    for residual, slopes in zip(near.residuals, near.slopes, strict=True):
+        seen = np.isfinite(residual)
+        X = np.concatenate([residual[seen][:, None], slopes[seen]], 1) / error
+        found.append(Gram(product=X.T @ X, ln_det=2 * len(X) * math.log(error), count=len(X)))
+    return found
 
 
 def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
@@ -56,12 +61,11 @@ def closest(data: Data, near: Linearised, but: int | None = None) -> Mode:
         near: A model near a point.
         but: Number of a trial that is left out.
     """
-    exact = _exact(near)
     kept = [i for i in range(len(data.trials)) if i != but]
     at = near.at
     for _ in range(SETTLED):
         left = tuple(r for i, r in enumerate(near.left(at)) if i in kept)
-        parts = grams(dataclasses.replace(data, noise=max(size_of(left), data.noise)), exact, Discrepancy())
+        parts = _alike(near, max(size_of(left), data.noise))
         whole = total([parts[i] for i in kept])
         mode = posterior(tempered(whole, max(whole.count / independent(left), 1.0)), near.at, near.model.priors)
         at = mode.at
@@ -77,8 +81,7 @@ def ln_evidence_within(data: Data, near: Linearised, error: float, count: float)
         error: Its size, root mean square [m].
         count: Independent numbers that all samples amount to, each the mean of so many with their noise.
     """
-    exact = _exact(near)
     samples = sum(int(np.isfinite(r).sum()) for r in near.residuals)
     each = max(samples / count, 1.0)
-    known = dataclasses.replace(data, noise=math.hypot(error, data.noise / math.sqrt(each)))
-    return posterior(tempered(total(grams(known, exact, Discrepancy())), each), near.at, near.model.priors).ln_evidence
+    whole = total(_alike(near, math.hypot(error, data.noise / math.sqrt(each))))
+    return posterior(tempered(whole, each), near.at, near.model.priors).ln_evidence

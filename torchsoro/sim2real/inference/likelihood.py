@@ -194,8 +194,8 @@ class Likelihood:
         return dataclasses.replace(self, trials=tuple(trials), **changes)
 
     def by(self, twin: Twin) -> Self:
-        """The same by another twin as it is, which nothing corrects."""
-        return self.only(self.trials, twin=twin, discretization=DiscretizationError())
+        """The same by another twin as it is, which nothing corrects; touching hangs on chance as much."""
+        return self.only(self.trials, twin=twin, discretization=DiscretizationError(chance=self.discretization.chance))
 
     def corrected(self, at: np.ndarray) -> Self:
         """The same, corrected by the finer twin where one is now: at the stated numbers [K], in scales.
@@ -220,7 +220,7 @@ class Likelihood:
         trials = [t for t in trials if t.name not in self.stated]
         if self.fine is None or not trials:
             return [{} for _ in points]
-        there = type(self)(self.experiment, self.fine, trials=tuple(trials), noise=self.noise, threads=self.threads)
+        there = self.by(self.fine).only(trials)
         bare = self.only(trials, discretization=self.discretization.replace(correction={}, own={}))
         coarse = bare.simulate(points)
         return [added(trials, a, b) for a, b in zip(coarse, there.simulate(points), strict=True)]

@@ -36,6 +36,9 @@ class TrialData:
                 f"trial {self.name}: time and position of shapes {self.time.shape} and {self.position.shape}, "
                 "wanted [T] and [T, M, A]"
             )
+        if len(never := np.argwhere(~np.isfinite(self.position).any(0))):
+            marker, axis = never[0]
+            raise ValueError(f"trial {self.name}: marker {marker} has no sample along axis {axis}, wanted some of each")
         for name in ("time", "position"):
             value = np.array(getattr(self, name), dtype=np.float64)
             value.setflags(write=False)

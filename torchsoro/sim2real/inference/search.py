@@ -99,7 +99,8 @@ def search(
     if len(tasks) > COMPLETED:
         tried = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=TRIED, settle=False) if f is not None]
         tried.sort(key=lambda fit: fit.chi2)
-        behind = tried[0].chi2 + BEHIND * max(null_model.chi2 - tried[0].chi2, 0.0)
+        least = tried[0].chi2 if tried else null_model.chi2
+        behind = least + BEHIND * max(null_model.chi2 - least, 0.0)
         led = [f for i, f in enumerate(tried[:COMPLETED]) if i < 3 or f.chi2 < behind]
         # A modulus beyond its tolerance may be that of a stiff side.
         led += [f for f in tried if released and varied(f) > 0 and f not in led]

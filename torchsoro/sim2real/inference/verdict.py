@@ -111,8 +111,8 @@ def judge(
         problem: Recordings and twin.
         effects: What is thought of; the library if None.
         tells: Which of them the experiment can tell; found if None.
-        heldout: Trials that are only predicted, once all is decided. Without any, each of three or more is predicted
-            from the others.
+        heldout: Trials that are only predicted, once all is decided. Without any, of three or more each of the first
+            four is predicted from the others.
         budget: Time that this may take on two cores, about [s]; sets how many searches are begun.
         report: Called with a line for each effect.
     """

@@ -69,22 +69,27 @@ def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, name
         Factors, for "noise" (quieter markers), "twin" (a smaller error of the twin), "trials" (more of them), and
         "motion" (a larger one, as of a larger load); none where such a change is visible as it is.
     """
-    wanted = max(MATTERS * data.size, VISIBLE * data.noise)
+
+    def matters(size: float, noise: float) -> float:
+        return max(MATTERS * size, VISIBLE * noise)
+
     found: dict[str, float] = {}
     now = limit(data, null, responses, kappa, names)
-    if now <= wanted:
+    if now <= matters(data.size, data.noise):
         return {}
     for factor in FACTORS:
         numerics = null.near.numerics.divided(factor)
         finer = dataclasses.replace(null, near=dataclasses.replace(null.near, numerics=numerics))
         quiet = dataclasses.replace(data, noise=data.noise / factor)
-        ways: Sequence[tuple[str, float]] = (
-            ("noise", limit(quiet, null, responses, kappa, names)),
-            ("twin", limit(data, finer, responses, 1 + (kappa - 1) / factor**2, names)),
-            ("trials", limit(data, null, responses, kappa, names, trials=factor)),
-            ("motion", now / factor),
+        # With a larger motion the twin errs by more, as responses grow: what is seen stays a share of it, or less.
+        seen = max(now, factor * null.near.numerics.size)
+        ways: Sequence[tuple[str, float, float]] = (
+            ("noise", limit(quiet, null, responses, kappa, names), matters(data.size, quiet.noise)),
+            ("twin", limit(data, finer, responses, 1 + (kappa - 1) / factor**2, names), matters(data.size, data.noise)),
+            ("trials", limit(data, null, responses, kappa, names, trials=factor), matters(data.size, data.noise)),
+            ("motion", seen, matters(factor * data.size, data.noise)),
         )
-        for name, value in ways:
+        for name, value, wanted in ways:
             if value <= wanted:
                 found.setdefault(name, factor)
     return found

@@ -307,13 +307,15 @@ class Weighing:
     def candidates(self) -> tuple[dict[str, float], list[Candidate]]:
         """Posterior probabilities of all names, and what has an effect, most probable first."""
         kappa = self.kappa
-        null = adjusted(self.data, self.null, kappa)
+        nulls = [adjusted(self.data, p, kappa) for p in self.nulls]
         groups = {name: [adjusted(self.data, p, kappa) for p in modes] for name, modes in self.groups.items()}
         ln_prior = {name: self._ln_prior(modes[0].near.model) for name, modes in groups.items()}
         ln_p = {name: ln_prior[name] + _summed(modes) for name, modes in groups.items()}
         # Without a discrepancy that matters nothing is missing, with one something is that has no name.
-        ln_p[NOTHING] = math.log(1 - MISSING) + null.none.ln_evidence
-        ln_p[UNKNOWN] = self._ln_prior(null.near.model) + null.some.ln_evidence
+        ln_p[NOTHING] = math.log(1 - MISSING) + float(np.logaddexp.reduce([p.none.ln_evidence for p in nulls]))
+        ln_p[UNKNOWN] = self._ln_prior(self.null.near.model) + float(
+            np.logaddexp.reduce([p.some.ln_evidence for p in nulls])
+        )
         probabilities = normalised(ln_p)
         left = {name: remainder(self.data, modes[0]) for name, modes in groups.items()}
         if self.best.matters:
@@ -322,7 +324,7 @@ class Weighing:
             least = min(groups, key=lambda name: left[name]) if groups else None
             count = independent(self.null.left if least is None else self.groups[least][0].left)
             seen = math.hypot(self.unexplained, self.data.noise)
-            rest = {UNKNOWN: self._ln_prior(null.near.model) - count * math.log(seen)}
+            rest = {UNKNOWN: self._ln_prior(self.null.near.model) - count * math.log(seen)}
             for name, modes in groups.items():
                 own = len(modes[0].near.model.own)
                 size = math.hypot(left[name], self.data.noise)

@@ -71,10 +71,10 @@ def evidence(e: Explanation) -> list[str]:
             "are none of the known effects."
         )
     if v.kind == "unknown_physics":
-        if v.ranking and v.ranking[0].left < v.conclusion.left:
-            closest = candidate_words(v.ranking[0], e.problem)
-            left = f"it leaves {words.millimetres(v.ranking[0].left)} unexplained"
-            found.append(f"Closest of the known effects: {closest}; {left}.")
+        closest = min(v.ranking, key=lambda c: c.left, default=None)
+        if closest is not None and closest.left < v.conclusion.left:
+            left = f"it leaves {words.millimetres(closest.left)} unexplained"
+            found.append(f"Closest of the known effects: {candidate_words(closest, e.problem)}; {left}.")
         if e.forces:
             found.append(str(e.forces))
     if v.kind == "cannot_distinguish":
