@@ -13,8 +13,9 @@ from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.inference.noise import estimate_noise
 from torchsoro.sim2real.twin.batch import SAMPLE
 
-MEMORY = 4e9  # bytes, that the covariances of all recordings may take: rows squared for each marker and axis
-ROWS = 4000  # of a recording, whose covariance is factorized in seconds
+MEMORY = 4e9  # bytes, that the slopes of all samples by all unknowns of all models that are weighed may take
+SLOPES = 1000  # of a sample: sixteen models of some sixty unknowns
+ROWS = 4000  # of a recording, whose errors are filtered in seconds
 WITHIN = 2  # samples for each of the twin's, with which a recording shows all that the twin does
 HIDDEN = 1.0  # of the noise, that motion between the rows that are kept may be off a cubic through them
 TRIED = 100_000  # rows that this is tried on, at most
@@ -34,7 +35,7 @@ def thinned(experiment: Experiment) -> tuple[Experiment, list[str]]:
     """
     channels = len(experiment.setup.markers) * len(experiment.setup.axes)
     trials = sum(t.recording is not None for t in (*experiment.trials, *experiment.heldout))
-    most = min(ROWS, math.isqrt(int(MEMORY / (8 * channels * max(trials, 1)))))
+    most = min(ROWS, int(MEMORY / (8 * SLOPES * channels * max(trials, 1))))
     notes = []
 
     def thin(trial: Trial) -> Trial:
