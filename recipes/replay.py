@@ -90,7 +90,7 @@ def main(chosen: Options) -> dict[str, float]:
     folder = archive.find(chosen.robot)
     designed = archive.read_result(folder)
     movie = {name: getattr(chosen, name) for name in ("frames", "resolution", "fps", "follow")}
-    base = read_settings(folder / "settings.json", device=chosen.device, **movie)
+    base = read_settings(folder / "settings.json", device=chosen.device, scenarios=0, **movie)
     # At least one sample, so that even a small part of a cycle can be simulated.
     duration = max(1, round(chosen.cycles / base.frequency / base.sample_every)) * base.sample_every
     settle = chosen.settle if base.settle > 0 else 0.0

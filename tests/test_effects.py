@@ -59,6 +59,21 @@ def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_
     assert torch.equal(found[1], scenario.pressure.pressure)
 
 
+@given(part=st.floats(0.05, 1.0), share=st.floats(0.05, 0.8))
+def test_a_throttle_and_a_hole_are_the_same_in_a_trial_at_a_lower_pressure(made, part, share):
+    highest = 2e4
+    twin, scenario = supplied(made, [part * highest] * 3)
+    twin = dataclasses.replace(twin, highest=highest)
+    values = torch.tensor([[share, -1.0]], dtype=torch.float64)
+    p = float(ThrottledLoss()(scenario, values, twin).pressure.pressure[0, 0, -1])
+    assert p + share / (1 - share) ** 2 * p**2 / highest == pytest.approx(part * highest, rel=1e-9)
+    assert p >= (1 - share) * part * highest * (1 - 1e-12)  # less is lost, and by a hole more
+    values = torch.tensor([[share, 0.0]], dtype=torch.float64)
+    p = float(OrificeLeak()(scenario, values, twin).pressure.pressure[0, 0, -1])
+    assert p + share / np.sqrt(1 - share) * np.sqrt(highest * p) == pytest.approx(part * highest, rel=1e-9)
+    assert p <= (1 - share) * part * highest * (1 + 1e-12)
+
+
 def test_an_orifice_without_a_hole_is_a_lag(made):
     twin, scenario = supplied(made, [0.0, 1e4, 1e4, 1e4])
     values = torch.tensor([[0.0, 0.02]], dtype=torch.float64)

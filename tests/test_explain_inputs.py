@@ -122,6 +122,8 @@ def test_a_good_experiment_is_accepted_with_byte_order_marks(folder):
     found = read_inputs(Options(experiment=folder, out=folder.parent / "out"))
     assert [t.name for t in found.trials] == ["a", "b"] and [t.name for t in found.kept] == ["c"]
     assert found.fine.count > found.twin.count and not found.notes and not found.hints
+    highest = max(float(t.pressure.pressure.abs().max()) for t in found.trials)
+    assert found.twin.highest == found.fine.highest == highest > 0
 
 
 @pytest.mark.parametrize(

@@ -450,8 +450,9 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             run.save(k, field=field, adam=adam, lagrangian=lagrangian, **kept)
             if stopped or time.perf_counter() > end_at:
                 break
-        if best is not None:
-            take_(robot, best)
+        # Without a best one the last that was simulated, which the field is a step beyond.
+        if best is not None or good:
+            take_(robot, good[-1] if best is None else best)
         none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
         told = {name: (best or none)[name] for name in none}
         return Optimized(gamma=robot.density().detach(), metrics=run.metrics, lately=good, **told)

@@ -205,14 +205,15 @@ def archive(run: Path, folder: Path, domain: Domain, iterations: Sequence[int]) 
         iterations: Early designs to keep; those the run does not have are left out.
 
     Raises:
-        ValueError: if the run is not finished (it has no design or no summary), or its pressure or material is in a
-            file elsewhere.
+        ValueError: if the run is not finished (it has no design or no summary), or its pressure, material or shape is
+            in a file elsewhere.
     """
     files = ("design.npz", "metrics.csv", "summary.png", "settings.json", "result.json")
     if missing := [name for name in files if not (run / name).is_file()]:
         raise ValueError(f"run: {run} has no {', '.join(missing)}, wanted a finished run")
     held = read_settings(run / "settings.json", device="auto")  # of a GPU, maybe, that is not here
-    if outside := [str(path) for path in (held.pressure_file, held.material) if path is not None]:
+    elsewhere = (held.pressure_file, held.material, held.body_mesh, held.chamber_mesh)
+    if outside := [str(path) for path in elsewhere if path is not None]:
         raise ValueError(f"run: {run} needs {', '.join(outside)}, wanted a robot that is complete without other files")
     folder.mkdir(parents=True, exist_ok=True)
     files += tuple(name for name in ("amendments.json", "motion.npz", CHAMBERS) if (run / name).is_file())

@@ -198,7 +198,7 @@ def compare(
             holds the checks of another robot.
     """
     folder = find(robot)
-    base = read_settings(folder / "settings.json", device=device, resume=False)
+    base = read_settings(folder / "settings.json", device=device, resume=False, scenarios=0)
     known = checks(base, iterations or [k for k in EARLY if k in kept_iterations(folder)])
     if unknown := sorted(set(only) - set(known)):
         raise ValueError(f"only = {', '.join(unknown)}: wanted some of {', '.join(known)}")

@@ -66,7 +66,7 @@ def _worth(robot: Robot, gamma: torch.Tensor) -> float:
 def print_part(robot: Robot, density: np.ndarray) -> Part:
     """The printable part, with the robot's air ports."""
     s = robot.settings
-    how: dict[str, Any] = {"density": s.density, "offset": s.offset, "min_wall": s.mended_to}
+    how: dict[str, Any] = {"density": float(robot.solid.density), "offset": s.offset, "min_wall": s.mended_to}
     return fabricate(robot.domain, density, port=robot.port, **how)
 
 

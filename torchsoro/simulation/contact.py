@@ -116,7 +116,7 @@ class Plane:
     @classmethod
     def through(cls, point: Sequence[float] | Tensor, *, normal: Sequence[float] | Tensor, **settings) -> Plane:
         """The plane through a point [..., 3] m with a normal [..., 3]; further arguments as of the class."""
-        at, n = torch.as_tensor(point), torch.as_tensor(normal)
+        at, n = (t if t.is_floating_point() else t.double() for t in map(torch.as_tensor, (point, normal)))
         offset = (at * n).sum(-1) / torch.linalg.vector_norm(n, dim=-1) if n.shape[-1:] == at.shape[-1:] == (3,) else at
         return cls(normal=normal, offset=offset, **settings)
 

@@ -307,6 +307,7 @@ class ModelTable(Table):
         ln_modulus: Logarithm of the modulus over what is believed.
         ln_pressure: The same of the pressure.
         ln_friction: The same of coefficients of friction.
+        highest_pressure: Supply to which shares of lost pressure refer [Pa]; 0 for the highest of each trial.
     """
 
     edge: Annotated[Number, Interval(gt=0.0, le=LENGTH[1])] = Field(description="a positive length in metres")
@@ -315,6 +316,7 @@ class ModelTable(Table):
     ln_modulus: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(description="a number from -5 to 5")
     ln_pressure: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(description="a number from -5 to 5")
     ln_friction: Annotated[Number, Interval(ge=-5.0, le=5.0)] = Field(default=0.0, description="a number from -5 to 5")
+    highest_pressure: Annotated[Number, Ge(0.0)] = Field(default=0.0, description="a pressure in Pa, at least 0")
 
 
 class EffectTable(BaseModel):

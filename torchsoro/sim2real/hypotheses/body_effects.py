@@ -73,7 +73,7 @@ class Stiffening(Hypothesis):
     """The solid stiffens with stretch: mu (1 + a x + a^2 x^2), x = I1b - 3, the first terms of Gent's 1 / (1 - a x)."""
 
     name, affected_quantity, model_form_deviation = "stiffening", "stress at large strain", LAW
-    quantities = (Quantity("coefficient", "1", 0.3, 0.0, 10.0),)
+    quantities = (Quantity("coefficient", "1", 0.3, 0.0, 30.0),)
     starts = ((1.0,), (3.0,))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:

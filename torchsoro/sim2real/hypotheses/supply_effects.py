@@ -44,8 +44,9 @@ class PressureGain(Hypothesis):
 class ThrottledLoss(Hypothesis):
     """A share is lost at any pressure, and a throttle takes more the higher it is: (1 - c) p_supply = p + b p^2 / P.
 
-    P is the highest supply. Air that seeps away behind a throttle in proportion to p loses b p^2 / P in it (turbulent
-    flow). Of a steady supply P the share a is lost, where b = (a - c) / (1 - a)^2 and c = a (1 + evenness) / 2.
+    P is the highest supply of all trials. Air that seeps away behind a throttle in proportion to p loses b p^2 / P in
+    it (turbulent flow). Of a steady supply P the share a is lost, where b = (a - c) / (1 - a)^2 and
+    c = a (1 + evenness) / 2.
     """
 
     name, affected_quantity, model_form_deviation = "pressure_loss", "chamber pressure", LAW
@@ -64,7 +65,7 @@ class ThrottledLoss(Hypothesis):
         share = values[:, 0].clamp(0, 0.99)
         steady = share * (1 + values[:, 1].clamp(-1, 1)) / 2
         throttle = ((share - steady) / (1 - share) ** 2)[:, None, None]
-        most = supply.abs().amax(-1, keepdim=True).clamp(min=_faint(scenario))
+        most = _highest(scenario, twin, supply)
         left = supply * (1 - steady)[:, None, None]
         # The root of b q^2 + q = |left| / P, in a form that does not cancel where b is small.
         behind = 2 * left / (1 + torch.sqrt(1 + 4 * throttle * left.abs() / most))
@@ -75,9 +76,11 @@ class ThrottledLoss(Hypothesis):
         return scenario.pressure is not None
 
 
-def _faint(scenario: Scenario) -> float:
-    """A pressure that moves nothing [Pa]."""
-    return float(scenario.youngs_modulus.mean()) * 1e-9
+def _highest(scenario: Scenario, twin: Twin, supply: Tensor) -> Tensor:
+    """The pressure to which shares that are lost refer [..., chambers, 1] Pa: one for all trials, if it is known."""
+    own = supply.abs().amax(-1, keepdim=True)
+    faint = float(scenario.youngs_modulus.mean()) * 1e-9  # a pressure that moves nothing
+    return (torch.full_like(own, twin.highest) if twin.highest else own).clamp(min=faint)
 
 
 def _chambers(supply: Waveform) -> Tensor:
@@ -89,7 +92,7 @@ def _sampled(scenario: Scenario, batch: int) -> tuple[Tensor, Tensor]:
     """Even, fine samples of a supply: times [S] s, and pressures [B, chambers, S] Pa."""
     supply = scenario.pressure
     assert supply is not None
-    time = torch.arange(0.0, scenario.duration + 2 * SAMPLE, SAMPLE, dtype=torch.float64)
+    time = torch.arange(0.0, max(scenario.duration, scenario.until) + 2 * SAMPLE, SAMPLE, dtype=torch.float64)
     p = Waveform(time=supply.time.double(), pressure=_chambers(supply).double()).at(time)
     return time, p.expand(batch, *p.shape[-2:])
 
@@ -185,10 +188,10 @@ class Leak(Hypothesis):
 
 
 class OrificeLeak(Hypothesis):
-    """Air escapes through a hole behind a line: tau p' = p_supply - p - b sqrt(P p), P the highest supply pressure.
+    """Air escapes through a hole behind a line: tau p' = p_supply - p - b sqrt(P p).
 
-    Flow through the hole goes with the root of the pressure (turbulent, incompressible). Of a steady supply P, the
-    share a is lost, where b = a / sqrt(1 - a).
+    P is the highest supply of all trials. Flow through the hole goes with the root of the pressure (turbulent,
+    incompressible). Of a steady supply P, the share a is lost, where b = a / sqrt(1 - a).
     """
 
     name, affected_quantity, model_form_deviation = "leak", "chamber pressure", LAW
@@ -212,7 +215,7 @@ class OrificeLeak(Hypothesis):
         time, p = _sampled(scenario, len(values))
         share, tau = values[:, 0].clamp(0, 0.99), values[:, 1].clamp(min=0)
         hole = share / torch.sqrt(1 - share)
-        most = p.abs().amax(-1).clamp(min=_faint(scenario))
+        most = _highest(scenario, twin, p).squeeze(-1).contiguous()
         behind = p.clone().numpy()
         _escape(behind, hole.numpy(), tau.numpy(), most.numpy(), SAMPLE)
         return scenario.replace(pressure=Waveform(time=time, pressure=torch.from_numpy(behind)))

@@ -40,6 +40,7 @@ class Model:
         ln_modulus: What the modulus is off.
         ln_pressure: What the pressure is off.
         ln_friction: What coefficients of friction are off.
+        highest_pressure: See :class:`~torchsoro.sim2real.twin.twin.Twin` [Pa].
         effects: What was missing, with its values [K], places included.
     """
 
@@ -51,6 +52,7 @@ class Model:
     ln_modulus: float
     ln_pressure: float
     ln_friction: float
+    highest_pressure: float
     effects: tuple[tuple[Hypothesis, np.ndarray], ...]
 
     def apply(self, scenario: Scenario, twin: Twin) -> Scenario:
@@ -82,6 +84,7 @@ def write_model(path: Path, setup: Path, fit: Fit, twin: Twin) -> None:
         f"edge = {twin.edge!r}",
         f"walls = {twin.walls}",
         f"across = {twin.across}",
+        f"highest_pressure = {twin.highest!r} # Pa, to which shares of lost pressure refer",
     ]
     lines += [f"{name} = {fit.ln_factors.get(name, 0.0)!r}" for name in STATED.values()]
     for effect, values in zip(fit.effects, fit.values, strict=True):
@@ -155,7 +158,8 @@ def predict_trial(
     if trial.name != "trial.toml" or not trial.is_file():
         raise ValueError(f"trial = {trial}: wanted a file named trial.toml")
     told: Trial = read_trial(trial.parent, model.tables, source)
-    twin = Twin(told.setup, edge=model.edge, walls=model.walls, across=model.across, device=device)
+    cells = {"edge": model.edge, "walls": model.walls, "across": model.across}
+    twin = Twin(told.setup, **cells, device=device, highest=model.highest_pressure)
     motion = simulate(twin, [model.apply(twin.scenario(told), twin)], threads=threads)[0].alone()
     if not motion.sound:
         raise ValueError(f"{trial}: the motion is not finite, wanted a trial that the body bears")

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, truncnorm
 
+from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.force_map import ForceMap
 from torchsoro.sim2real.inference.heldout import Prediction
 from torchsoro.sim2real.inference.isolability import Isolability
+from torchsoro.sim2real.inference.likelihood import STATED
 from torchsoro.sim2real.inference.next_experiment import Proposal
 from torchsoro.sim2real.inference.phases import Mismatch
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
@@ -110,6 +112,10 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
         scenario = next(s for s in problem.scenarios if effect.applies(s, problem.twin))
+        # What is relative to the modulus is to that which was found.
+        found = sum(float(v[0]) for e, v in zip(fit.effects, fit.values, strict=True) if isinstance(e, Modulus))
+        stiffer = math.exp(fit.ln_factors.get(STATED[Modulus], 0.0) + found * (not isinstance(effect, Modulus)))
+        scenario = scenario.replace(youngs_modulus=stiffer * scenario.youngs_modulus)
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
         own = np.where(logarithm, 1.0, values[:count])
         whole = covariance[:count, :count] + np.diag((effect.model_form_deviation * own) ** 2)

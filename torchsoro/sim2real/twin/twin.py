@@ -73,6 +73,7 @@ class Twin:
         walls: Cells through each wall around a chamber, at least.
         across: Cells across a body without a chamber, at least.
         device: Where it is simulated, "cpu" or "cuda".
+        highest: Supply to which shares of lost pressure refer [Pa], the highest of all trials; 0 for that of each.
 
     Raises:
         ValueError: for an edge or walls with which there are too many cells, a clamp that holds nothing or all of the
@@ -85,6 +86,7 @@ class Twin:
     walls: int = 3
     across: int = 3
     device: str = "cpu"
+    highest: float = 0.0
 
     def __post_init__(self) -> None:
         """Check the numbers, and that the body can be laid on a grid and held."""

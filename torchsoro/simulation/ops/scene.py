@@ -166,7 +166,7 @@ class Inputs:
         planes: [B, planes, PLANE]: offset [m], Coulomb coefficient, adhesive traction [Pa], its reach [m], normal, what
             is added to the coefficient at rest, speed that halves it [m/s].
         origin: [B, 3] a grid node [m].
-        softening: [B, 2] depth d and range r of the shear modulus' factor 1 - d u / (u + r), where u is by how much
+        softening: [B, 2] depth d and range r of the shear modulus' factor 1 - d erf(u / r), where u is by how much
             x = I1b - 3 is less than its largest so far.
         fluid: [B] density of what surrounds the body times its drag coefficient [kg/m3]: along each axis a force of
             half of it times the area (``Faces.front``) times v |v|, taken implicitly.
