@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torchsoro.sim2real.hypotheses.body_effects import LoadInertia, TautTether
 from torchsoro.sim2real.hypotheses.outer_effects import InitialPose
 from torchsoro.sim2real.hypotheses.supply_effects import OrificeLeak, PressureLag, ThrottledLoss
+from torchsoro.sim2real.report.explanation import _limits
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.loads import Force
@@ -137,3 +138,9 @@ def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
     assert pull is pulled.loads[1]
     assert torch.allclose(left.value, 0.1 * scenario.gravity * (1 - values))
     assert torch.allclose(mass.mass, 0.1 * values[:, 0])
+
+
+@pytest.mark.parametrize("effect", [ThrottledLoss(), OrificeLeak()])
+def test_a_share_of_the_pressure_that_is_lost_lies_between_nothing_and_all_of_it(effect, made):
+    twin, scenario = supplied(made, [0.0, 1e4])
+    assert _limits(effect, "fraction", scenario, twin) == (0.0, 1.0)

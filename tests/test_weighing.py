@@ -137,3 +137,23 @@ def test_an_error_tells_as_much_as_its_independent_numbers_whatever_the_rate_of_
     some, none = (dataclasses.replace(nothing, residuals=r) for r in (slow, tuple(0 * r for r in slow)))
     odds = ln_evidence_within(exact, some, 0.1, 8.0) - ln_evidence_within(exact, none, 0.1, 8.0)
     assert odds == pytest.approx(-4.0, rel=0.05)
+
+
+def test_nothing_has_the_evidence_of_all_its_modes_as_names_have():
+    data, nothing, drag = recorded(0.0, 4)
+    once = weighed(data, nothing, drag)
+    model = Model(effects=(), priors=(Prior(1e3),), beliefs=1)
+    still = tuple(np.zeros_like(J) for J in drag.slopes)
+    modes = [dataclasses.replace(nothing, model=model, at=np.array([x]), slopes=still) for x in (0.0, 900.0)]
+    found = [infer(data, m) for m in modes]
+    found = [
+        dataclasses.replace(p, **{
+            name: dataclasses.replace(b, mode=dataclasses.replace(b.mode, at=m.at, covariance=np.eye(1)))
+            for name, b in (("some", p.some), ("none", p.none))
+        })
+        for p, m in zip(found, modes, strict=True)
+    ]  # fmt: skip
+    one, both = (dataclasses.replace(once, nothing=tuple(n)).candidates()[0] for n in (found[:1], found))
+    odds = [p["nothing"] / p["drag"] for p in (one, both)]
+    gained = found[1].none.ln_evidence - found[0].none.ln_evidence
+    assert odds[1] / odds[0] == pytest.approx(1 + np.exp(gained), rel=1e-6)
