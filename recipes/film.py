@@ -70,7 +70,7 @@ def main(chosen: Options) -> Path:
     from torchsoro.output.archive import find, load_design, load_supply
     from torchsoro.output.fabricate import surface
     from torchsoro.output.marker_map import marker_map
-    from torchsoro.sim2real.data.from_design import believed, far_apart, seen_from
+    from torchsoro.sim2real.data.from_design import believed, elements, far_apart, seen_from
     from torchsoro.sim2real.data.recording import write_table
     from torchsoro.storage import check_folder
 
@@ -88,7 +88,7 @@ def main(chosen: Options) -> Path:
         robot,
         title=folder.name,
         duration=length,
-        prony=torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist(),
+        prony=elements(robot),
         air_stiffness=base.air_stiffness,
     )
     axis, side = "xyz".index(chosen.camera[1]), 1 if chosen.camera[0] == "+" else -1

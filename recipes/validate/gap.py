@@ -38,7 +38,7 @@ from torchsoro.design.robot import Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.output.archive import find, load_design
 from torchsoro.output.fabricate import surface
-from torchsoro.sim2real.data.from_design import believed, far_apart
+from torchsoro.sim2real.data.from_design import believed, elements, far_apart
 from torchsoro.simulation.loads import Drag, Load, PointMass, Spring
 from torchsoro.simulation.material import Body, Prony
 
@@ -74,11 +74,6 @@ class Options:
     """Whether the experiment includes the simulation with its described model."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device of the simulation."""
-
-
-def elements(robot: Robot) -> list[list[float]]:
-    """Relative modulus and relaxation time [s] of each Maxwell element."""
-    return torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
 
 
 def hidden(options: Options, robot: Robot, body: Body, stiffness: float) -> tuple[Body, list[Load], dict[str, Any]]:

@@ -165,9 +165,9 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     simulated = {p.trial for p in before}
     everything = [t for t in (*trials, *kept) if t.name in simulated]
     if not everything:
-        found = ", ".join(c.name for c in verdict.chosen) or verdict.kind
+        what = ", ".join(c.name for c in verdict.chosen) or verdict.kind
         raise ValueError(
-            f"experiment: by what was found ({found}) no trial can be simulated, wanted --effects without it"
+            f"experiment: by what was found ({what}) no trial can be simulated, wanted --effects without it"
         )
     if len(everything) < len(trials) + len(kept):
         progress.note("Trials that cannot be simulated with what was found are not shown.")

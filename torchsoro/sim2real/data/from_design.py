@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from torchsoro.design.robot import Robot
+
+
+def elements(robot: Robot) -> list[list[float]]:
+    """Relative modulus and relaxation time [s] of each Maxwell element."""
+    return torch.stack([robot.prony.moduli, robot.prony.times], -1).tolist()
 
 
 def believed(

@@ -109,12 +109,12 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
     """
     wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
     size = np.array(problem.twin.setup.size)
+    # What is relative to the modulus is to that which was found.
+    found = sum(float(v[0]) for e, v in zip(fit.effects, fit.values, strict=True) if isinstance(e, Modulus))
+    stiffer = math.exp(fit.ln_factors.get(STATED[Modulus], 0.0) + found)
     for effect, values, covariance in zip(fit.effects, fit.values, fit.covariances, strict=True):
         count = len(effect.quantities)
         scenario = next(s for s in problem.scenarios if effect.applies(s, problem.twin))
-        # What is relative to the modulus is to that which was found.
-        found = sum(float(v[0]) for e, v in zip(fit.effects, fit.values, strict=True) if isinstance(e, Modulus))
-        stiffer = math.exp(fit.ln_factors.get(STATED[Modulus], 0.0) + found * (not isinstance(effect, Modulus)))
         scenario = scenario.replace(youngs_modulus=stiffer * scenario.youngs_modulus)
         logarithm = np.array([q.unit.startswith("ln ") for q in effect.quantities])
         own = np.where(logarithm, 1.0, values[:count])
