@@ -13,6 +13,22 @@ import numpy as np
 import pytest
 
 
+def _service(judge, tmp_path, monkeypatch):
+    """Stand in for the service that shares a GPU; returns the file where it notes its calls."""
+    service = tmp_path / "bin" / judge.ask.SHARING
+    service.parent.mkdir()
+    calls = tmp_path / "calls"
+    service.write_text(
+        f'#!/bin/sh\n[ "$1" = -d ] && echo start${{CUDA_VISIBLE_DEVICES}} >> {calls} || cat >> {calls}\n'
+    )
+    service.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
+    monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
+    monkeypatch.setattr(judge.ask, "SERVED", tmp_path / "none")
+    return calls
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="the service of the test is a shell script")
 def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge, tmp_path, monkeypatch):
     setups = {"case-0": "", "case-1": "[[chamber]]", "case-2": "[[plane]]\n[[chamber]]", "case-3": "[[plane]]"}
@@ -29,17 +45,7 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
         "seen = {'gpu': os.environ['CUDA_VISIBLE_DEVICES'], 'pipe': os.environ['CUDA_MPS_PIPE_DIRECTORY']}\n"
         "(out / 'explanation.json').write_text(json.dumps({'verdict': 'nothing_missing', 'effects': [], **seen}))\n"
     )
-    service = tmp_path / "bin" / judge.ask.SHARING
-    service.parent.mkdir()
-    calls = tmp_path / "calls"
-    service.write_text(
-        f'#!/bin/sh\n[ "$1" = -d ] && echo start${{CUDA_VISIBLE_DEVICES}} >> {calls} || cat >> {calls}\n'
-    )
-    service.chmod(0o755)
-    monkeypatch.setenv("PATH", f"{service.parent}:{os.environ['PATH']}")
-    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "5,3,1")
-    monkeypatch.delenv("CUDA_MPS_PIPE_DIRECTORY", raising=False)
-    monkeypatch.setattr(judge.ask, "SERVED", tmp_path / "none")
+    calls = _service(judge, tmp_path, monkeypatch)
     command, answers = f"{sys.executable} {tool}", tmp_path / "answers"
     judge.ask.ask(tmp_path / "batch", answers=answers, tool=command, workers=4, gpus=2)
     told = [json.loads(path.read_text()) for path in sorted(answers.rglob("explanation.json"))]
@@ -58,6 +64,31 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
     with pytest.raises(ValueError, match="gpus = 2: wanted 0 to workers = 1"):
         judge.ask.ask(tmp_path / "batch", answers=tmp_path / "none", tool=command, gpus=2)
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the service of the test is a shell script")
+def test_ask_asks_again_alone_what_a_fault_on_a_shared_gpu_has_ended(judge, tmp_path, monkeypatch):
+    for name in ("case-0", "case-1", "case-2"):
+        (tmp_path / "batch" / "cases" / name).mkdir(parents=True)
+        (tmp_path / "batch" / "cases" / name / "setup.toml").write_text("")
+    tool = tmp_path / "tool.py"
+    tool.write_text(
+        "import json, os, pathlib, sys\n"
+        "case, out = pathlib.Path(sys.argv[1]).name, pathlib.Path(sys.argv[3])\n"
+        "shared = 'CUDA_MPS_PIPE_DIRECTORY' in os.environ\n"
+        "if case == 'case-1' and shared: sys.exit('CUDA_ERROR_ILLEGAL_ADDRESS')\n"
+        "if case == 'case-2': sys.exit('no such body')\n"
+        "out.mkdir()\n"
+        "found = {'verdict': 'nothing_missing', 'effects': [], 'shared': shared}\n"
+        "(out / 'explanation.json').write_text(json.dumps(found))\n"
+    )
+    calls, answers = _service(judge, tmp_path, monkeypatch), tmp_path / "answers"
+    asked = {"answers": answers, "tool": f"{sys.executable} {tool}", "gpus": 1}
+    judge.ask.ask(tmp_path / "batch", workers=2, **asked)
+    told = [json.loads((answers / f"case-{k}" / "explanation.json").read_text()) for k in range(3)]
+    assert [found["verdict"] for found in told] == ["nothing_missing", "nothing_missing", "failed"]
+    assert [found.get("shared") for found in told] == [True, False, None]
+    assert calls.read_text().split() == ["start", "quit"]
 
 
 def test_intervals_are_those_of_clopper_and_pearson(judge):

@@ -36,6 +36,9 @@ SHARING = "nvidia-cuda-mps-control"
 SERVED = Path("/tmp/nvidia-mps/control")
 """Where it is while somebody else's runs, unless told otherwise."""
 
+PIPE = "CUDA_MPS_PIPE_DIRECTORY"
+"""Variable by which a process finds it."""
+
 STOPPED = threading.Event()
 """Set once a run is interrupted: what the tools have not answered by then is asked for the next time."""
 
@@ -84,7 +87,7 @@ def _read(path: Path) -> dict[str, Any]:
 @contextlib.contextmanager
 def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
     """The multi-process service, where several workers share a GPU; yields the variables by which they find it."""
-    served = "CUDA_MPS_PIPE_DIRECTORY" in os.environ or SERVED.exists()
+    served = PIPE in os.environ or SERVED.exists()
     if workers <= gpus or not gpus or served:
         yield {}
         return
@@ -93,7 +96,7 @@ def _shared(gpus: int, workers: int) -> Iterator[dict[str, str]]:
         yield {}
         return
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        variables = {"CUDA_MPS_PIPE_DIRECTORY": f"{folder}/pipe", "CUDA_MPS_LOG_DIRECTORY": f"{folder}/log"}
+        variables = {PIPE: f"{folder}/pipe", "CUDA_MPS_LOG_DIRECTORY": f"{folder}/log"}
         surroundings = {**os.environ, **variables}
         surroundings.pop("CUDA_VISIBLE_DEVICES", None)  # by which it would number the GPUs anew
         for name in variables.values():
@@ -140,6 +143,8 @@ def answer(
 ) -> dict[str, Any]:
     """One case; returns its explanation, or the verdict "failed" with the reason.
 
+    A fault on a shared GPU ends the processes of all that share it. It is no answer, and none is written.
+
     Raises:
         Interrupted: if the run ends before; nothing is kept of the answer then.
     """
@@ -152,6 +157,8 @@ def answer(
         found: dict[str, Any] = {"verdict": "failed", "error": wrong, "effects": []}
         if not wrong:
             found = _read(out / "explanation.json")
+        elif "CUDA" in wrong and PIPE in variables:
+            return found
         found["judge_seconds"] = time.perf_counter() - started
         target = answers / case.name
         part = answers / f"{case.name}.part"
@@ -208,36 +215,47 @@ def ask(
         raise ValueError(f"batch = {batch}: wanted a folder with cases/, made by seal.py")
     if not (command := shlex.split(tool)) or shutil.which(command[0]) is None:
         raise ValueError(f"tool = {tool!r}: wanted a command line that begins with a program")
+    _devices(gpus, workers)
     cases = sorted((batch / "cases").iterdir())
     todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
     todo.sort(key=_rank, reverse=True)
-    free: queue.SimpleQueue[str] = queue.SimpleQueue()
-    for device in _devices(gpus, workers):
-        free.put(device)
     answers.mkdir(parents=True, exist_ok=True)
     print(f"{len(cases)} cases, {len(cases) - len(todo)} of them answered already", flush=True)
-    with _shared(gpus, workers) as sharing, concurrent.futures.ThreadPoolExecutor(workers) as pool:
+    with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
 
-        def answered(case: Path) -> dict[str, Any]:
-            device = free.get()
-            variables = {**sharing, **({"CUDA_VISIBLE_DEVICES": device} if device else {})}
-            try:
-                return answer(case, command, answers, timeout, shlex.split(extra), variables)
-            finally:
+        def each(todo: list[Path], workers: int) -> list[Path]:
+            """Ask for these; returns what has no answer then."""
+            free: queue.SimpleQueue[str] = queue.SimpleQueue()
+            for device in _devices(gpus, workers):
                 free.put(device)
 
-        jobs = {pool.submit(answered, case): case.name for case in todo}
-        with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
-            try:
-                for job in concurrent.futures.as_completed(jobs):
-                    found = job.result()
-                    reason = f" ({found.get('error', '')[:200]})" if found["verdict"] == "failed" else ""
-                    bar.write(f"{jobs[job]}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
-                    bar.update()
-            except BaseException:
-                STOPPED.set()
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+            def answered(case: Path) -> dict[str, Any]:
+                device = free.get()
+                variables = {**sharing, **({"CUDA_VISIBLE_DEVICES": device} if device else {})}
+                try:
+                    return answer(case, command, answers, timeout, shlex.split(extra), variables)
+                finally:
+                    free.put(device)
+
+            with _shared(gpus, workers) as sharing, concurrent.futures.ThreadPoolExecutor(workers) as pool:
+                jobs = {pool.submit(answered, case): case for case in todo}
+                try:
+                    for job in concurrent.futures.as_completed(jobs):
+                        case, found = jobs[job], job.result()
+                        reason = f" ({found.get('error', '')[:200]})" if found["verdict"] == "failed" else ""
+                        if (answers / case.name).exists():
+                            bar.write(f"{case.name}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
+                            bar.update()
+                        else:
+                            bar.write(f"{case.name}: asked again, as a fault has ended what shared its GPU{reason}")
+                except BaseException:
+                    STOPPED.set()
+                    pool.shutdown(wait=True, cancel_futures=True)
+                    raise
+            return [case for case in todo if not (answers / case.name).exists()]
+
+        if left := each(todo, workers):
+            each(left, gpus)
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
         for path in sorted(answers.rglob("*"))
