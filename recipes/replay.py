@@ -69,7 +69,7 @@ def main(chosen: Options) -> dict[str, float]:
     # Imported when it runs, so that --help is there at once.
     import torch
 
-    from torchsoro.design.reading import read_settings
+    from torchsoro.design.reading import lasting, read_settings
     from torchsoro.design.robot import build
     from torchsoro.output import archive
     from torchsoro.output.delivery import numbers, show
@@ -96,8 +96,8 @@ def main(chosen: Options) -> dict[str, float]:
     settle = chosen.settle if base.settle > 0 else 0.0
     min_wall = base.mended_to if chosen.min_wall is None else chosen.min_wall
     touches = base.self_contact if chosen.self_contact is None else chosen.self_contact
-    changes = {"duration": duration, "settle": settle, "min_wall": min_wall, "self_contact": touches}
-    robot = build(dataclasses.replace(base, **changes))
+    changes = {"settle": settle, "min_wall": min_wall, "self_contact": touches}
+    robot = build(dataclasses.replace(lasting(base, duration), **changes))
     out = chosen.out or Path("runs/replay") / folder.name
     written = ("motion.npz", "motion.html", "shape.stl", "shape.3mf", "shape.json")
     check_folder("out", out, (f"{folder.name}.mp4", *written))

@@ -144,6 +144,17 @@ def test_a_walker_is_sent_up_other_slopes_than_its_own(compare):
     assert slopes(robot="climber") == []
 
 
+def test_what_a_file_gives_is_not_checked_by_a_setting(compare, tmp_path):
+    for name in ("pressure.csv", "material.toml"):
+        (tmp_path / name).touch()
+    plain = compare.checks(TINY, ())
+    measured = compare.checks(dataclasses.replace(TINY, pressure_file=tmp_path / "pressure.csv"), ())
+    assert plain.keys() - measured.keys() == {"double_modulus_and_pressure", "50_kPa", "3_Hz"}
+    assert any(check.long for check in plain.values()) and not any(check.long for check in measured.values())
+    fitted = compare.checks(dataclasses.replace(TINY, material=tmp_path / "material.toml"), ())
+    assert plain.keys() - fitted.keys() == {"double_modulus", "double_modulus_and_pressure", "five_elements"}
+
+
 @pytest.mark.parametrize("times", [1, 2, 3])
 def test_a_finer_density_keeps_constant_and_linear_fields(times, compare):
     shape = (4, 5, 6)

@@ -14,6 +14,7 @@ from tiny import TINY
 
 from torchsoro import SimulationDiverged
 from torchsoro.command_line import plain_errors
+from torchsoro.design.presets import CLIMBER, WALKER
 from torchsoro.design.reading import from_command_line
 from torchsoro.design.settings import Settings
 
@@ -176,3 +177,11 @@ def test_the_projection_sharpens_by_equal_factors_between_two_iterations():
     assert dataclasses.replace(s, sharpen=(0, 0)).sharpness(99) == 2.0
     with pytest.raises(ValueError, match="two increasing iterations"):
         dataclasses.replace(TINY, sharpen=(30, 30))
+
+
+def test_designs_count_with_full_gravity_and_features_of_whole_thickness():
+    assert WALKER["desk"].counts_from == WALKER["paper"].counts_from == 0
+    assert CLIMBER["desk"].counts_from == 20 and CLIMBER["paper"].counts_from == 80
+    thick = dataclasses.replace(WALKER["desk"], feature=2.5e-3)
+    assert thick.sharpened(thick.counts_from - (67 - 25)) == 1.0 > thick.sharpened(thick.counts_from - 1 - (67 - 25))
+    assert CLIMBER["desk"].gravity_scale(20) == 1.0 > CLIMBER["desk"].gravity_scale(19)

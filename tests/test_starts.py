@@ -52,6 +52,16 @@ def test_a_run_that_starts_again_leaves_no_start_of_the_former(tmp_path):
         assert {folder.name for folder in path.glob("start-*")} == left | {"start-mine", "start-4"}
 
 
+def test_a_run_is_resumed_with_several_starts_or_one_as_it_began(tmp_path):
+    for name, count, other in (("one", 1, 2), ("two", 2, 1)):
+        settings = tiny(tmp_path / name, starts=count)
+        optimize_starts(walker(settings))
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(ValueError, match=f"starts = {other}: .* holds a run of {count}, wanted that"):
+            optimize_starts(walker(dataclasses.replace(settings, starts=other, resume=True)))
+        assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_starts_one_after_the_other_end_as_side_by_side(tmp_path):
     beside = optimize_starts(walker(tiny(tmp_path / "beside", starts=2)))
     with threads_here(1):

@@ -342,3 +342,5 @@ def test_a_measured_pressure_is_that_of_every_chamber_and_has_no_timing(tmp_path
     assert both.at(vector(0.02)).tolist() == [[50e3], [50e3]]
     with pytest.raises(ValueError, match=r"designed = .*: wanted none with a pressure that is measured"):
         walker(tiny(tmp_path, chambers=2, pressure_file=file, timing=("phase",)))
+    with pytest.raises(ValueError, match="pressure_file: beside phases, wanted valves or"):
+        walker(tiny(tmp_path, chambers=2, pressure_file=file, phases=(0.0, 0.5)))

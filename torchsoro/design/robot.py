@@ -190,6 +190,9 @@ class Robot(nn.Module):
 
         closes = s.sample_every * max(1, round(min(s.duty / s.frequency, s.duration) / s.sample_every))
         height = trajectory.center_of_gravity[..., 2]
+        stands = height[..., 0]
+        if scenarios is not None and scenarios.posed:  # what a body that leans or drops at the start loses is no fall
+            stands = center_of_gravity(body.position, weight)[..., 2].expand(stands.shape)
         return Outcome(
             travel=until(end),
             feet=self.feet(trajectory, gamma, near=False),
@@ -199,29 +202,27 @@ class Robot(nn.Module):
             turn_inflated=self.turned(trajectory, gamma, s.settle + closes),
             intermediate=intermediate_density(gamma, self.design) if member is None else member.intermediate(gamma),
             mass=total_mass(solid),
-            fall=torch.relu(height[..., 0] - self.clearance(gamma, scenarios) - height.amin(-1) - s.sink * s.size[2]),
+            fall=torch.relu(stands - self.clearance(gamma) - height.amin(-1) - s.sink * s.size[2]),
             center=center_of_gravity(body.position, weight),
             trajectory=trajectory,
             dt=trajectory.dt,
         )
 
     @torch.no_grad()
-    def clearance(self, gamma: Tensor, scenarios: ScenarioBatch | None = None) -> Tensor:
-        """Height of the solid above the ground at the start [...] m, in whole layers, and a drop; 0 without a ground.
+    def clearance(self, gamma: Tensor) -> Tensor:
+        """Height of the solid above the ground of a body that stands [...] m, in whole layers; 0 without a ground.
 
         An eroded design has lost its lowest layers, and lands before it walks.
 
         Args:
             gamma: Density [..., N].
-            scenarios: That may begin with a drop.
         """
         none = torch.zeros((), dtype=gamma.dtype, device=gamma.device)
         if not any(plane.axis == 2 and plane.side == 1 for plane in self.planes):
             return none
         layer = ((self.domain.positions[:, 2] - self.domain.origin[2]) / self.domain.spacing).floor().to(gamma)
         solid = torch.where(gamma >= 0.5, layer, math.inf).amin(-1)
-        free = torch.where(solid.isfinite(), solid, 0.0) * self.domain.spacing
-        return free if scenarios is None or scenarios.drop is None else free + scenarios.drop.to(free)
+        return torch.where(solid.isfinite(), solid, 0.0) * self.domain.spacing
 
     def density(self) -> Tensor:
         """Density of the present design [N], with a gradient by the field and by chambers that are designed."""
@@ -392,8 +393,7 @@ class Robot(nn.Module):
             found["planes"] = tuple(replace(plane, **one) for plane in self.planes)
         if b.tube_mass is not None:
             found["loads"] = (PointMass(particles=socket, mass=b.tube_mass),)
-        pose = [t for t in (b.pitch, b.roll, b.drop) if t is not None]
-        if any(t.requires_grad or bool(t.any()) for t in pose):
+        if b.posed:
             nodes = Lattice.around(body.position, self.domain.cell).node_places
             moved = posed(nodes, s.size, b).to(body.position)
             found["start"] = Start(displacement=moved, velocity=torch.zeros_like(moved))

@@ -107,6 +107,12 @@ class ScenarioBatch:
         """The tensors that are there, by name."""
         return {name: value for name in NOMINAL if (value := getattr(self, name)) is not None}
 
+    @property
+    def posed(self) -> bool:
+        """Whether a body may lean, or hang above the ground, at the start."""
+        pose = [t for t in (self.pitch, self.roll, self.drop) if t is not None]
+        return any(t.requires_grad or bool(t.any()) for t in pose)
+
     def part(self, index: Sequence[int]) -> ScenarioBatch:
         """The scenarios of these indices, in this order."""
         chosen = list(index)

@@ -441,6 +441,12 @@ class Settings:
         return min(1.0, (iteration // self.gravity_every) / self.gravity_steps)
 
     @property
+    def counts_from(self) -> int:
+        """First iteration whose design may be the best: with full gravity, and the whole thickness of features."""
+        first, last = self.sharpen
+        return max(self.gravity_every * self.gravity_steps, 2 * last - first if self.feature else 0)
+
+    @property
     def mended_to(self) -> float:
         """Thickness up to which thin walls of the printed part are mended [m]; 0 for none."""
         return min(self.feature, self.wall) if self.min_wall is None else self.min_wall

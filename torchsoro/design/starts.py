@@ -59,7 +59,10 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
         SimulationDiverged: if the simulation of every start breaks down.
     """
     s = robot.settings
-    former = _starts_of(s.out) if s.overwrite else 0
+    held = _starts_of(s.out)
+    if s.resume and held and (held == 1) != (s.starts == 1):
+        raise ValueError(f"starts = {s.starts}: {s.out} holds a run of {held}, wanted that to resume it")
+    former = held if s.overwrite and held > 1 else 0
     if s.starts == 1:
         found = optimize(robot, observe, processes)
         _forget(s.out, 1, former)
@@ -120,10 +123,10 @@ def optimize_starts(robot: Robot, observe: Observe | None = None, processes: Pro
 
 
 def _starts_of(folder: Path) -> int:
-    """Of how many starts a folder's run is; 0 of one, or without a run."""
+    """Of how many starts a folder's run is; 0 without a run."""
     path = folder / "settings.json"
-    starts = read_json(path, dict).get("starts", 1) if path.is_file() else 1
-    return starts if isinstance(starts, int) and starts > 1 else 0
+    starts = read_json(path, dict).get("starts", 1) if path.is_file() else 0
+    return starts if isinstance(starts, int) else 1
 
 
 def _forget(folder: Path, first: int, last: int) -> None:

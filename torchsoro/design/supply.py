@@ -187,6 +187,8 @@ def supply_of(s: Settings, modulus: float) -> Supply:
     Raises:
         ValueError: for numbers out of their range, and a pressure that does not fit the modulus or the duration.
     """
+    if s.pressure_file is not None and (given := [n for n in ("amplitudes", "phases", "duties") if getattr(s, n)]):
+        raise ValueError(f"pressure_file: beside {', '.join(given)}, wanted valves or a measured pressure")
     measured = None if s.pressure_file is None else _measured(s, s.pressure_file, modulus)
     if measured is None and s.material is not None:
         check_pressure("pressure", s.pressure, modulus)

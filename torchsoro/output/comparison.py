@@ -52,7 +52,7 @@ class Check:
 
 
 def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
-    """The checks of a robot, by name.
+    """The checks of a robot, by name; without those of numbers that a file gives instead of the settings.
 
     Args:
         s: Its settings.
@@ -83,6 +83,14 @@ def checks(s: Settings, iterations: Sequence[int]) -> dict[str, Check]:
         "updated": Check(title="updated formulation (MLS-MPM), void left out", changes=updated, void=False),
         "updated_half_cell": Check(title="updated formulation, half the cell size", changes=updated, finer=2),
     }
+    if s.material is not None:  # which gives modulus and Maxwell elements
+        found = {k: check for k, check in found.items() if not {"youngs_modulus", "elements"} & check.changes.keys()}
+    if s.pressure_file is not None:  # which gives pressure and cycle, and ends
+        found = {
+            k: dataclasses.replace(check, long=False)
+            for k, check in found.items()
+            if not {"pressure", "frequency"} & check.changes.keys()
+        }
     return found | {f"iteration_{k}": Check(title=f"iteration {k}", iteration=k, motion=True) for k in iterations}
 
 

@@ -65,6 +65,12 @@ def design(robot: Robot, name: str) -> dict[str, float]:
             f"slopes = {s.slopes}: wanted at least as many scenarios, not {s.scenarios}, and none for a climber or "
             f"beside a slope of {s.slope:g}"
         )
+    if s.iterations <= s.counts_from:
+        print(
+            f"iterations = {s.iterations}: gravity and the thickness of features still grow until iteration "
+            f"{s.counts_from}, from which on designs count; the last one is delivered",
+            file=sys.stderr,
+        )
     if world_size() > 1:
         if s.starts > 1:
             raise ValueError(f"starts = {s.starts}: wanted 1 in several processes, which share scenarios")
