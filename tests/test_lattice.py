@@ -13,6 +13,7 @@ from problems import DT, H, block, problem, rotations, simulator
 
 from torchsoro.simulation.axis import Axis
 from torchsoro.simulation.kernels import layout
+from torchsoro.simulation.ops.arena import Arena
 from torchsoro.simulation.ops.axis_sums import PARTICLES, QUADRATURE
 from torchsoro.simulation.ops.lattice import Lattice, numbers
 from torchsoro.simulation.ops.scene import Inputs
@@ -297,6 +298,13 @@ def test_the_constants_of_the_layout_agree_with_its_names():
             assert getattr(layout, constant) == place, (buffer, name)
             place += 1
     assert place == layout.HEAD
+
+
+def test_a_buffer_of_more_numbers_than_kernels_can_index_is_refused():
+    shapes = (layout.LARGEST - 1,), (0,), (0,)
+    assert Arena.over("kept", torch.empty(layout.LARGEST, device="meta"), *shapes).offsets == [0, *[shapes[0][0]] * 2]
+    with pytest.raises(ValueError, match=r"kept: 2.147e\+09 numbers in a buffer, wanted at most 2.147e\+09"):
+        Arena.over("kept", torch.empty(layout.LARGEST + 1, device="meta"), *shapes)
 
 
 def test_a_segment_lays_its_quantities_where_the_constants_say():

@@ -18,6 +18,7 @@ from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.kernels.tile import KEPT
 from torchsoro.simulation.ops import total
 from torchsoro.simulation.ops.lattice import Lattice
+from torchsoro.simulation.ops.scene import Inputs
 from torchsoro.simulation.ops.tiles import LIMIT, tables, tiles_along, tiles_of
 
 
@@ -85,6 +86,19 @@ def test_slopes_with_all_that_a_body_may_have_agree_with_central_differences_to_
         with torch.no_grad():
             up, down = (combined(p.run({name: at + step * way})) for step in (1e-5, -1e-5))
         assert float((by * way).sum()) == pytest.approx(float(up - down) / 2e-5, rel=1e-6), name
+
+
+def test_forces_that_begin_later_are_the_same_in_both_engines_and_few_rows_on_a_gpu():
+    p = completed(problem(formulation="total", lattice=hollow(), batch=2, lanes=False), starts=True)
+    inputs = Inputs(**{f.name: p.tensors[f.name] for f in fields(Inputs)})
+    integrator = total.TotalSegmentIntegrator(p.scene, inputs, first=1, samples=())
+    rows = integrator.supply.views[2]
+    acts = torch.tensor([[1 + t >= start for start in (0, 2, 3)] for t in range(integrator.steps)])
+    assert len(rows) == 3  # from substeps 1, 2 and 3 of the run on
+    assert torch.equal(rows[integrator.force_row.long()], inputs.force * acts[:, None, :, None])
+    other = completed(problem(formulation="total", lattice=hollow(), batch=2, lanes=True), starts=True)
+    one, other = (each.run(keep=False)[0][:, : 6 * integrator.nodes] for each in (p, other))
+    assert float((one - other).norm()) < 1e-12 * float(other.norm())
 
 
 @pytest.mark.parametrize("batch", [3, 14])

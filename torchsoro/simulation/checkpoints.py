@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from torchsoro.simulation.kernels.layout import LARGEST
+
 MEMORY = {"cpu": 2 * 2**30, "cuda": 6 * 2**30}  # default budget by device, bytes
-_LARGEST = 2**31 - 1  # most numbers in a buffer, which Taichi indexes with 32 bits
 NODE_SHARE = 1.15  # bytes kept of particles and nodes, over those of the particles alone
 
 
@@ -48,7 +49,7 @@ def plan_checkpoints(
         ValueError: if no plan fits a binding budget; says the smallest budget that does.
     """
     each = int(state_bytes * node_share)
-    most = max(1, _LARGEST * element_bytes // state_bytes - 1)
+    most = max(1, LARGEST * element_bytes // state_bytes - 1)
     if each * (steps + 1) <= budget and steps <= most:
         return Plan(segment=steps, keep=True, memory=each * (steps + 1))
     # The fewest segments, as each costs the host some time; of equal length, which takes the least memory.

@@ -250,7 +250,7 @@ class Simulator(nn.Module):
         """Forces that are constant from a substep of the run on, with a row for each of this one if they need it."""
         tensors = [*others, *(getattr(inputs, f.name) for f in fields(inputs))]
         gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-        if not gradient and self.formulation.in_lanes(inputs.coefficients):
+        if not gradient and scene.lattice is not None:
             return replace(scene, force_start=firsts), inputs
         force, steps = inputs.force, began + torch.arange(len(inputs.gravity), device=inputs.force.device)
         rows = force.expand(len(steps), *force.shape[1:])

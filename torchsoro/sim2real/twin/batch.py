@@ -21,6 +21,7 @@ from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.formulation import Total
 from torchsoro.simulation.kernels.lanes import LANES
+from torchsoro.simulation.kernels.layout import LARGEST, lattice_components
 from torchsoro.simulation.loads import Clamp, Drag, Force, Load, PointMass, QuadraticDrag, Spring
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.simulator import Simulator
@@ -78,6 +79,7 @@ def simulate(
         steps = [np.full_like(dt, least) for dt in steps]
     if not (shortest := min(float(dt.min()) for dt in steps)) > SHORTEST:
         raise ValueError(f"stiffness: a step of {shortest:g} s is needed, wanted a body with at least {SHORTEST:g} s")
+    samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
     alike: dict[object, list[Lane]] = {}
     for i, s in enumerate(scenarios):
         alike.setdefault(_kind(s), []).extend((i, b) for b in range(s.batch))
@@ -88,9 +90,10 @@ def simulate(
         if twin.device == "cpu":
             groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
         else:
-            groups += _at_once(members, [steps[i][b] for i, b in members])
+            elements = max(_extras(scenarios[i])[0] for i, _ in members)
+            most = min(MOST_AT_ONCE, _countable(twin, samples, elements))
+            groups += _at_once(members, [steps[i][b] for i, b in members], most)
     markers = torch.tensor([m.at for m in twin.setup.markers], dtype=torch.float64).reshape(-1, 3)
-    samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
     shape = samples, len(markers)
     position, velocity = ([np.zeros((s.batch, *shape, 3)) for s in scenarios] for _ in range(2))
     deformation = [np.zeros((s.batch, *shape, 3, 3)) for s in scenarios]
@@ -124,13 +127,21 @@ def simulate(
     ]
 
 
-def _at_once(members: list[Lane], steps: list[float]) -> list[list[Lane]]:
-    """Batches for a GPU, which takes hardly longer for more: as large as the memory allows and steps are alike."""
+def _countable(twin: Twin, samples: int, elements: int) -> int:
+    """Variations at most of which a GPU can index what is recorded, and the two states that it goes between."""
+    lattice = twin.grid.lattice
+    seen = samples * 6 * 27 * max(1, len(twin.setup.markers))  # way and velocity of the nodes around each marker
+    states = 2 * lattice_components(lattice.nodes, lattice.count, elements, softens=True)
+    return max(1, LARGEST // max(seen, states))
+
+
+def _at_once(members: list[Lane], steps: list[float], most: int = MOST_AT_ONCE) -> list[list[Lane]]:
+    """Batches for a GPU, which takes hardly longer for more: so many at most, with steps that are alike."""
     order = sorted(zip(steps, members, strict=True))
     batches: list[list[Lane]] = []
     shortest = 0.0
     for step, lane in order:
-        if not batches or step > ALIKE * shortest or len(batches[-1]) == MOST_AT_ONCE:
+        if not batches or step > ALIKE * shortest or len(batches[-1]) == most:
             batches.append([])
             shortest = step
         batches[-1].append(lane)

@@ -57,6 +57,8 @@ NODE_NEW = 6
 ADJOINT_MOVED, ADJOINT_FLIP = 0, 3
 ADJOINT_NEW = 6
 
+LARGEST = 2**31 - 1  # numbers in a buffer, which kernels index with 32 bits
+
 # The clock of the updated form: substep, and whether the last pass did anything.
 NOW, ACTIVE = 0, 2
 
@@ -80,11 +82,11 @@ COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
-    *("faced", "ties", "pushes", "wall_chunks", "wall_rows", "fluid", "watched", "sample_at"),
+    *("faced", "ties", "pushes", "wall_chunks", "wall_rows", "fluid", "watched", "sample_at", "row_at"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
 VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
-FACED, TIES, PUSHES, WALL_CHUNKS, WALL_ROWS, FLUID, WATCHED, SAMPLE_AT = range(26, 34)
+FACED, TIES, PUSHES, WALL_CHUNKS, WALL_ROWS, FLUID, WATCHED, SAMPLE_AT, ROW_AT = range(26, 35)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
@@ -118,17 +120,17 @@ BUFFERS = {
         )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(34, 43)
-WALL_CHUNK, WALL_KIND, WALL_ROW, WALL_COUNT, WALL_ENTRY, NEAR_NUMBER = range(43, 49)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(49, 58)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(58, 65)
-PRESSURE, GRAVITY, FORCE = range(65, 68)
-VOLUMES, PUSHED, SEEN = range(68, 71)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(71, 77)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(77, 81)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(81, 89)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(89, 92)
-HEAD = 92
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(35, 44)
+WALL_CHUNK, WALL_KIND, WALL_ROW, WALL_COUNT, WALL_ENTRY, NEAR_NUMBER = range(44, 50)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(50, 59)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(59, 66)
+PRESSURE, GRAVITY, FORCE = range(66, 69)
+VOLUMES, PUSHED, SEEN = range(69, 72)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(72, 78)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(78, 82)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(82, 90)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(90, 93)
+HEAD = 93
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors. Number by number, so that threads

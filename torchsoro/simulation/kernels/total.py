@@ -57,6 +57,7 @@ from torchsoro.simulation.kernels.layout import (
     REPELLED,
     REPULSION,
     RING,
+    ROW_AT,
     SAMPLE_AT,
     SEEN,
     SHAPES,
@@ -164,8 +165,8 @@ def external_force(block: ti.template(), q, t, b, p):
 @ti.func
 def force_at(block: ti.template(), t, b, g):
     """Where force number g of a substep lies: those on points, then those on nodes."""
-    forces = block.head[GROUPS] + block.head[PUSHES]
-    return block.head[FORCE] + ((t * block.head[BATCH] + b) * forces + g) * 3
+    forces, row = block.head[GROUPS] + block.head[PUSHES], block.ints[block.head[ROW_AT] + t]
+    return block.head[FORCE] + ((row * block.head[BATCH] + b) * forces + g) * 3
 
 
 @ti.func

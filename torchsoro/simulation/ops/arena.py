@@ -12,6 +12,19 @@ from torch import Tensor
 from torchsoro.simulation.kernels import layout
 
 
+def check_count(name: str, count: int) -> None:
+    """Refuse a buffer of more numbers than kernels can index.
+
+    Raises:
+        ValueError: naming it.
+    """
+    if count > layout.LARGEST:
+        raise ValueError(
+            f"{name}: {count:.4g} numbers in a buffer, wanted at most {layout.LARGEST:.4g}: fewer simulations in a "
+            "batch, samples or particles"
+        )
+
+
 class Arena:
     """Several tensors in one buffer, under one of the names of ``layout.BUFFERS``, in the order given there.
 
@@ -40,6 +53,7 @@ class Arena:
 
     def _divide(self, name: str, buffer: Tensor, shapes: Sequence[Sequence[int]]) -> None:
         assert len(shapes) == len(layout.BUFFERS[name])
+        check_count(name, buffer.numel())
         ends = list(itertools.accumulate(math.prod(shape) for shape in shapes))
         self.name, self.buffer, self.offsets = name, buffer, [0, *ends[:-1]]
         self.views = [

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchsoro.simulation.kernels import layout, total, total_adjoint
-from torchsoro.simulation.ops.arena import Arena
+from torchsoro.simulation.ops.arena import Arena, check_count
 from torchsoro.simulation.ops.chambers import chamber_adjoint
 from torchsoro.simulation.ops.divergence import outside, report
 from torchsoro.simulation.ops.fixed import fixed
@@ -91,7 +91,8 @@ class TotalSegmentIntegrator:
         self.checked = False
         self.near = None if scene.markers is None or not scene.only_markers else scene.markers.near.to(like.device)
         self.watched = 0 if self.near is None else len(self.near)
-        self.supply = Arena("supply", inputs.pressure, inputs.gravity, self._forces())
+        force, self.force_row = self._forces()
+        self.supply = Arena("supply", inputs.pressure, inputs.gravity, force)
         self.tiles = tiles_of(self.lattice, like)
         tiles, chunks = self.tiles.count, -(-self.nodes // layout.TILE)
         # Of each tile, of each pair of a tile and a chamber that has points in it, and of the rates in each tile.
@@ -117,15 +118,19 @@ class TotalSegmentIntegrator:
         step = self.first + torch.arange(self.steps)
         return (step[:, None] >= torch.tensor(starts)).view(self.steps, 1, -1, 1)
 
-    def _forces(self) -> Tensor:
-        """In each substep [steps, B, forces, 3]."""
-        force = self.inputs.force
-        return force if self.scene.force_start is None else force * self._started().to(force)
+    def _forces(self) -> tuple[Tensor, Tensor]:
+        """Forces [rows, B, forces, 3], and the row of each substep [steps]: few, where they last once they act."""
+        force, starts, steps = self.inputs.force, self.scene.force_start, torch.arange(self.steps, dtype=torch.int32)
+        if starts is None or not self.scene.forces:
+            return force, steps
+        begins = torch.tensor(sorted({0, *(s - self.first for s in starts if 0 < s - self.first < self.steps)}))
+        return force * self._started()[begins].to(force), torch.bucketize(steps, begins, right=True, out_int32=True) - 1
 
     def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
         """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
         ring, slots = (self.steps + 1, self.steps) if keep else (2, 1)
         # The kernels write no history at places without a particle.
+        check_count("states", ring * start.numel())
         states = (start.new_empty if self.scene.absent is None else start.new_zeros)(ring, *start.shape)
         states[0] = start
         self.kept = Arena.zeros("kept", start, *self._kept(slots, len(self._recorded())))
@@ -303,6 +308,7 @@ class TotalSegmentIntegrator:
             **{"wall_chunks": self.wall_chunks, "wall_rows": self.wall_rows},
             **{"pushes": self.scene.forces - self.groups, "fluid": int(self.scene.immersed)},
             **{"watched": self.watched, "sample_at": layout.HEAD + len(self.tables.buffer)},
+            **{"row_at": layout.HEAD + len(self.tables.buffer) + (self.steps if self.watched else 0)},
             **{name: int(value) for name, value in more.items()},
         }
         head = [_NEVER, 0, *(sizes.get(name, 0) for name in layout.SIZES)]
@@ -314,6 +320,7 @@ class TotalSegmentIntegrator:
         values, samples = torch.tensor(head, dtype=torch.int32), self._recorded()
         of_step = torch.full((self.steps if self.watched else 0,), -1, dtype=torch.int32)
         of_step[[k - 1 for k in samples]] = torch.arange(len(samples), dtype=torch.int32)
+        of_step = torch.cat([of_step, self.force_row])
         if self.gpu:  # from pinned memory, as the host would wait otherwise
             device = self.tables.buffer.device
             values, of_step = (t.pin_memory().to(device, non_blocking=True) for t in (values, of_step))
