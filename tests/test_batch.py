@@ -12,7 +12,7 @@ from test_experiment import experiment
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.twin.batch import simulate, waves
+from torchsoro.sim2real.twin.batch import _Group, simulate, waves
 from torchsoro.sim2real.twin.twin import Twin
 
 EDGE = 0.008
@@ -71,6 +71,17 @@ def test_variations_with_elements_and_springs_move_together_as_they_do_alone(tri
         (alone,) = simulate(twin, [s])
         assert np.ptp(alone.position) > 1e-3
         assert_same([one], [alone], 2e-5)  # whose step is another
+
+
+def test_forces_at_a_place_are_one_for_all_trials(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    asked = varied(twin, trial) * 3
+    lanes = [(i, b) for i, s in enumerate(asked) for b in range(s.batch)]
+    forces = _Group(twin, asked, lanes).forces()
+    assert len(forces) == 2  # the two places of the taut tether
+    for place, force in enumerate(forces):
+        pulled = [k for k, (i, b) in enumerate(lanes) if i % 5 == 4 and b == place]
+        assert len(pulled) == 3 and force.value.any(1).nonzero().squeeze(1).tolist() == pulled
 
 
 def test_residuals_of_a_batch_are_those_of_each_motion(tmp_path):

@@ -314,8 +314,9 @@ class _Group:
 
     def forces(self) -> list[Force]:
         """Forces of all; those on the same nodes from the same time on are one, zero where a scenario has none."""
-        values: dict[tuple[int, float], Tensor] = {}
-        shares: dict[int, Tensor] = {}
+        values: dict[tuple[bytes, float], Tensor] = {}
+        shares: dict[bytes, Tensor] = {}
+        keys: dict[int, bytes] = {}  # of shares: those of different trials are tensors of their own
         for k, (i, b) in enumerate(self.lanes):
             for force in self.scenarios[i].loads:
                 if isinstance(force, Force):
@@ -323,10 +324,13 @@ class _Group:
                     value = force.value if force.value.ndim == 1 else force.value[b if len(force.value) > 1 else 0]
                     if not bool(value.any()):
                         continue  # as of a force whose place is that of other variations
-                    shares[id(force.share)] = force.share
-                    whole = values.setdefault((id(force.share), force.start), torch.zeros(len(self.lanes), 3))
+                    if id(force.share) not in keys:
+                        keys[id(force.share)] = force.share.numpy().tobytes()
+                    key = keys[id(force.share)]
+                    shares[key] = force.share
+                    whole = values.setdefault((key, force.start), torch.zeros(len(self.lanes), 3))
                     whole[k] += value.float()
-        return [Force(share=shares[number], value=value, start=start) for (number, start), value in values.items()]
+        return [Force(share=shares[key], value=value, start=start) for (key, start), value in values.items()]
 
     def other_loads(self) -> list[Load]:
         """Point masses, springs and drag: the first ones of each scenario together, then the second ones, ..."""
