@@ -20,7 +20,6 @@ from torchsoro.sim2real.data.recording import read_table
 from torchsoro.sim2real.inference.model import read_model
 from torchsoro.sim2real.inputs import chosen, read_inputs
 from torchsoro.sim2real.options import Options
-from torchsoro.sim2real.progress import Progress, span
 from torchsoro.sim2real.twin.twin import Twin
 
 SETUP = f"""title = "finger"
@@ -456,30 +455,6 @@ def test_drawn_input_is_accepted_or_refused_and_nothing_is_written(whole, mutati
         else:
             assert found.trials
         assert listing(Path(place)) == before
-
-
-# Progress ---------------------------------------------------------------------------------------------------------
-
-
-def test_progress_in_a_log_grows_to_the_end_and_says_what_is_left(tmp_path, monkeypatch):
-    clock = iter(np.arange(0.0, 1e5, 4.0))
-    monkeypatch.setattr("torchsoro.sim2real.progress.time.perf_counter", lambda: float(next(clock)))
-    from torchsoro.sim2real.progress import STAGES
-
-    with open(tmp_path / "log", "w") as stream:
-        progress = Progress(stream)
-        fractions = []
-        for name, (_, batches) in STAGES.items():
-            progress.stage(name)
-            for _ in range(3 * batches):
-                progress.tick()
-                fractions.append(progress.fraction)
-        progress.close()
-    assert sum(share for share, _ in STAGES.values()) == pytest.approx(1.0)
-    assert (np.diff(fractions) >= 0).all() and fractions[-1] < 1
-    lines = (tmp_path / "log").read_text().splitlines()
-    assert all(name in " ".join(lines) for name in STAGES) and " s left" in lines[-1]
-    assert [span(v) for v in (40.0, 600.0, 7200.0)] == ["40 s", "10 min", "2.0 h"]
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -79,25 +79,22 @@ def predict_markers(options: Options) -> dict[str, np.ndarray]:
     return columns
 
 
-def correct(inputs: Inputs, tick: Callable[[str], None] = lambda line: None) -> FitProblem:
+def correct(inputs: Inputs, progress: Progress | None = None) -> FitProblem:
     """What effects are fitted to: recordings, a twin, and the error that its cells make, by a twin with smaller ones.
 
     Args:
         inputs: That were checked.
-        tick: Called after each batch of simulations.
+        progress: To tell of simulations.
 
     Raises:
         ValueError: if the body as it is believed does not bear what acts on it.
     """
-    return FitProblem(
-        inputs.experiment,
-        inputs.twin,
-        trials=inputs.trials,
-        discretization=measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, report=tick),
-        fine=inputs.fine,
-        threads=inputs.threads,
-        report=tick,
-    )
+    told: dict[str, Any] = {} if progress is None else {"report": progress.tick}
+    error = measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, **told)
+    if progress is not None:
+        told["watch"] = progress.watch
+    known = {"discretization": error, "fine": inputs.fine, "threads": inputs.threads}
+    return FitProblem(inputs.experiment, inputs.twin, trials=inputs.trials, **known, **told)
 
 
 @threadpool_limits.wrap(limits=1)  # products of small matrices: threads would wait for each other, and round otherwise
@@ -146,7 +143,7 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     for finding in told:
         progress.note(f"Hint: {finding}")
     progress.stage("comparing cell sizes")
-    problem = correct(inputs, progress.tick)
+    problem = correct(inputs, progress)
     discretization = problem.discretization
     progress.stage("simulating what each effect would change")
     tells = isolability(problem, inputs.effects)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -34,6 +35,10 @@ VALLEYS = 2.0  # times the noise: chance of sliding blocks, whose searches end w
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
 
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
+
+
+def _unwatched(size: float, share: float) -> None:
+    """Show nothing."""
 
 
 def _silent(line: str) -> None:
@@ -89,6 +94,7 @@ class Likelihood:
         threads: That simulate.
         even: Whether all simulations of a call take the same time step, so that its error cancels in differences.
         report: Called with a line after each batch of simulations.
+        watch: Called in it with its size, in simulated seconds, and the share that is done.
         tally: Of all simulations of this and of what is derived from it.
     """
 
@@ -106,6 +112,7 @@ class Likelihood:
     threads: int = THREADS
     even: bool = False
     report: Callable[[str], None] = _silent
+    watch: Callable[[float, float], None] = _unwatched
     tally: Tally = field(default_factory=Tally)
 
     def __post_init__(self) -> None:
@@ -315,7 +322,10 @@ class Likelihood:
         lanes = [(k, i) for k, own in enumerate(asked) for i in own]
         varied = [self.vary(self.scenarios[i], *requests[k]) for k, i in lanes]
         found: list[list[MarkerTrajectory]] = [[] for _ in requests]
-        moving = simulate(self.twin, varied, threads=self.threads, even=self.even)
+        size = sum(s.until * s.batch for s in varied)
+        watch = functools.partial(self.watch, size)
+        watch(0.0)
+        moving = simulate(self.twin, varied, threads=self.threads, even=self.even, watch=watch)
         for (k, i), motion in zip(lanes, moving, strict=True):
             error, name = self.discretization, self.trials[i].name
             known = error.own.get(requests[k][0], error.correction)

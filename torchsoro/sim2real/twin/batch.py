@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 from collections import Counter
@@ -53,7 +54,13 @@ def safety(twin: Twin) -> float:
 
 
 def simulate(
-    twin: Twin, scenarios: Sequence[Scenario], *, threads: int = THREADS, even: bool = False, safe: float | None = None
+    twin: Twin,
+    scenarios: Sequence[Scenario],
+    *,
+    threads: int = THREADS,
+    even: bool = False,
+    safe: float | None = None,
+    watch: Callable[[float], None] = lambda share: None,
 ) -> list[MarkerTrajectory]:
     """Simulate variations of scenarios of one body.
 
@@ -63,6 +70,7 @@ def simulate(
         threads: Number of threads.
         even: Whether all variations take the same time step, so that its error cancels in their differences.
         safe: Step over the bound of a stable one near rest; chosen by the body's cells if None.
+        watch: Called with the share of the simulated time that is done, group by group.
 
     Returns:
         For each scenario, its motions [B, ...]; diverged ones are not ``sound``. Of no scenario, none.
@@ -109,16 +117,16 @@ def simulate(
                 kept[i][b] = one
         return found.dt
 
-    largest, first = 0.0, 0
+    largest, first, done = 0.0, 0, 0.0
+    whole = sum(s.until * s.batch for s in scenarios)
     plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
     for width, count in sorted(Counter(plan).items(), reverse=True):
         part = groups[first : first + width * count]
         each = [min(threads // width, TOGETHER)] * len(part)
-        if width == 1:
-            largest = max(largest, *map(run, part, each))
-        else:
-            with ThreadPoolExecutor(width) as pool:
-                largest = max(largest, *pool.map(run, part, each))
+        with ThreadPoolExecutor(width) if width > 1 else contextlib.nullcontext() as pool:
+            for group, dt in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
+                largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
+                watch(done / whole)
         first += len(part)
     time = np.arange(samples) * SAMPLE
     return [
