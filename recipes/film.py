@@ -70,7 +70,7 @@ def main(chosen: Options) -> Path:
     from torchsoro.output.archive import find, load_design, load_supply
     from torchsoro.output.fabricate import surface
     from torchsoro.output.marker_map import marker_map
-    from torchsoro.sim2real.data.from_design import believed, elements, far_apart, seen_from
+    from torchsoro.sim2real.data.from_design import believed, elements, far_apart, marker_tables, seen_from
     from torchsoro.sim2real.data.recording import write_table
     from torchsoro.storage import check_folder
 
@@ -97,8 +97,7 @@ def main(chosen: Options) -> Path:
     away = -side * seen[:, axis]
     near = seen[away <= away.min() + REACHED * robot.domain.size[axis]]
     places = {f"m{k + 1}": near[i] for k, i in enumerate(far_apart(near, chosen.markers))}
-    for name, place in places.items():
-        text += f'\n[[marker]]\nname = "{name}"\nat = {[float(f"{x:.6g}") for x in place]}\n'
+    text += f"\n{marker_tables({name: place.tolist() for name, place in places.items()})}"
     axes = ["x", "y", "z"] if chosen.kind == "mocap" else [a for a in "xyz" if a != chosen.camera[1]]
     text += f'\n[recording]\nkind = "{chosen.kind}"\naxes = {axes}\n'.replace("'", '"')
     chosen.out.mkdir(parents=True, exist_ok=True)

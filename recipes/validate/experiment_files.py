@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
+from torchsoro.sim2real.data.from_design import marker_tables
 from torchsoro.sim2real.data.recording import write_table
 
 
 def setup(text: str, markers: Mapping[str, Sequence[float]], noise: float = 5e-5) -> str:
     """Text of setup.toml with the markers and the standard deviation of motion capture noise [m]."""
-    marker = "\n".join(f'[[marker]]\nname = "{name}"\nat = {list(at)}\n' for name, at in markers.items())
-    return f'{text}\n{marker}\n[recording]\nkind = "mocap"\nnoise = {noise}\n'
+    return f'{text}\n{marker_tables(markers)}\n[recording]\nkind = "mocap"\nnoise = {noise}\n'
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import torch
 
@@ -46,6 +48,12 @@ def believed(
         point = [float(plane.offset) * (a == plane.axis) for a in range(3)]
         friction = '"stick"' if plane.sticks else plane.friction
         tables.append(f"[[plane]]\npoint = {point}\nnormal = {normal}\nfriction = {friction}\n")
+    return "\n".join(tables)
+
+
+def marker_tables(markers: Mapping[str, Sequence[float]]) -> str:
+    """Tables of setup.toml of markers at places of the undeformed body [m], by name."""
+    tables = (f'[[marker]]\nname = "{name}"\nat = {[float(f"{x:.6g}") for x in at]}\n' for name, at in markers.items())
     return "\n".join(tables)
 
 
