@@ -68,26 +68,31 @@ def test_ask_shares_workers_out_to_gpus_and_begins_with_what_takes_longest(judge
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the service of the test is a shell script")
 def test_ask_asks_again_alone_what_a_fault_on_a_shared_gpu_has_ended(judge, tmp_path, monkeypatch):
-    for name in ("case-0", "case-1", "case-2"):
-        (tmp_path / "batch" / "cases" / name).mkdir(parents=True)
+    for name in ("case-0", "case-1", "case-2", "case-3"):
+        (tmp_path / "batch" / "cases" / name / "heldout" / "a").mkdir(parents=True)
+        (tmp_path / "batch" / "cases" / name / "heldout" / "a" / "trial.toml").write_text("")
         (tmp_path / "batch" / "cases" / name / "setup.toml").write_text("")
     tool = tmp_path / "tool.py"
     tool.write_text(
         "import json, os, pathlib, sys\n"
-        "case, out = pathlib.Path(sys.argv[1]).name, pathlib.Path(sys.argv[3])\n"
-        "shared = 'CUDA_MPS_PIPE_DIRECTORY' in os.environ\n"
-        "if case == 'case-1' and shared: sys.exit('CUDA_ERROR_ILLEGAL_ADDRESS')\n"
+        "predicts, shared = sys.argv[1] == '--predict', 'CUDA_MPS_PIPE_DIRECTORY' in os.environ\n"
+        "if predicts: case = pathlib.Path(sys.argv[2]).read_text()\n"
+        "else: case, out = pathlib.Path(sys.argv[1]).name, pathlib.Path(sys.argv[3])\n"
+        "if case == ('case-3' if predicts else 'case-1') and shared: sys.exit('CUDA_ERROR_ILLEGAL_ADDRESS')\n"
+        "if predicts: sys.exit()\n"
         "if case == 'case-2': sys.exit('no such body')\n"
         "out.mkdir()\n"
+        "(out / 'model.toml').write_text(case)\n"
         "found = {'verdict': 'nothing_missing', 'effects': [], 'shared': shared}\n"
         "(out / 'explanation.json').write_text(json.dumps(found))\n"
     )
     calls, answers = _service(judge, tmp_path, monkeypatch), tmp_path / "answers"
     asked = {"answers": answers, "tool": f"{sys.executable} {tool}", "gpus": 1}
     judge.ask.ask(tmp_path / "batch", workers=2, **asked)
-    told = [json.loads((answers / f"case-{k}" / "explanation.json").read_text()) for k in range(3)]
-    assert [found["verdict"] for found in told] == ["nothing_missing", "nothing_missing", "failed"]
-    assert [found.get("shared") for found in told] == [True, False, None]
+    told = [json.loads((answers / f"case-{k}" / "explanation.json").read_text()) for k in range(4)]
+    assert [found["verdict"] for found in told] == [*["nothing_missing"] * 2, "failed", "nothing_missing"]
+    assert [found.get("shared") for found in told] == [True, False, None, False]
+    assert not any("prediction_error" in found for found in told)
     assert calls.read_text().split() == ["start", "quit"]
 
 

@@ -171,6 +171,9 @@ def answer(
                 asked = ["--predict", str(out / "model.toml"), "--trial", str(trial)]
                 asked += ["--out", str(part / "predicted.csv"), *extra]
                 wrong = _call([*tool, *asked], timeout, variables)
+                if "CUDA" in wrong and PIPE in variables:
+                    shutil.rmtree(part)
+                    return found
                 if wrong:
                     found["prediction_error"] = wrong
         (part / "explanation.json").write_text(json.dumps(found, indent=1))
