@@ -378,8 +378,9 @@ def node_pass(block: ti.template(), item, t):
                     f -= load_vector(block.scratch, head[REPULSION] + 3 * b * nodes + i, nodes)
                 if ti.static(block.features & PUSHED_NODES):
                     for g in range(head[PUSHES]):
-                        force = load_vector(block.supply, force_at(block, t, b, head[GROUPS] + g), 1)
-                        f -= fixed[head[NODE_SHARE] + g * nodes + i] * force
+                        share = fixed[head[NODE_SHARE] + g * nodes + i]
+                        if share != 0:  # of hundreds of places, few are near a node
+                            f -= share * load_vector(block.supply, force_at(block, t, b, head[GROUPS] + g), 1)
                 pull = load_vector(block.supply, head[GRAVITY] + (t * head[BATCH] + b) * 3, 1)
                 drag_factor = fixed[head[NODES] + (b * NODAL + NODAL_DRAG_FACTOR) * nodes + i]
                 v += dt * (pull - f / mass)
