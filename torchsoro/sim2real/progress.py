@@ -16,6 +16,7 @@ STAGES = {
     "predicting trials and writing the report": (0.05, 6),
 }
 EVERY = 10.0  # s between two lines of a log
+FIRST = 0.02  # of the time left that has to have passed before it is told: the first batches say little
 MORE = 0.1  # of the batches expected of a stage, that are still expected of one that has had as many
 
 
@@ -61,7 +62,8 @@ class Progress:
         else:
             return None
         later = 1 - self.done - self.share
-        return left + (before + spent + left) * later / (1 - later)
+        left += (before + spent + left) * later / (1 - later)
+        return left if before + spent > FIRST * left else None
 
     def stage(self, name: str) -> None:
         """Begin a stage; the one before has ended."""
