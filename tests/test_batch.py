@@ -12,8 +12,9 @@ from test_experiment import experiment
 from torchsoro.sim2real.data.experiment import read_experiment
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.twin.batch import _Group, simulate, waves
+from torchsoro.sim2real.twin.batch import _at_once, _countable, _Group, simulate, waves
 from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.simulation.kernels.layout import LARGEST
 
 EDGE = 0.008
 EFFECTS = {type(e).__name__: e for e in library()}
@@ -82,6 +83,15 @@ def test_forces_at_a_place_are_one_for_all_trials(trial):
     for place, force in enumerate(forces):
         pulled = [k for k, (i, b) in enumerate(lanes) if i % 5 == 4 and b == place]
         assert len(pulled) == 3 and force.value.any(1).nonzero().squeeze(1).tolist() == pulled
+
+
+def test_batches_of_a_gpu_hold_no_more_than_it_can_index(trial):
+    twin = Twin(trial.setup, edge=EDGE)
+    lanes = [(0, b) for b in range(6)]
+    assert _at_once(lanes, [1.0, 1.0, 2.0, 1.1, 1.2, 1.0], 3) == [[(0, 0), (0, 1), (0, 5)], [(0, 3), (0, 4)], [(0, 2)]]
+    short, long = (_countable(twin, samples, 2) for samples in (2, 10**6))
+    nodes = 27 * len(trial.setup.markers)
+    assert long == LARGEST // (10**6 * 6 * nodes) < short < LARGEST // (2 * 6 * twin.nodes)
 
 
 def test_residuals_of_a_batch_are_those_of_each_motion(tmp_path):
