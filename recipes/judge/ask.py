@@ -133,6 +133,11 @@ def _rank(case: Path) -> int:
     return ("[[plane]]" in setup) + ("[[chamber]]" in setup) + (case / "body.stl").exists()
 
 
+def _faulted(wrong: str, variables: dict[str, str]) -> bool:
+    """Whether a fault on a shared GPU has ended a process, maybe another one's."""
+    return "CUDA" in wrong and PIPE in variables
+
+
 def answer(
     case: Path,
     tool: list[str],
@@ -157,7 +162,7 @@ def answer(
         found: dict[str, Any] = {"verdict": "failed", "error": wrong, "effects": []}
         if not wrong:
             found = _read(out / "explanation.json")
-        elif "CUDA" in wrong and PIPE in variables:
+        elif _faulted(wrong, variables):
             return found
         found["judge_seconds"] = time.perf_counter() - started
         target = answers / case.name
@@ -171,7 +176,7 @@ def answer(
                 asked = ["--predict", str(out / "model.toml"), "--trial", str(trial)]
                 asked += ["--out", str(part / "predicted.csv"), *extra]
                 wrong = _call([*tool, *asked], timeout, variables)
-                if "CUDA" in wrong and PIPE in variables:
+                if _faulted(wrong, variables):
                     shutil.rmtree(part)
                     return found
                 if wrong:

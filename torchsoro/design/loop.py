@@ -400,7 +400,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             for one, more in zip((field.phi, *placing), (price, *prices), strict=True):
                 one.grad = more if one.grad is None else one.grad + more
             worth, excess = worth_of(robot, outcome), float(violation.detach())
-            counts = s.gravity_scale(k) == 1.0 and (ensemble is None or ensemble.grown(k) == 1.0)
+            counts = k >= s.counts_from
             if counts and better(worth, excess, best, lagrangian):
                 best = {"worth": worth, "violation": excess, **design}
             end = time.perf_counter()
@@ -450,9 +450,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             run.save(k, field=field, adam=adam, lagrangian=lagrangian, **kept)
             if stopped or time.perf_counter() > end_at:
                 break
-        # Without a best one the last that was simulated, which the field is a step beyond.
-        if best is not None or good:
-            take_(robot, good[-1] if best is None else best)
+        take_(robot, best or good[-1])  # without a best one the last that was simulated: the field is a step beyond
         none = {"iteration": None, "worth": -math.inf, "violation": math.inf}
         told = {name: (best or none)[name] for name in none}
         return Optimized(gamma=robot.density().detach(), metrics=run.metrics, lately=good, **told)

@@ -189,10 +189,10 @@ class Robot(nn.Module):
             return travel(seen, time, start=s.settle, end=moment, direction=self.direction)
 
         closes = s.sample_every * max(1, round(min(s.duty / s.frequency, s.duration) / s.sample_every))
-        height = trajectory.center_of_gravity[..., 2]
+        height, center = trajectory.center_of_gravity[..., 2], center_of_gravity(body.position, weight)
         stands = height[..., 0]
         if scenarios is not None and scenarios.posed:  # what a body that leans or drops at the start loses is no fall
-            stands = center_of_gravity(body.position, weight)[..., 2].expand(stands.shape)
+            stands = center[..., 2].expand(stands.shape)
         return Outcome(
             travel=until(end),
             feet=self.feet(trajectory, gamma, near=False),
@@ -203,7 +203,7 @@ class Robot(nn.Module):
             intermediate=intermediate_density(gamma, self.design) if member is None else member.intermediate(gamma),
             mass=total_mass(solid),
             fall=torch.relu(stands - self.clearance(gamma) - height.amin(-1) - s.sink * s.size[2]),
-            center=center_of_gravity(body.position, weight),
+            center=center,
             trajectory=trajectory,
             dt=trajectory.dt,
         )

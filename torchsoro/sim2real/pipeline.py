@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -23,6 +22,7 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.force_map import force_map
 from torchsoro.sim2real.inference.heldout import at_clocks_of
 from torchsoro.sim2real.inference.isolability import isolability
+from torchsoro.sim2real.inference.likelihood import silent
 from torchsoro.sim2real.inference.model import predict_trial, read_model, write_model
 from torchsoro.sim2real.inference.next_experiment import next_experiment
 from torchsoro.sim2real.inference.phases import mismatches
@@ -89,12 +89,17 @@ def correct(inputs: Inputs, progress: Progress | None = None) -> FitProblem:
     Raises:
         ValueError: if the body as it is believed does not bear what acts on it.
     """
-    told: dict[str, Any] = {} if progress is None else {"report": progress.tick}
-    error = measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, **told)
-    if progress is not None:
-        told["watch"] = progress.watch
-    known = {"discretization": error, "fine": inputs.fine, "threads": inputs.threads}
-    return FitProblem(inputs.experiment, inputs.twin, trials=inputs.trials, **known, **told)
+    report, watch = (silent, silent) if progress is None else (progress.tick, progress.watch)
+    return FitProblem(
+        inputs.experiment,
+        inputs.twin,
+        trials=inputs.trials,
+        discretization=measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, report=report),
+        fine=inputs.fine,
+        threads=inputs.threads,
+        report=report,
+        watch=watch,
+    )
 
 
 @threadpool_limits.wrap(limits=1)  # products of small matrices: threads would wait for each other, and round otherwise

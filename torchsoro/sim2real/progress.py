@@ -94,7 +94,8 @@ class Progress:
             self.bar.close()
 
     def _show(self, now: bool = False) -> None:
-        fraction, left = self.fraction, "" if self.left is None else f"about {span(self.left)} left"
+        fraction, seconds = self.fraction, self.left
+        left = "" if seconds is None else f"about {span(seconds)} left"
         if self.bar is not None:
             self.bar.n = fraction
             self.bar.set_description_str(self.name, refresh=False)

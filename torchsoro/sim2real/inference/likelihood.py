@@ -37,11 +37,7 @@ WITHIN = 0.3  # slope of the prior residual within its tolerance, where values a
 BREAKS = "setup: its simulation breaks down, wanted a body that withstands its loads"
 
 
-def _unwatched(size: float, share: float) -> None:
-    """Show nothing."""
-
-
-def _silent(line: str) -> None:
+def silent(*_told: object) -> None:
     """Report nothing."""
 
 
@@ -111,8 +107,8 @@ class Likelihood:
     fine: Twin | None = None
     threads: int = THREADS
     even: bool = False
-    report: Callable[[str], None] = _silent
-    watch: Callable[[float, float], None] = _unwatched
+    report: Callable[[str], None] = silent
+    watch: Callable[[float, float], None] = silent
     tally: Tally = field(default_factory=Tally)
 
     def __post_init__(self) -> None:

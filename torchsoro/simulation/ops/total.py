@@ -110,13 +110,9 @@ class TotalSegmentIntegrator:
         self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors, repulsion)
         self.kept = Arena.zeros("kept", like, (0,), (0,), (0,))
 
-    def _started(self) -> Tensor:
-        """Which forces act in each substep [steps, 1, forces, 1]; all of those with a row for each."""
-        starts = self.scene.force_start
-        if starts is None:
-            return torch.ones(self.steps, 1, self.scene.forces, 1, dtype=torch.bool)
-        step = self.first + torch.arange(self.steps)
-        return (step[:, None] >= torch.tensor(starts)).view(self.steps, 1, -1, 1)
+    def _started(self, steps: Tensor) -> Tensor:
+        """Which of the forces that last once they act do so in these substeps of the segment [n, 1, forces, 1]."""
+        return (self.first + steps[:, None] >= torch.tensor(self.scene.force_start)).view(len(steps), 1, -1, 1)
 
     def _forces(self) -> tuple[Tensor, Tensor]:
         """Forces [rows, B, forces, 3], and the row of each substep [steps]: few, where they last once they act."""
@@ -124,7 +120,7 @@ class TotalSegmentIntegrator:
         if starts is None or not self.scene.forces:
             return force, steps
         begins = torch.tensor(sorted({0, *(s - self.first for s in starts if 0 < s - self.first < self.steps)}))
-        return force * self._started()[begins].to(force), torch.bucketize(steps, begins, right=True, out_int32=True) - 1
+        return force * self._started(begins).to(force), torch.bucketize(steps, begins, right=True, out_int32=True) - 1
 
     def forward(self, start: Tensor, *, keep: bool, observe: ObserveMany) -> Tensor:
         """Advance the state [B, L] over the segment; as ``SegmentIntegrator.forward``."""
@@ -240,7 +236,7 @@ class TotalSegmentIntegrator:
         found |= {name: pairwise_sum(found[name].movedim(1, -1)) for name in ("gravity", "force")}
         found["pressure"] = found["pressure"].clone()
         if self.scene.force_start is not None:
-            found["force"] = (found["force"] * self._started().to(bar)).sum(0, keepdim=True)
+            found["force"] = (found["force"] * self._started(torch.arange(steps)).to(bar)).sum(0, keepdim=True)
         if self.scene.immersed:
             assert self.lattice.faces is not None
             found["fluid"] = torch.einsum("bcn,nc->b", quadratic_bar, self.lattice.faces.front.to(bar)) / 2
