@@ -82,9 +82,9 @@ def read_inputs(options: Options) -> Inputs:
     _check_noise(experiment, recordings)
     with named_in(experiment.folder, hints):
         twin = _twin(options, experiment)
-        twin = dataclasses.replace(twin, device=chosen(options.device, cost(twin, len(trials))))
-    supplies = [t.pressure.pressure for t in trials if t.pressure is not None]
-    twin = dataclasses.replace(twin, highest=max((float(p.abs().max()) for p in supplies), default=0.0))
+        supplies = [t.pressure.pressure for t in trials if t.pressure is not None]
+        highest = max((float(p.abs().max()) for p in supplies), default=0.0)
+        twin = dataclasses.replace(twin, device=chosen(options.device, cost(twin, len(trials))), highest=highest)
     scenarios = {}
     for room, group in (("trials", trials), ("heldout", experiment.heldout)):
         for trial in group:
