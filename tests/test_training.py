@@ -135,6 +135,20 @@ def test_sigterm_ends_the_run_like_ctrl_c(tmp_path, capsys):
     assert RunFolder(tmp_path / "run", SETTINGS, resume=True).start == 3
 
 
+def test_a_run_whose_partner_is_lost_says_where_it_stands_though_torchrun_ends_it(tmp_path, capsys, monkeypatch):
+    close = RunFolder.close
+
+    def ended_meanwhile(run: RunFolder) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        close(run)
+
+    with pytest.raises(ConnectionError), RunFolder(tmp_path / "run", SETTINGS) as run:
+        run.save(0)
+        monkeypatch.setattr(RunFolder, "close", ended_meanwhile)
+        raise ConnectionError("lost")
+    assert "1 iterations are saved" in capsys.readouterr().err
+
+
 class Kind(enum.Enum):
     DESK = "desk"
 

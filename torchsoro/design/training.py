@@ -319,10 +319,17 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Close the events, restore the signal handler, and say where an interrupted run stands."""
+        """Close the events, say where an interrupted run stands, and restore the signal handler."""
         if self._old_handler is not None:
-            signal.signal(signal.SIGTERM, self._old_handler)
-            self._old_handler = None
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)  # torchrun sends it to a process that ends by itself, too
+        try:
+            self._end(kind)
+        finally:
+            if self._old_handler is not None:
+                signal.signal(signal.SIGTERM, self._old_handler)
+                self._old_handler = None
+
+    def _end(self, kind: type[BaseException] | None) -> None:
         self.close()
         if kind is not None and issubclass(kind, ValueError) and self._saved < self.start:
             self._take_back()
@@ -331,7 +338,7 @@ class RunFolder:
             if self._new:
                 with contextlib.suppress(OSError):  # something else lies there
                     self.path.rmdir()
-        if kind is not None and issubclass(kind, KeyboardInterrupt):
+        if kind is not None and issubclass(kind, (KeyboardInterrupt, ConnectionError)):
             kept = f"{self._saved + 1} iterations are saved in {self.path}; resume to continue"
             print(f"interrupted: {kept if self._saved >= 0 else 'no iteration was complete'}", file=sys.stderr)
 
