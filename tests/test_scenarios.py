@@ -10,6 +10,8 @@ import pytest
 import torch
 from tiny import TINY
 
+from torchsoro import Chamber, Domain
+from torchsoro.design.chambers import sockets
 from torchsoro.design.reading import from_command_line
 from torchsoro.design.risk import CVaR
 from torchsoro.design.robot import Outcome, Robot, build, climber, walker
@@ -234,14 +236,27 @@ def test_a_pose_is_a_rigid_motion_that_leaves_no_corner_below_the_floor():
 def test_a_tube_pulls_down_at_the_rear_and_a_dropped_robot_falls(robot):
     plain = run(robot, everything=True).trajectory
     found = run(robot, batch(tube_mass=[0.0, 0.02], drop=[0.0, 0.001]), everything=True).trajectory
-    assert robot.domain.positions[robot.socket, 0].unique().tolist() == [
+    assert robot.domain.positions[robot.socket[0], 0].unique().tolist() == [
         robot.domain.positions[robot.domain.wall, 0].min()
     ]
     start = found.position[:, 0] - plain.position[0]
     torch.testing.assert_close(start[1], torch.tensor([0.0, 0.0, 1e-3]).expand_as(start[1]), rtol=0, atol=1e-8)
     hung = run(robot, batch(tube_mass=[0.02]), everything=True).trajectory
-    lower = (hung.position[0, 10] - plain.position[10])[robot.socket, 2]
+    lower = (hung.position[0, 10] - plain.position[10])[robot.socket[0], 2]
     assert (lower < -1e-5).all()
+
+
+def test_tubes_hang_in_equal_parts_on_chambers_of_different_size():
+    sizes = ((0.012, 0.012, 0.012), (0.012, 0.018, 0.018))
+    chambers = tuple(
+        Chamber(name=name, center=(x, 0.009, 0.009), size=size, wall=0.003)
+        for name, x, size in zip(("small", "large"), (0.006, 0.018), sizes, strict=True)
+    )
+    domain = Domain(size=(0.024, 0.018, 0.018), particles=(16, 12, 12), chambers=chambers)
+    particles, share = sockets(domain, (0.0, 0.0, 1.0))
+    parts = [share[domain.shell(k)[particles]] for k in range(2)]
+    assert len(parts[1]) > len(parts[0]) > 0
+    assert [float(part.sum()) for part in parts] == pytest.approx([0.5, 0.5])
 
 
 def test_gradients_by_every_quantity_and_through_the_risk_are_central_differences():

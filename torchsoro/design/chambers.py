@@ -144,14 +144,20 @@ def port_of(s: Settings, chambers: tuple[Chamber, ...], travel: tuple[float, flo
     return AirPort(direction=direction, diameter=s.port or 0.4 * cavity)
 
 
-def sockets(domain: Domain, direction: tuple[float, float, float]) -> Tensor:
-    """Particles of each chamber wall's outermost layer in the direction of the air port, where tubes hang [n]."""
+def sockets(domain: Domain, direction: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    """Particles of each chamber wall's outermost layer in the direction of the air port, where tubes hang.
+
+    Returns:
+        Their numbers [n], and the share of the tubes that hangs on each [n]: as much on every chamber.
+    """
     along = domain.positions @ domain.positions.new_tensor(direction)
-    found = torch.zeros_like(domain.wall)
+    shares = torch.zeros_like(along)
     for index in range(len(domain.chambers)):
         shell = domain.shell(index)
-        found |= shell & (along > along[shell].max() - 0.5 * domain.spacing)
-    return found.nonzero().squeeze(1)
+        outermost = shell & (along > along[shell].max() - 0.5 * domain.spacing)
+        shares += outermost / (outermost.sum() * len(domain.chambers))
+    found = shares.nonzero().squeeze(1)
+    return found, shares[found]
 
 
 def _triple(values: tuple[float, ...]) -> tuple[float, float, float]:

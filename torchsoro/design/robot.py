@@ -237,9 +237,10 @@ class Robot(nn.Module):
         return self.domain if self.placement is None else replace(self.domain, chambers=self.placement.rounded())
 
     @property
-    def socket(self) -> Tensor:
-        """Particles of the chambers' walls from which their tubes hang [n], whose places are rounded if designed."""
-        return sockets(self.rounded_domain, self.port.direction).to(self.settings.target)
+    def socket(self) -> tuple[Tensor, Tensor]:
+        """Particles of the chambers' walls from which tubes hang, rounded if designed, and the share of each [n]."""
+        particles, share = sockets(self.rounded_domain, self.port.direction)
+        return particles.to(self.settings.target), share.to(self.settings.target)
 
     def membership(self, like: Tensor) -> Membership | None:
         """What chambers that are designed make of each particle, in the type of a tensor; None if they are given."""
@@ -352,7 +353,8 @@ class Robot(nn.Module):
         gravity = tuple(gravity_scale * g for g in self.gravity)
         met: dict[str, Any] = {"body": body, "pressure": pressure, "gravity": gravity, "planes": self.planes}
         if scenarios is not None:
-            met |= self.varied(body, scenarios, number[self.socket], pressure, gravity_scale)
+            particles, share = self.socket
+            met |= self.varied(body, scenarios, (number[particles], share), pressure, gravity_scale)
         for halving in range(1 if dt else s.halvings + 1):
             try:
                 trajectory = self.simulator(2**halving, dt)(
@@ -373,14 +375,19 @@ class Robot(nn.Module):
         raise AssertionError
 
     def varied(
-        self, body: Body, scenarios: ScenarioBatch, socket: Tensor, pressure: Waveform, gravity_scale: float = 1.0
+        self,
+        body: Body,
+        scenarios: ScenarioBatch,
+        socket: tuple[Tensor, Tensor],
+        pressure: Waveform,
+        gravity_scale: float = 1.0,
     ) -> dict[str, Any]:
         """What differs by scenario, as arguments of the simulator; what is not given stays as it is.
 
         Args:
             body: Without scenarios.
             scenarios: [S].
-            socket: Particles of the body from which the tube hangs [n].
+            socket: Particles of the body from which tubes hang, and the share of each [n].
             pressure: Of the supply.
             gravity_scale: Share of gravity.
         """
@@ -392,7 +399,7 @@ class Robot(nn.Module):
             one = {"friction": b.friction, "static_friction": None}  # a scenario has a single coefficient
             found["planes"] = tuple(replace(plane, **one) for plane in self.planes)
         if b.tube_mass is not None:
-            found["loads"] = (PointMass(particles=socket, mass=b.tube_mass),)
+            found["loads"] = (PointMass(particles=socket[0], mass=b.tube_mass, share=socket[1]),)
         if b.posed:
             nodes = Lattice.around(body.position, self.domain.cell).node_places
             moved = posed(nodes, s.size, b).to(body.position)
