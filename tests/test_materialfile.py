@@ -34,6 +34,15 @@ def test_a_solid_without_elements_is_elastic(tmp_path):
     assert read_material(tmp_path / "elastic.toml").prony.elements == 0
 
 
+def test_a_solid_that_stiffens_comes_back(tmp_path):
+    yeoh = dataclasses.replace(RUBBER.solid, linear_stiffening=0.2, quadratic_stiffening=0.1)
+    path = write_material(tmp_path / "material.toml", dataclasses.replace(RUBBER, solid=yeoh))
+    assert read_material(path).solid == yeoh
+    path.write_text(path.read_text().replace("quadratic_stiffening = 0.1\n", ""))
+    with pytest.raises(ValueError, match=r"\[solid\] has .*linear_stiffening.*, wanted .*quadratic_stiffening"):
+        read_material(path)
+
+
 def test_a_robot_is_made_of_it(tmp_path):
     path = write_material(tmp_path / "material.toml", RUBBER)
     robot = walker(dataclasses.replace(TINY, material=path, dt="auto"))

@@ -343,6 +343,29 @@ def test_particles_beside_the_places_of_the_lattice_are_refused():
 
 
 @pytest.mark.parametrize(
+    ("settings", "what"),
+    [
+        ({"loads": [Clamp((-1.0,) * 3, (0.001, 1.0, 1.0))]}, "a Clamp"),
+        ({"loads": [Spring(particles=torch.arange(64), stiffness=5.0, mean=True)]}, "a Spring of nodes"),
+        ({"start": Start(displacement=torch.zeros(64, 3), velocity=torch.zeros(64, 3))}, "a Start of nodes"),
+    ],
+)
+def test_bodies_beside_their_lattice_are_refused_where_nodes_have_places_of_their_own(settings, what):
+    body = block()[1]
+    apart = torch.stack([body.position, body.position + vector(5e-3, 0.0, 0.0)])
+    with pytest.raises(ValueError, match=f"body.position: 5 mm beside the lattice, wanted on it where there is {what}"):
+        simulator(formulation="total")(replace(body, position=apart), duration=10 * DT, **settings)
+
+
+def test_a_box_that_ends_on_nodes_holds_them_in_either_precision():
+    for dtype in (torch.float64, torch.float32):
+        x = (block(origin=(0.0, 0.0, 0.3))[1].position).to(dtype)
+        lattice = Lattice.around(x, 2 * H)
+        top = 0.3 + 3 * H  # where the third layer of nodes lies, the first half a cell below the body
+        assert int(lattice.inside((-1.0, -1.0, 0.0), (1.0, 1.0, top)).sum()) == 3 * lattice.shape[0] * lattice.shape[1]
+
+
+@pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({"loads": [Clamp((0.0,) * 3, (1.0,) * 3)]}, "loads: Clamp on nodes or means"),

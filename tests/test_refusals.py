@@ -9,7 +9,7 @@ import pytest
 import torch
 from problems import DT, H, block, constant, simulator, vector, ways
 
-from torchsoro import DesignField, Gas, Prony, Simulator, Solid, ground, stable_step, stride, travel
+from torchsoro import DesignField, Force, Gas, Prony, Simulator, Solid, ground, stable_step, stride, travel
 
 FREE = (0.0, 0.0, 0.0)
 
@@ -41,6 +41,11 @@ def changed(name, make):
     return replace(body, **{name: make(body.mass if value is None else value)})
 
 
+def numbered(*chambers):
+    """Makes chambers of these numbers, of a particle each."""
+    return lambda x: torch.cat([torch.tensor(chambers, dtype=x.dtype), x[len(chambers) :]])
+
+
 @pytest.mark.parametrize(
     ("body", "message"),
     [
@@ -63,6 +68,8 @@ def changed(name, make):
         (lambda: changed("velocity", lambda x: x), r"body\.velocity: shape \(64,\), wanted \[\.\.\., 64, 3\]"),
         (lambda: changed("velocity", lambda x: torch.full((64, 3), math.inf).double()), r"body\.velocity: value inf"),
         (lambda: changed("chamber", lambda x: x[:5]), r"body\.chamber: shape \(5,\), wanted \[64\]"),
+        (lambda: changed("chamber", lambda x: x - 1), r"body\.chamber: numbers \[-2\], wanted -1 for a solid, and"),
+        (lambda: changed("chamber", numbered(0, 2)), r"body\.chamber: numbers \[-1, 0, 2\], wanted .* 0 to one less"),
     ],
 )
 def test_bad_bodies_are_refused(body, message):
@@ -81,7 +88,12 @@ def test_bad_bodies_are_refused(body, message):
         ({"sample_every": -DT}, r"sample_every = -5e-05: wanted finite and positive"),
         ({"gravity": (0.0, -9.81)}, r"gravity: shape \(2,\), wanted \[\.\.\., 3\]"),
         ({"gravity": (0.0, 0.0, math.nan)}, r"gravity = .*: wanted finite"),
-        ({"gravity": (vector(0.0, 1.0), torch.zeros(2, 2))}, r"gravity: shape \(2, 2\), wanted \[\.\.\., S, 3\]"),
+        (
+            {"gravity": (vector(0.0, 1.0), torch.zeros(2, 2))},
+            r"gravity: .* of \(2, 2\), wanted \[S\] and \[\.\.\., S, 3\]",
+        ),
+        ({"gravity": (vector(0.0, 0.0), torch.zeros(2, 3))}, r"gravity: time: .* strictly increasing"),
+        ({"loads": [Force(particles=torch.arange(3), value=torch.zeros(4, 3), time=vector(0.0, 1.0))]}, "Force: times"),
         ({"pressure": constant(1.0)}, r"pressure: 1 chambers, wanted the body's 0"),
         ({"probes": torch.tensor([0.5])}, r"probes: places of shape \(1,\), wanted finite places \[P, 3\] m"),
         ({"probes": torch.tensor([[1]])}, r"probes: torch\.int64 of shape \(1, 1\), wanted int64 \[P\]"),
@@ -96,6 +108,11 @@ def test_bad_arguments_are_refused(arguments, message):
     _, body = block()
     with pytest.raises(ValueError, match="^" + message):
         simulator()(body, **{"duration": 10 * DT, **arguments})
+
+
+def test_an_automatic_step_needs_whole_samples():
+    with pytest.raises(ValueError, match=r"duration = 0\.01 s: wanted a whole number of samples of 0\.003 s"):
+        simulator(dt="auto")(block()[1], duration=0.01, sample_every=0.003)
 
 
 @pytest.mark.parametrize(

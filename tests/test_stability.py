@@ -47,6 +47,20 @@ def test_auto_step_is_stable_with_drag_of_any_size(way, coefficient):
     assert speed(way, loads, "auto") < GROWTH
 
 
+@ways("apic", "flip", "total")
+@pytest.mark.parametrize("viscosity", [1.0, 20.0, 50.0, 1e3])  # Pa s
+def test_auto_step_is_stable_with_volume_viscosity_of_any_size(way, viscosity, monkeypatch):
+    thick = replace(moving(), volume_viscosity=torch.full((64,), viscosity, dtype=torch.float64))
+    monkeypatch.setitem(globals(), "moving", lambda: thick)
+    assert speed(way, (), "auto") < GROWTH
+
+
+def test_volume_viscosity_limits_the_step_of_the_updated_form():
+    thick = replace(moving(), volume_viscosity=torch.full((64,), 1e3, dtype=torch.float64))
+    limit = stable_step(thick, None, cell=CELL)
+    assert courant(thick, None, dt=limit, cell=CELL).term == "volume viscosity"
+
+
 @ways("apic", "total")
 def test_limit_of_equal_stiff_springs_is_that_of_the_rigid_body_on_them(way):
     body = moving()

@@ -129,7 +129,8 @@ class Case:
     @property
     def times(self) -> tuple[float, float]:
         """At rest, and in all [s]."""
-        return self.steps // 3 * self.substep, self.steps * self.substep
+        rest = self.steps // 3 * self.substep
+        return rest, 3 * rest if self.auto else self.steps * self.substep
 
     @property
     def taken(self) -> float:

@@ -121,7 +121,7 @@ class Settings:
     air_stiffness: AtLeastZero = 0.14e6
     """Air spring of the chamber [Pa]; 0 for a regulated supply."""
     air_viscosity: AtLeastZero = 1.83e-5
-    """Shear viscosity of the air [Pa s]."""
+    """Shear viscosity of the air in the updated formulation [Pa s]; the total one has none."""
     air_density: Positive | Literal["auto"] = "auto"
     """Density of the air [kg/m3]; auto: 3, but in the updated formulation the paper's 100, artificially high."""
 

@@ -51,7 +51,7 @@ def largest_step(
     formulation: FormulationName,
     viscosity: float = 0.0,
 ) -> float:
-    """Largest stable step [s], by bisection in log time; as ``torchsoro.simulation.material.stable_step``."""
+    """Largest stable step [s], by bisection in log time; as ``torchsoro.simulation.stability.stable_step``."""
     low, high = math.log(1e-15), 0.0
     while high - low > 1e-5:
         dt = math.exp((low + high) / 2)

@@ -16,7 +16,7 @@ from torchsoro.simulation.attachment import load_tensors
 from torchsoro.simulation.checkpoints import MEMORY
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.kernels import layout
-from torchsoro.simulation.loads import Attached
+from torchsoro.simulation.loads import Attached, vectors_at
 from torchsoro.simulation.material import Body
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.scene import Inputs, Scene
@@ -175,12 +175,7 @@ def supply_at(body: Body, hollow: int, pressure: Waveform | None, times: Tensor)
 def gravity_at(gravity, times: Tensor) -> Tensor:
     """Gravity at each substep [..., T, 3]."""
     if isinstance(gravity, tuple) and len(gravity) == 2 and all(isinstance(g, Tensor) for g in gravity):
-        wave = Waveform(time=gravity[0], pressure=gravity[1].transpose(-1, -2))
-        if gravity[1].shape[-1] != 3:
-            raise ValueError(
-                f"gravity: shape {tuple(gravity[1].shape)}, wanted [..., S, 3] over {len(gravity[0])} times"
-            )
-        values = wave.at(times.to(gravity[0])).transpose(-1, -2)
+        values = vectors_at("gravity", *gravity, times)
     else:
         constant = gravity if isinstance(gravity, Tensor) else torch.as_tensor(gravity, dtype=times.dtype)
         if constant.shape[-1:] != (3,):
@@ -203,6 +198,13 @@ def check_body(body: Body) -> None:
     count = x.shape[-2]
     if body.chamber.shape != (count,):
         raise ValueError(f"body.chamber: shape {tuple(body.chamber.shape)}, wanted [{count}]")
+    numbers = torch.unique(body.chamber)
+    given = numbers[numbers >= 0]
+    if int(numbers[0]) < -1 or len(given) <= int(numbers[-1]):
+        raise ValueError(
+            f"body.chamber: numbers {numbers.tolist()}, wanted -1 for a solid, and of chambers 0 to one less "
+            "than their count"
+        )
     for name in (
         "position",
         "velocity",

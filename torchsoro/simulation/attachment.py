@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import (
     Attached,
     Clamp,
@@ -21,6 +22,8 @@ from torchsoro.simulation.loads import (
 )
 from torchsoro.simulation.ops.lattice import Lattice
 from torchsoro.simulation.ops.scene import Inputs, Scene
+
+_BESIDE = 1e-3  # of a cell, by which a body may lie off its lattice: rounding of its places
 
 
 def load_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
@@ -116,6 +119,30 @@ def on_nodes(
     if bool(held.any()):
         scene = replace(scene, held=held)
     return scene, replace(inputs, **changes)
+
+
+def refuse_shifted(scene: Scene, x: Tensor, *, started: bool) -> None:
+    """Refuse bodies beside their lattice where nodes have places of their own: a clamp, a spring of nodes, a start.
+
+    Args:
+        scene: On its lattice.
+        x: Of the points [B, points, 3] m.
+        started: Whether displacements of nodes are given.
+
+    Raises:
+        ValueError: for a simulation whose body lies elsewhere.
+    """
+    lattice = scene.lattice
+    if lattice is None or not (started or scene.held is not None or scene.tie_share is not None):
+        return
+    present = scene.kind != layout.ABSENT
+    off = (x.detach() - lattice.on("places", x))[:, present].mean(1).abs().amax(1)
+    if bool((off > _BESIDE * scene.cell).any()):
+        what = "a Start of nodes" if started else "a Clamp" if scene.held is not None else "a Spring of nodes"
+        raise ValueError(
+            f"body.position: {1e3 * float(off.max()):.3g} mm beside the lattice, wanted on it where there is {what}; "
+            "by default the lattice is that of the first simulation"
+        )
 
 
 def held_still(scene: Scene, state: Tensor, *, continued: bool) -> Tensor:

@@ -54,7 +54,7 @@ class Force:
             found = self.value.unsqueeze(-2).expand(*self.value.shape[:-1], len(t), 3)
             begin = self.start if dt is None else (self.first(dt) - 0.5) * dt
             return found * (t >= begin).to(found)[:, None]
-        return Waveform(time=self.time, pressure=self.value.transpose(-1, -2)).at(t.to(self.time)).transpose(-1, -2)
+        return vectors_at("Force", self.time, self.value, t)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -256,6 +256,23 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
 def _elsewhere(load: Load) -> bool:
     """Whether a load is not on particles, each by itself."""
     return isinstance(load, QuadraticDrag | Clamp) or load.particles is None or (isinstance(load, Spring) and load.mean)
+
+
+def vectors_at(name: str, time: Tensor, value: Tensor, t: Tensor) -> Tensor:
+    """Vectors [..., S, 3] at times [S] s, interpolated linearly at others [T] s: [..., T, 3].
+
+    Raises:
+        ValueError: for shapes or times that a :class:`Waveform` does not take; it begins with the name.
+    """
+    if time.ndim != 1 or value.shape[-2:] != (len(time), 3):
+        raise ValueError(
+            f"{name}: times of shape {tuple(time.shape)} and values of {tuple(value.shape)}, wanted [S] and [..., S, 3]"
+        )
+    try:
+        wave = Waveform(time=time, pressure=value.transpose(-1, -2))
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}".replace("pressure: ", "value: ")) from error
+    return wave.at(t.to(time)).transpose(-1, -2)
 
 
 def _check_group(load: Force | PointMass | Spring | Drag) -> None:

@@ -79,8 +79,8 @@ class Gas:
 
     Attributes:
         stiffness: k [Pa]; 0 for a regulated supply, 0.14 MPa for sealed air.
-        viscosity: Shear viscosity mu_v [Pa s].
-        volume_viscosity: zeta [Pa s].
+        viscosity: Shear viscosity mu_v [Pa s], in the updated form; the total-Lagrangian one has none of a gas.
+        volume_viscosity: zeta [Pa s], likewise.
         density: [kg/m3]; artificially high, as the updated form's stable step falls with its square root. The
             total-Lagrangian form stands ``formulation.AIR``, which is next to nothing.
         shear: Fictitious shear modulus of the chamber's points in the total-Lagrangian form [Pa], which keeps them
@@ -187,7 +187,7 @@ class Body:
         shear: mu of a solid, of a gas its fictitious one (see :class:`Gas`) [..., N] Pa.
         chamber: int32 [N], -1 for solid, else the gas chamber's number.
         velocity: [..., N, 3] m/s; at rest if None.
-        viscosity: [..., N] Pa s; 0 if None. Solids may have one too.
+        viscosity: [..., N] Pa s; 0 if None. Solids may have one too; that of a gas counts in the updated form only.
         volume_viscosity: [..., N] Pa s; 0 if None.
         void_fraction: Share of a solid's stress that comes from the law of void, which bears being turned inside out
             [..., N], 0 to 1; 0 if None. See :func:`fill`. At exactly 0 its gradient is the one-sided derivative. At

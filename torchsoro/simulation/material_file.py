@@ -14,6 +14,7 @@ from torchsoro.simulation.material import Prony, Solid
 from torchsoro.storage import atomic_write
 
 _SOLID = {"youngs_modulus_Pa": "youngs_modulus", "poisson_ratio": "poisson_ratio", "density_kg_per_m3": "density"}
+_STIFFENING = ("linear_stiffening", "quadratic_stiffening")  # not in a file of a neo-Hookean solid
 _MAXWELL = ("modulus_over_equilibrium", "time_s")
 
 
@@ -44,6 +45,9 @@ def write_material(path: Path, material: Material) -> Path:
     lines = ["# A material for torchsoro. Moduli of the Maxwell elements are relative to the equilibrium modulus.", ""]
     lines.append(f"left_out = {_quoted(material.left_out)}")
     lines += ["", "[solid]", *(f"{key} = {float(getattr(material.solid, name))!r}" for key, name in _SOLID.items())]
+    stiffening = {name: float(getattr(material.solid, name)) for name in _STIFFENING}
+    if any(stiffening.values()):
+        lines += [f"{name} = {value!r}" for name, value in stiffening.items()]
     order = material.prony.times.detach().argsort(descending=True)
     for modulus, time in zip(
         material.prony.moduli.detach()[order].tolist(), material.prony.times.detach()[order].tolist(), strict=True
@@ -68,15 +72,17 @@ def read_material(path: Path) -> Material:
     unknown = set(found) - {"left_out", "solid", "maxwell", "source"}
     if unknown:
         raise ValueError(f"path: {path} has {', '.join(sorted(unknown))}, wanted left_out, solid, maxwell and source")
-    solid = _numbers(found.get("solid", {}), tuple(_SOLID), f"{path}: [solid]")
+    table = found.get("solid", {})
+    stiffens = isinstance(table, dict) and any(name in table for name in _STIFFENING)
+    solid = _numbers(table, (*_SOLID, *(_STIFFENING if stiffens else ())), f"{path}: [solid]")
     elements = [
         _numbers(element, _MAXWELL, f"{path}: [[maxwell]] number {number}")
         for number, element in enumerate(found.get("maxwell", []), start=1)
     ]
-    table = torch.tensor([[e[name] for name in _MAXWELL] for e in elements], dtype=torch.float64).reshape(-1, 2)
+    maxwell = torch.tensor([[e[name] for name in _MAXWELL] for e in elements], dtype=torch.float64).reshape(-1, 2)
     return Material(
-        solid=Solid(**{name: solid[key] for key, name in _SOLID.items()}),
-        prony=Prony(moduli=table[:, 0].clone(), times=table[:, 1].clone()),
+        solid=Solid(**{_SOLID.get(key, key): value for key, value in solid.items()}),
+        prony=Prony(moduli=maxwell[:, 0].clone(), times=maxwell[:, 1].clone()),
         left_out=str(found.get("left_out", "")),
         source={key: str(value) for key, value in found.get("source", {}).items()},
     )

@@ -21,7 +21,7 @@ from torchsoro.simulation.assembly import (
     gravity_at,
     supply_at,
 )
-from torchsoro.simulation.attachment import held_still, on_nodes
+from torchsoro.simulation.attachment import held_still, on_nodes, refuse_shifted
 from torchsoro.simulation.checkpoints import MEMORY, plan_checkpoints
 from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.formulation import Formulation, FormulationName, check_self_contact, formulation_of
@@ -144,15 +144,20 @@ class Simulator(nn.Module):
             gravity: [..., 3] m/s2; or a pair of times [S] and values [..., S, 3], interpolated linearly.
             planes: Ground and walls.
             loads: Forces, point masses, springs, drag and clamps.
-            sample_every: Time between two samples [s], a whole number of substeps; about a hundred samples if None.
+            sample_every: Time between two samples [s], a whole number of substeps, of which the duration is a multiple
+                where dt is "auto"; about a hundred samples if None.
             probes: Particles to record, int64 [P]; or places of the undeformed body, floating point [P, 3] m, which
                 move with the nearest place of it (total formulation only); none if None.
-            weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None.
+            weight: Particle weights of the recorded centre of gravity [..., N]; the mass if None. In the total
+                formulation a particle's weight lies where its mass does, at a point of quadrature, which is 0.08 of a
+                spacing away along each axis.
             start: Trajectory to go on from, in state and time: pressure, gravity, forces and samples continue at its
                 last time. Or a state alone (``Trajectory.final``), or a ``Start`` of the nodes, with which time begins
                 at zero. The undeformed body at time zero if None.
             divergence: Whether a simulation that diverges raises, or is marked (``Trajectory.sound``) while the others
-                of the batch go on as they would without it; of the total-Lagrangian form, without a gradient.
+                of the batch go on as they would without it; of the total-Lagrangian form, without a gradient. Only
+                what is recorded marks it, so that gas particles which collapse inside of a chamber, for which a run
+                that raises ends, do not.
             record: "probes" leaves out centre of gravity, chamber volumes and pressures, which then have no numbers
                 [..., S, 0]; with places as probes and simulations that are marked only.
             progress: Called between stretches of the simulation, up to a hundred without a gradient, with the substeps
@@ -215,6 +220,7 @@ class Simulator(nn.Module):
         scene, whole, x, velocity, weights = self.formulation.place(scene, whole, x, velocity, weights)
         if scene.lattice is not None:
             scene, whole = on_nodes(scene, whole, attached, wide)
+            refuse_shifted(scene, x, started=isinstance(start, Start))
         if where.is_floating_point():
             if scene.lattice is None:
                 raise ValueError("probes: places, wanted particles in the updated formulation")
@@ -390,6 +396,7 @@ class Simulator(nn.Module):
         if self.dt == "auto":
             limit = self.safety * stable_step(body, prony, cell=self.cell, formulation=self.formulation, loads=loads)
             each = duration / 100 if sample_every is None else sample_every
+            _whole("duration", duration, each, "samples")
             return each / math.ceil(each / limit)
         found = courant(body, prony, dt=self.dt, cell=self.cell, formulation=self.formulation, loads=loads)
         most = self.formulation.limit or STABLE_COURANT
@@ -422,13 +429,13 @@ def _steps(duration: float, sample_every: float | None, dt: float) -> tuple[int,
     return steps, max(1, steps // 100) if sample_every is None else _whole("sample_every", sample_every, dt)
 
 
-def _whole(name: str, value: float, dt: float) -> int:
-    """A time as a number of substeps."""
+def _whole(name: str, value: float, dt: float, parts: str = "substeps") -> int:
+    """A time as a number of substeps, or of other parts."""
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{name} = {value}: wanted finite and positive")
     steps = round(value / dt)
     if steps < 1 or abs(steps * dt - value) > 1e-6 * value:
-        raise ValueError(f"{name} = {value:g} s: wanted a whole number of substeps of {dt:g} s")
+        raise ValueError(f"{name} = {value:g} s: wanted a whole number of {parts} of {dt:g} s")
     return steps
 
 

@@ -17,7 +17,6 @@ from torchsoro.simulation.ops.inertia import Matching
 
 # The centre of the matter that a node outside of a face carries is 3/4 of a cell away, the face half a cell.
 _DEPTH = 0.25
-_TINY = 1e-9  # m, by which a node may be off a box that it lies in
 _OFF = 1e-3  # how far a particle may be from its place, in particle spacings
 
 _uniform = lru_cache(maxsize=256)(Axis.uniform)  # one axis, so one set of matrices, for equal arguments
@@ -253,7 +252,8 @@ class Lattice:
     def inside(self, low: Sequence[float], high: Sequence[float]) -> Tensor:
         """Which nodes lie in a box [m], bool [nodes]."""
         begin, end = (torch.tensor(corner, dtype=torch.float64) for corner in (low, high))
-        return ((self.node_places > begin - _TINY) & (self.node_places < end + _TINY)).all(-1)
+        rounding = _OFF * self.cell / 2
+        return ((self.node_places > begin - rounding) & (self.node_places < end + rounding)).all(-1)
 
     @cached_property
     def _node_spreads(self) -> Tensor:
