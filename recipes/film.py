@@ -65,10 +65,12 @@ def main(chosen: Options) -> Path:
     import trimesh
     from PIL import Image
 
+    from torchsoro.design.connected import connected
     from torchsoro.design.reading import read_settings
     from torchsoro.design.robot import build
     from torchsoro.output.archive import find, load_design, load_supply
     from torchsoro.output.fabricate import surface
+    from torchsoro.output.loose import loose
     from torchsoro.output.marker_map import marker_map
     from torchsoro.sim2real.data.from_design import believed, elements, far_apart, marker_tables, seen_from
     from torchsoro.sim2real.data.recording import write_table
@@ -82,7 +84,10 @@ def main(chosen: Options) -> Path:
     base = dataclasses.replace(read_settings(folder / "settings.json", device="cpu", scenarios=0), **timed)
     robot = build(base)
     load_supply(folder / "design.npz", robot.supply)
-    gamma = load_design(folder / "design.npz", robot.domain)
+    design = load_design(folder / "design.npz", robot.domain)
+    gamma = connected(design, robot.rounded_domain.wall, robot.domain.shape)  # the rest is not printed
+    if share := loose(robot, design):
+        print(f"{100 * share:.2g} % of the solid is loose and not printed: body.stl is without it")
     length = chosen.settle + chosen.duration
     text = believed(
         robot,

@@ -69,6 +69,9 @@ def main(options: Options) -> Path | None:
     from torchsoro.storage import check_folder
 
     if not options.robot:
+        if options.page or options.export or options.animation:
+            wanted = f"a run's folder, a motion.npz or one of {', '.join(archive.names())}"
+            raise ValueError(f"robot: none given, wanted {wanted}")
         for name in archive.names():
             print(name if (archive.DESIGNS / name / FILE).is_file() else f"{name} (without motion)")
         return None

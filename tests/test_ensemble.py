@@ -23,8 +23,9 @@ import torchsoro.design.ensemble
 import torchsoro.design.robot
 from torchsoro.design import loop
 from torchsoro.design.ensemble import Ensemble, Evaluation, evaluate, fallen, overall
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.processes import Processes
-from torchsoro.design.robot import Outcome, Robot, walker
+from torchsoro.design.robot import Robot, walker
 from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import load_design
@@ -310,10 +311,11 @@ def flags(path: Path, **changes: Any) -> list[str]:
     settings = tiny(path, **{**MANY, **changes})
     for field in dataclasses.fields(settings):
         value = getattr(settings, field.name)
-        if value is not None and not isinstance(value, bool):
-            listed += ["--" + field.name.replace("_", "-"), *map(str, value if isinstance(value, tuple) else (value,))]
-        elif value:
-            listed.append("--" + field.name.replace("_", "-"))
+        name = field.name.replace("_", "-")
+        if isinstance(value, bool):
+            listed.append(f"--{name}" if value else f"--no-{name}")
+        elif value is not None:
+            listed += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
     return listed
 
 

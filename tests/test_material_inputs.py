@@ -116,7 +116,11 @@ class Captured:
         (text(table()), ("--equilibrium", "inf"), "equilibrium = inf: wanted finite and positive"),
         (text(table()), ("--dt", "1"), r"dt = 1 s: wanted at most"),
         (text(table()), ("--units", "storage", "psi"), "units: 'psi' for 'storage', wanted one of Pa"),
-        (text(table()), ("--columns", "storage", "nope"), r"no header row with the columns \{'storage': 'nope'\}"),
+        (
+            text(table()),
+            ("--columns", "storage", "nope"),
+            r"no header row names quantities with the columns \{'storage': 'nope'\}",
+        ),
         (text(table()), ("--columns", "storage", "7"), "storage.*column 7, but .* has 3"),
     ],
 )

@@ -156,12 +156,13 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(recipes, straight,
 
 def command(settings: Settings) -> list[str]:
     """The flags that make these settings."""
-    flags = ["--resume"] if settings.resume else []
+    flags: list[str] = []
     for field in dataclasses.fields(settings):
-        value = getattr(settings, field.name)
-        if not isinstance(value, bool) and value is not None:
-            flags.append("--" + field.name.replace("_", "-"))
-            flags += map(str, value) if isinstance(value, tuple) else [str(value)]
+        name, value = field.name.replace("_", "-"), getattr(settings, field.name)
+        if isinstance(value, bool):
+            flags.append(f"--{name}" if value else f"--no-{name}")
+        elif value is not None:
+            flags += [f"--{name}", *map(str, value if isinstance(value, tuple) else (value,))]
     return [sys.executable, str(RECIPES / "walker.py"), *flags]
 
 

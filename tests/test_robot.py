@@ -12,7 +12,8 @@ from tiny import TINY
 
 import torchsoro.design.robot
 from torchsoro import SimulationDiverged, Simulator
-from torchsoro.design.robot import Outcome, Robot, build, climber, walker
+from torchsoro.design.outcome import Outcome
+from torchsoro.design.robot import Robot, build, climber, walker
 from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.design.settings import Settings
 

@@ -12,9 +12,10 @@ from tiny import TINY
 
 from torchsoro import Chamber, Domain
 from torchsoro.design.chambers import sockets
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.reading import from_command_line
 from torchsoro.design.risk import CVaR
-from torchsoro.design.robot import Outcome, Robot, build, climber, walker
+from torchsoro.design.robot import Robot, build, climber, walker
 from torchsoro.design.scenarios import (
     NOMINAL,
     STICK,

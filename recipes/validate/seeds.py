@@ -1,6 +1,6 @@
 """Design a robot from several initial fields that differ by a millionth, and print what becomes of each.
 
-    python recipes/validate/seeds.py                       # ten desk walkers, about a minute each on two cores
+    python recipes/validate/seeds.py                       # ten desk walkers, about two minutes each on two cores
     python recipes/validate/seeds.py climber --seeds 3
     python recipes/validate/seeds.py --jobs 8 --out runs/seeds    # eight at a time; finished ones are printed
 

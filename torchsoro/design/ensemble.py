@@ -19,10 +19,11 @@ from torch import Tensor
 
 from torchsoro.design.features import threshold_of
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.placement import Membership
 from torchsoro.design.processes import Processes
 from torchsoro.design.risk import CVaR, parse_risk
-from torchsoro.design.robot import LANES, Outcome, Robot
+from torchsoro.design.robot import LANES, Robot
 from torchsoro.design.scenarios import ScenarioBatch
 from torchsoro.errors import SimulationDiverged
 
@@ -118,7 +119,7 @@ class Ensemble:
         batch = self.sample(iteration)
         dt = robot.step(gamma, batch)
         grown = self.grown(iteration)
-        self._variants = [gamma, *(robot.field(threshold=grown * one) for one in self.thresholds[1:])]
+        self._variants = [gamma, *(robot.density(grown * one) for one in self.thresholds[1:])]
         for halving in range(s.halvings + 1):
             step = dt / 2**halving
             _tell(self.processes, _JUDGE, iteration, gravity_scale, step)

@@ -14,10 +14,11 @@ import torch
 
 from torchsoro.design.ensemble import MOST, VARIANTS, Ensemble, fallen, overall, shares
 from torchsoro.design.lagrangian import AugmentedLagrangian, ExactPenalty
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.placement import Placement
 from torchsoro.design.processes import Processes
 from torchsoro.design.risk import CVaR
-from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.robot import Robot
 from torchsoro.design.settings import Settings
 from torchsoro.design.supply import Supply
 from torchsoro.design.training import RunFolder
@@ -27,6 +28,7 @@ Lagrangian = AugmentedLagrangian | ExactPenalty
 Observe = Callable[[RunFolder, Robot, torch.Tensor, int], None]
 
 LARGEST_C = 0.25  # of any design
+LOOSE = 0.3  # price of loose density, in cells of travel: with 0.5 desk walkers lean, with 3 they hardly move
 WALKS = 0.7  # share of the travel of the centre of gravity that the feet of a robot make that does not just lean
 KEPT = 8  # designs to step back to
 BESIDE = ("supply", "placement")  # what may be designed beside the field
@@ -346,7 +348,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
         until = s.chamber_until or math.inf  # from where on the chambers stay
         for k in run.progress(run.start if stopped else s.iterations):
             begin = time.perf_counter()
-            told = {}
+            told: dict[str, Any] = {}
             if placement is not None and k >= until and not placement.settled:
                 told = settle(robot, placement, s.gravity_scale(k))
                 best = None  # earlier designs would change as they are rounded
@@ -363,6 +365,10 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             violation, aims = outcome.intermediate - s.c_max, aim(robot, outcome, k)
             goal = overall(robot, aims)
             loss = lagrangian(goal.detach(), violation)
+            if s.connected:
+                loose = robot.loose()
+                loss = loss + LOOSE * loose
+                told["constraint/loose"] = loose.detach()
             middle = time.perf_counter()
             # Only the gradient of the motion is clipped: beside that of a rough one the price of C would vanish.
             price, *prices = torch.autograd.grad(loss, (field.phi, *placing), retain_graph=True)
@@ -408,7 +414,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
             timed |= {"grad_norm/supply": timing_norm} if timing else {}
             if placement is not None:
                 timed |= {f"chamber/{name}": value for name, value in placement.numbers().items()}
-                timed |= {"grad_norm/chamber": placing_norm, **told}
+                timed |= {"grad_norm/chamber": placing_norm}
             adam.step()
             field.clamp_()
             for module in others.values():
@@ -435,6 +441,7 @@ def optimize(robot: Robot, observe: Observe | None = None, processes: Processes 
                     "field/gamma_mean": gamma.detach().mean(),
                     **({"objective/turn": overall(robot, outcome.turn.detach())} if s.robot == "turner" else {}),
                     **timed,
+                    **told,
                     "simulation/dt": outcome.dt,
                     "time/forward": middle - begin,
                     "time/backward": end - middle,

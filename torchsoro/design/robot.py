@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -13,11 +13,13 @@ from torch import Tensor, nn
 
 from torchsoro.design.blending import fill_blended, solid_shares
 from torchsoro.design.chambers import chambers_of, placement_of, port_of, sockets
+from torchsoro.design.connected import connected
 from torchsoro.design.density import fill, without_void
 from torchsoro.design.domain import Domain
 from torchsoro.design.field import DesignField
 from torchsoro.design.mesh import UNITS, read_surface
 from torchsoro.design.objective import center_of_gravity, intermediate_density, total_mass, travel, yaw
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.placement import Membership
 from torchsoro.design.scenarios import ScenarioBatch, leaning_gravity, posed, supplied, varied
 from torchsoro.design.settings import Settings
@@ -36,40 +38,6 @@ from torchsoro.simulation.sums import pairwise_sum
 from torchsoro.simulation.trajectory import Start, Trajectory
 
 LANES = 16  # simulations that a CPU carries on at a time
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Outcome:
-    """What one simulation says of a design; with scenarios, all but C is of each [S].
-
-    Attributes:
-        travel: L, Eq. 13 [m].
-        feet: The same of the feet (see :meth:`Robot.feet`) [m]: a robot that leans moves its centre and not its feet.
-        soles: The same with all soles, the less the farther off they are, which has a gradient by what touches [m].
-        inflated: Travel of the centre of gravity after the first ``settings.duty`` of a cycle [m].
-        turn: Angle by which the soles turned about z since the actuation starts, positive to the left [rad].
-        turn_inflated: The same after the first ``settings.duty`` of a cycle [rad].
-        intermediate: C, Eq. 15.
-        mass: Of solid and chamber wall [kg].
-        fall: What the centre of gravity sinks at most, beyond ``settings.sink`` times the height and what is free below
-            the body at the start [m].
-        center: Centre of gravity of the undeformed design domain [3] m, Eq. 14.
-        trajectory: The motion.
-        dt: Substep that it took [s]: the settings' or, where that broke down, a half or a quarter of it.
-    """
-
-    travel: Tensor
-    feet: Tensor
-    soles: Tensor
-    inflated: Tensor
-    turn: Tensor
-    turn_inflated: Tensor
-    intermediate: Tensor
-    mass: Tensor
-    fall: Tensor
-    center: Tensor
-    trajectory: Trajectory
-    dt: float
 
 
 class Robot(nn.Module):
@@ -224,12 +192,30 @@ class Robot(nn.Module):
         solid = torch.where(gamma >= 0.5, layer, math.inf).amin(-1)
         return torch.where(solid.isfinite(), solid, 0.0) * self.domain.spacing
 
-    def density(self) -> Tensor:
-        """Density of the present design [N], with a gradient by the field and by chambers that are designed."""
-        if self.placement is None:
-            return self.field()
-        member = self.placement()
-        return self.field(shares=(member.design, member.wall))
+    def density(self, threshold: float = 0.0) -> Tensor:
+        """Density of the present design [N], as far as it is connected if the settings say so.
+
+        Args:
+            threshold: Of the field's projection, which erodes or dilates it.
+
+        Returns:
+            With a gradient by the field and by chambers that are designed.
+        """
+        gamma, whole = self._densities(threshold)
+        return torch.lerp(gamma, whole, self.settings.sharp(self.field.beta))
+
+    def loose(self) -> Tensor:
+        """Mean density over the design domain of what is not connected with a chamber, with a gradient."""
+        gamma, whole = self._densities()
+        return (gamma - whole)[self.design].mean()
+
+    def _densities(self, threshold: float = 0.0) -> tuple[Tensor, Tensor]:
+        """As designed and, if the settings say so, as far as it is connected."""
+        member = None if self.placement is None else self.placement()
+        shares = None if member is None else (member.design, member.wall)
+        gamma = self.field(threshold=threshold, shares=shares)
+        wall = self.domain.wall if member is None else member.wall.detach() > 0.5
+        return gamma, connected(gamma, wall, self.domain.shape) if self.settings.connected else gamma
 
     @property
     def rounded_domain(self) -> Domain:

@@ -223,6 +223,8 @@ class Settings:
     """Iterations between which the projection sharpens, and steps shrink in proportion; 0 0 for the paper's, never."""
     feature: AtLeastZero = 0.0
     """Least thickness of walls and gaps [m]; scenarios meet the design, an eroded and a dilated one in turn. 0: any."""
+    connected: bool = False
+    """Simulate material only as far as it is connected with a chamber, so that the body is in one piece."""
     counted: Literal["design", "body"] = "design"
     """Whose centre of gravity travels: the design domain's (the paper's) or the chamber wall's, too."""
     feet: _Density = 0.0
@@ -433,6 +435,12 @@ class Settings:
     def sharpness(self, iteration: int) -> float:
         """Sharpness of the projection in an iteration: rises by the same factor in each."""
         return self.beta * (self.final_beta / self.beta) ** self.sharpened(iteration) if self.sharpen[1] else self.beta
+
+    def sharp(self, beta: float) -> float:
+        """How far a projection of this sharpness has sharpened, from 0 to 1; 1 where it never does."""
+        if not self.sharpen[1] or self.final_beta == self.beta:
+            return 1.0
+        return min(1.0, max(0.0, math.log(beta / self.beta) / math.log(self.final_beta / self.beta)))
 
     def gravity_scale(self, iteration: int) -> float:
         """Share of gravity in an iteration (the climber's continuation): min(1, floor(k / every) / steps)."""

@@ -15,8 +15,9 @@ import torch
 
 from torchsoro.command_line import progress_bar
 from torchsoro.design.objective import mean_stride
+from torchsoro.design.outcome import Outcome
 from torchsoro.design.reading import CHAMBERS, lasting, read_settings
-from torchsoro.design.robot import Outcome, Robot, build
+from torchsoro.design.robot import Robot, build
 from torchsoro.design.settings import Settings
 from torchsoro.errors import SimulationDiverged
 from torchsoro.output.archive import find, kept_iterations, load_design, load_shape, load_supply

@@ -29,6 +29,7 @@ from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import begin_with, save_design
 from torchsoro.output.fabricate import surface
 from torchsoro.output.folding import folded, folding_line
+from torchsoro.output.loose import loose, loose_line, travel_without
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
@@ -141,7 +142,7 @@ def report(result: Mapping[str, Any], settings: Settings) -> str:
     spread = f"\n{spread_line(result, settings.scenarios)}" if settings.scenarios else ""
     return (
         f"travel L = {1e3 * result['L']:.2f} mm in {settings.duration:g} s; {numbers(result)}\n{mending_line(result)}"
-        f"{rounding_line(result)}{folding_line(result, settings)}"
+        f"{rounding_line(result)}{loose_line(result)}{folding_line(result, settings)}"
         f"{result['iterations']} iterations of {result['forward']:.1f} s forward and {result['backward']:.1f} s "
         f"backward (medians), {result['seconds']:.0f} s in all; everything is in {settings.out}{spread}"
     )
@@ -267,9 +268,10 @@ def show(
     Returns:
         Travel L [m], that of the feet [m], mean stride over whole cycles [m] (NaN if there is none), C, its limit and
         whether it is met, mass [kg], how many particles lie in another part of the body at the worst (``folded``), of a
-        turner its angles to the left, and to the right with the supply mirrored [rad], thinnest wall and gap of the
-        part [m] (NaN if there is none), of one whose walls were to be mended what :func:`told_of` says, ``more``; and
-        the printable part. All but C are those of the part with its walls mended.
+        turner its angles to the left, and to the right with the supply mirrored [rad], where pieces are loose their
+        share of the solid (``loose``) and the travel without them [m] (``L_connected``, NaN if that breaks down),
+        thinnest wall and gap of the part [m] (NaN if there is none), of one whose walls were to be mended what
+        :func:`told_of` says, ``more``; and the printable part. All but C are those of the part with its walls mended.
 
     Raises:
         ValueError: if the design has no connected body to print; all but the part is written before.
@@ -302,6 +304,9 @@ def show(
     if part is not None:
         with progress_bar(f"simulating {name}, not mended") as progress:
             found |= told_of(part, robot(gamma, void=void, progress=progress))
+    if (share := loose(robot, delivered)) > 0:
+        with progress_bar(f"simulating {name}, loose pieces left out") as progress:
+            found |= {"loose": share, "L_connected": travel_without(robot, delivered, void, progress)}
     found |= more or {}
     bodiless: ValueError | RuntimeError | None = None
     try:

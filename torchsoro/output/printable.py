@@ -12,7 +12,8 @@ import torch
 from torchsoro.design.density import thickened
 from torchsoro.design.loop import Optimized, design_of, take_, worth_of
 from torchsoro.design.objective import intermediate_density
-from torchsoro.design.robot import Outcome, Robot
+from torchsoro.design.outcome import Outcome
+from torchsoro.design.robot import Robot
 from torchsoro.errors import SimulationDiverged
 from torchsoro.output.fabricate import fabricate
 from torchsoro.output.part import Part

@@ -168,11 +168,21 @@ def load(path: Path, columns: Mapping[str, str | int], units: Mapping[str, str],
     for rows, decimal in _splits(path, sheet):
         found = _header(rows, columns)
         if found is not None:
-            return _table(path, rows, found, columns, units, decimal)
-    first = "; ".join(" | ".join(row)[:60] for row in next(iter(_splits(path, sheet)))[0][:3])
+            table = _table(path, rows, found, columns, units, decimal)
+            if "modulus" in columns and "stress" in table.names[table.columns["modulus"]].lower():
+                raise ValueError(f"{table.where('modulus')}: a stress, wanted a modulus: divide it by the strain")
+            return table
+    rows = next(iter(_splits(path, sheet)))[0][:3]
+    first = "; ".join(" | ".join(row)[:60] for row in rows)
     declared = f" with the columns {dict(columns)}" if columns else ""
+    words = " ".join(cell.lower() for row in rows for cell in row)
+    if not columns and "stress" in words and "strain" in words:
+        raise ValueError(
+            f"{path}: stress and strain ({first}), wanted moduli over frequency, or a modulus or compliance over time: "
+            "of a relaxation test, stress over strain. Tests to failure are fitted by torchsoro.rheology.hyperelastic"
+        )
     raise ValueError(
-        f"{path}: no header row{declared}; the first rows are: {first}. Wanted one that names frequency, storage and "
+        f"{path}: no header row names quantities{declared}; the first rows are: {first}. Wanted frequency, storage and "
         'loss, or time and modulus or compliance. Name the columns, for example columns={"frequency": 0, "storage": 1}'
         ", on a command line --columns frequency 0 storage 1"
     )

@@ -15,6 +15,7 @@ from torchsoro.storage import atomic_write
 
 _SOLID = {"youngs_modulus_Pa": "youngs_modulus", "poisson_ratio": "poisson_ratio", "density_kg_per_m3": "density"}
 _STIFFENING = ("linear_stiffening", "quadratic_stiffening")  # not in a file of a neo-Hookean solid
+_RANGES = {"youngs_modulus_Pa": (1e2, 1e10), "density_kg_per_m3": (10.0, 3e4)}  # of anything that is printed or cast
 _MAXWELL = ("modulus_over_equilibrium", "time_s")
 
 
@@ -79,6 +80,9 @@ def read_material(path: Path) -> Material:
         _numbers(element, _MAXWELL, f"{path}: [[maxwell]] number {number}")
         for number, element in enumerate(found.get("maxwell", []), start=1)
     ]
+    for name, (low, high) in _RANGES.items():
+        if not low <= solid[name] <= high:
+            raise ValueError(f"{path}: {name} = {solid[name]:g}, wanted {low:g} to {high:g}: is the unit right?")
     maxwell = torch.tensor([[e[name] for name in _MAXWELL] for e in elements], dtype=torch.float64).reshape(-1, 2)
     return Material(
         solid=Solid(**{_SOLID.get(key, key): value for key, value in solid.items()}),
@@ -90,8 +94,10 @@ def read_material(path: Path) -> Material:
 
 def _numbers(table: object, wanted: tuple[str, ...], where: str) -> dict[str, float]:
     names = set(table) if isinstance(table, dict) else set()
-    if names != set(wanted):
-        raise ValueError(f"{where} has {', '.join(sorted(names)) or 'nothing'}, wanted {', '.join(wanted)}")
+    wrong = [f"unknown {name}" for name in sorted(names - set(wanted))]
+    wrong += [f"no {name}" for name in wanted if name not in names]
+    if wrong:
+        raise ValueError(f"{where}: {', '.join(wrong)}; wanted {', '.join(wanted)}")
     assert isinstance(table, dict)
     for name, value in table.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
