@@ -297,11 +297,19 @@ class RunFolder:
 
     def _iterate(self, total: int) -> Iterator[int]:
         interval = 0.1 if sys.stderr.isatty() else 10.0  # s; in a log file every refresh is a line
-        bar = tqdm(total=max(total, self.start), initial=self.start, mininterval=interval, dynamic_ncols=True)
+        bar = tqdm(
+            total=max(total, self.start),
+            initial=self.start,
+            mininterval=interval,
+            dynamic_ncols=True,
+            desc="kernels may have to be compiled",
+        )
         with bar as self._bar:
             try:
                 for iteration in range(self.start, total):
                     yield iteration
+                    if bar.desc:
+                        bar.set_description_str("", refresh=False)
                     bar.update()
             finally:
                 self._bar = None

@@ -197,7 +197,10 @@ def _masses(path: Path) -> dict[str, list[tuple[float, float, float]]]:
                 break
             above = line
     if above or not masses:
-        raise ValueError(f"{path}: {above.strip()[:60]!r}, wanted columns t, x, y as of Tracker, and numbers below")
+        raise ValueError(
+            f"{path}: {above.strip()[:60]!r}, wanted columns t, x, y as of Tracker, and numbers below, "
+            "the CSV of DeepLabCut, or a C3D file"
+        )
     return masses
 
 
@@ -231,9 +234,12 @@ def read_deeplabcut(
     Raises:
         ValueError: for a file that is no such table, or without ``fps`` or a scale.
     """
-    if fps is None or frame is None or frame.scale is None or not 1e-3 <= fps <= 1e6 or not 0 <= likelihood <= 1:
-        seen = f"fps = {fps}, scale = {frame and frame.scale}, likelihood = {likelihood}"
-        raise ValueError(f"{path}: {seen}, wanted frames per second, metres per pixel, and 0 to 1")
+    scale = None if frame is None else frame.scale
+    wrong = [] if fps is not None and 1e-3 <= fps <= 1e6 else [f"fps = {fps}, wanted frames per second"]
+    wrong += [f"scale = {scale}, wanted metres per pixel"] if scale is None else []
+    wrong += [] if 0 <= likelihood <= 1 else [f"likelihood = {likelihood}, wanted 0 to 1"]
+    if wrong or fps is None or frame is None:
+        raise ValueError(f"{path}: {'; '.join(wrong)}")
     lines = [_cells(line) for line in _lines(path) if line.strip(" ,")]
     wanted = ["scorer", "bodyparts", "coords"]
     if lines[1:] and lines[1][0] == "individuals":
