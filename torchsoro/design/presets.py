@@ -88,9 +88,6 @@ _CLIMBER_DESK = dataclasses.replace(
     friction="stick",
     # Thinner limbs lose their hold in some designs and not in others.
     filter_radius=0.0085,
-    connected=False,
-    # One start in eight lets go of the walls.
-    starts=2,
     iterations=100,
     penalty=0.8,
     sharpen=(12, 46),
@@ -110,7 +107,7 @@ _TURNING = {
     "phases": (0.0, 0.25),
 }
 _TURNER_PAPER = dataclasses.replace(_WALKER_PAPER, **_TURNING)
-_TURNER_DESK = dataclasses.replace(_WALKER_DESK, **_TURNING, connected=False, starts=1)
+_TURNER_DESK = dataclasses.replace(_WALKER_DESK, **_TURNING)
 
 WALKER = {"desk": _WALKER_DESK, "paper": _WALKER_PAPER}
 CLIMBER = {"desk": _CLIMBER_DESK, "paper": _CLIMBER_PAPER}
