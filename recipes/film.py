@@ -65,12 +65,11 @@ def main(chosen: Options) -> Path:
     import trimesh
     from PIL import Image
 
-    from torchsoro.design.connected import connected
     from torchsoro.design.reading import read_settings
     from torchsoro.design.robot import build
     from torchsoro.output.archive import find, load_design, load_supply
     from torchsoro.output.fabricate import surface
-    from torchsoro.output.loose import loose
+    from torchsoro.output.loose import loose_share, without_loose
     from torchsoro.output.marker_map import marker_map
     from torchsoro.sim2real.data.from_design import believed, elements, far_apart, marker_tables, seen_from
     from torchsoro.sim2real.data.recording import write_table
@@ -85,8 +84,8 @@ def main(chosen: Options) -> Path:
     robot = build(base)
     load_supply(folder / "design.npz", robot.supply)
     design = load_design(folder / "design.npz", robot.domain)
-    gamma = connected(design, robot.rounded_domain.wall, robot.domain.shape)  # the rest is not printed
-    if share := loose(robot, design):
+    gamma = without_loose(robot, design)
+    if share := loose_share(design, gamma):
         print(f"{100 * share:.2g} % of the solid is loose and not printed: body.stl is without it")
     length = chosen.settle + chosen.duration
     text = believed(

@@ -15,7 +15,7 @@ from tiny import TINY
 from torchsoro.design.connected import connected
 from torchsoro.design.robot import walker
 from torchsoro.output.levelset import pieces
-from torchsoro.output.loose import loose, loose_line, travel_without
+from torchsoro.output.loose import loose_line, loose_share, travel_of, without_loose
 
 FACES = np.zeros((3, 3, 3), dtype=bool)
 FACES[1, 1] = FACES[1, :, 1] = FACES[:, 1, 1] = True
@@ -78,11 +78,12 @@ def test_a_run_says_what_is_loose_and_how_far_the_rest_travels():
         robot.field.phi[:, :, 0] = 1.0
         gamma = robot.field()
     layer, shell = robot.domain.shape[0] * robot.domain.shape[1], int(robot.domain.wall.sum())
-    assert loose(robot, gamma) == pytest.approx(layer / (layer + shell), rel=0.2)
-    assert loose(robot, robot.domain.wall.float()) == 0.0
-    travel = travel_without(robot, gamma, void=True)
-    whole = robot(connected(gamma, robot.domain.wall, robot.domain.shape)).travel
-    assert travel == float(whole) != float(robot(gamma).travel)
+    whole, walls = without_loose(robot, gamma), robot.domain.wall.float()
+    assert loose_share(gamma, whole) == pytest.approx(layer / (layer + shell), rel=0.2)
+    assert loose_share(walls, without_loose(robot, walls)) == 0.0
+    travel = travel_of(robot, whole, void=True)
+    expected = robot(connected(gamma, robot.domain.wall, robot.domain.shape)).travel
+    assert travel == float(expected) != float(robot(gamma).travel)
     assert loose_line({"loose": 0.0}) == ""
     said = loose_line({"loose": 0.123, "L_connected": -4.37e-3})
     assert "12 % of the solid is loose and not printed: without it the travel is -4.37 mm" in said

@@ -201,21 +201,24 @@ class Robot(nn.Module):
         Returns:
             With a gradient by the field and by chambers that are designed.
         """
-        gamma, whole = self._densities(threshold)
+        gamma, wall = self._designed(threshold)
+        if not self.settings.connected:
+            return gamma
+        whole = connected(gamma, wall, self.domain.shape)
         return torch.lerp(gamma, whole, self.settings.sharp(self.field.beta))
 
     def loose(self) -> Tensor:
         """Mean density over the design domain of what is not connected with a chamber, with a gradient."""
-        gamma, whole = self._densities()
-        return (gamma - whole)[self.design].mean()
+        gamma, wall = self._designed()
+        return (gamma - connected(gamma, wall, self.domain.shape))[self.design].mean()
 
-    def _densities(self, threshold: float = 0.0) -> tuple[Tensor, Tensor]:
-        """As designed and, if the settings say so, as far as it is connected."""
-        member = None if self.placement is None else self.placement()
-        shares = None if member is None else (member.design, member.wall)
-        gamma = self.field(threshold=threshold, shares=shares)
-        wall = self.domain.wall if member is None else member.wall.detach() > 0.5
-        return gamma, connected(gamma, wall, self.domain.shape) if self.settings.connected else gamma
+    def _designed(self, threshold: float = 0.0) -> tuple[Tensor, Tensor]:
+        """Density as designed, and which particles are walls of chambers."""
+        if self.placement is None:
+            return self.field(threshold=threshold), self.domain.wall
+        member = self.placement()
+        gamma = self.field(threshold=threshold, shares=(member.design, member.wall))
+        return gamma, member.wall.detach() > 0.5
 
     @property
     def rounded_domain(self) -> Domain:

@@ -29,7 +29,7 @@ from torchsoro.design.training import RunFolder
 from torchsoro.output.archive import begin_with, save_design
 from torchsoro.output.fabricate import surface
 from torchsoro.output.folding import folded, folding_line
-from torchsoro.output.loose import loose, loose_line, travel_without
+from torchsoro.output.loose import loose_line, loose_share, travel_of, without_loose
 from torchsoro.output.motion import FILE as MOTION
 from torchsoro.output.motion import decompose, read_motion
 from torchsoro.output.part import Part
@@ -304,9 +304,10 @@ def show(
     if part is not None:
         with progress_bar(f"simulating {name}, not mended") as progress:
             found |= told_of(part, robot(gamma, void=void, progress=progress))
-    if (share := loose(robot, delivered)) > 0:
+    whole = without_loose(robot, delivered)
+    if (share := loose_share(delivered, whole)) > 0:
         with progress_bar(f"simulating {name}, loose pieces left out") as progress:
-            found |= {"loose": share, "L_connected": travel_without(robot, delivered, void, progress)}
+            found |= {"loose": share, "L_connected": travel_of(robot, whole, void, progress)}
     found |= more or {}
     bodiless: ValueError | RuntimeError | None = None
     try:

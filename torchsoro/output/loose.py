@@ -14,33 +14,41 @@ from torchsoro.errors import SimulationDiverged
 from torchsoro.output.folding import HALF
 
 
-def loose(robot: Robot, gamma: torch.Tensor) -> float:
+def without_loose(robot: Robot, gamma: torch.Tensor) -> torch.Tensor:
+    """A design as far as it is connected with the robot's chambers [N].
+
+    Args:
+        robot: The robot.
+        gamma: Density of the design [N].
+    """
+    domain = robot.rounded_domain
+    return connected(gamma, domain.wall, domain.shape)
+
+
+def loose_share(gamma: torch.Tensor, whole: torch.Tensor) -> float:
     """Share of a design's solid particles that no others connect with a chamber.
 
     Args:
-        robot: The robot.
         gamma: Density of the design [N].
+        whole: The same of :func:`without_loose`.
     """
-    domain = robot.rounded_domain
     solid = gamma >= HALF
-    count = int((solid & (connected(gamma, domain.wall, domain.shape) < HALF)).sum())
-    return count / max(1, int(solid.sum()))
+    return int((solid & (whole < HALF)).sum()) / max(1, int(solid.sum()))
 
 
-def travel_without(
+def travel_of(
     robot: Robot, gamma: torch.Tensor, void: bool, progress: Callable[[int, int], None] | None = None
 ) -> float:
-    """Travel [m] of a design without its loose pieces; NaN if its simulation breaks down.
+    """Travel [m] of a density, NaN if its simulation breaks down.
 
     Args:
         robot: The robot.
-        gamma: Density of the design [N].
+        gamma: The density [N].
         void: Simulate void, too.
         progress: Called as that of :class:`torchsoro.Simulator`.
     """
-    domain = robot.rounded_domain
     try:
-        return float(robot(connected(gamma, domain.wall, domain.shape), void=void, progress=progress).travel)
+        return float(robot(gamma, void=void, progress=progress).travel)
     except SimulationDiverged:
         return math.nan
 

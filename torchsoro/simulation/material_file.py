@@ -11,11 +11,12 @@ from pathlib import Path
 import torch
 
 from torchsoro.simulation.material import Prony, Solid
+from torchsoro.simulation.plausible import DENSITY, MODULUS
 from torchsoro.storage import atomic_write
 
 _SOLID = {"youngs_modulus_Pa": "youngs_modulus", "poisson_ratio": "poisson_ratio", "density_kg_per_m3": "density"}
 _STIFFENING = ("linear_stiffening", "quadratic_stiffening")  # not in a file of a neo-Hookean solid
-_RANGES = {"youngs_modulus_Pa": (1e2, 1e10), "density_kg_per_m3": (10.0, 3e4)}  # of anything that is printed or cast
+_RANGES = {"youngs_modulus_Pa": MODULUS, "density_kg_per_m3": DENSITY}
 _MAXWELL = ("modulus_over_equilibrium", "time_s")
 
 

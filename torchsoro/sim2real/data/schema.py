@@ -30,11 +30,11 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 from torchsoro.sim2real.data.recording import brief
+from torchsoro.simulation.plausible import DENSITY, MODULUS
 
-# Ranges that hold every soft body and its motion in SI units; what lies outside is in another unit.
+# Ranges that hold every soft body and its motion in SI units, as those of its material do; what lies outside is in
+# another unit.
 LENGTH = (1e-4, 10.0)  # m, edges of a body
-MODULUS = (1e2, 1e10)  # Pa
-DENSITY = (10.0, 3e4)  # kg/m3
 LONGEST = 1000.0  # s, a trial
 MODES = 5  # Maxwell elements
 
