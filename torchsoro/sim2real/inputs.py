@@ -25,6 +25,7 @@ from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.storage import check_folder
 
 RESULTS = ("report.html", "explanation.json", "model.toml")
+RECORDINGS = Path(__file__).resolve().parents[1] / "recordings"  # experiments that come with the package
 WORTH = 30.0  # s on two cores, of an explanation that is worth a GPU: those of bars wait for each step of a small body
 DEAR = 100.0  # budgets, that a twin with a given edge may take
 
@@ -71,7 +72,7 @@ def read_inputs(options: Options) -> Inputs:
     check_device(options.device)
     effects = named(options.effects)
     check_folder("out", Path(options.out), RESULTS)
-    experiment = read_experiment(Path(options.experiment))
+    experiment = read_experiment(_found(Path(options.experiment)))
     if empty := [f"trials/{t.name}" for t in experiment.trials if t.recording is None]:
         raise ValueError(f"{options.experiment}: {', '.join(empty)}: no markers.csv, wanted one in each trial")
     experiment, notes = thinned(experiment)
@@ -105,6 +106,12 @@ def read_inputs(options: Options) -> Inputs:
         notes=tuple(notes),
         hints=tuple(hints),
     )
+
+
+def _found(experiment: Path) -> Path:
+    """The folder of an experiment: one's own, or else one that comes with the package."""
+    shipped = RECORDINGS / experiment
+    return shipped if not experiment.exists() and len(experiment.parts) == 1 and shipped.is_dir() else experiment
 
 
 def check_numbers(options: Options) -> None:

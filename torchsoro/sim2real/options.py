@@ -14,7 +14,7 @@ class Options:
     """What to explain."""
 
     experiment: tyro.conf.Positional[Path | None] = None
-    """Folder of the experiment."""
+    """Folder of the experiment, or the name of one that comes with the package: bar."""
     out: Path
     """Folder for report.html, explanation.json and model.toml; with --predict, the file of the markers."""
     predict: Path | None = None
