@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -339,6 +340,14 @@ def test_screened_points_are_within_bounds_and_places_within_the_body(made, one)
     if one.local:  # even in the body: each half of each edge has half of them
         middle = 10 * np.array(twin.setup.center) / np.array(twin.setup.size)
         assert (points[:, -3:] < middle).mean(0) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.slow
+def test_the_recording_that_comes_along_lacks_the_fluid_around_its_bar(tmp_path):
+    found = pipeline.explain(pipeline.Options(experiment=Path("bar"), out=tmp_path)).verdict
+    assert found.kind == "explained" and [c.name for c in found.chosen] == ["drag"]
+    ((before, after),) = found.heldout.values()
+    assert after < 0.35 * before  # measurement errors included, which are a quarter of what is stated
 
 
 def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):

@@ -18,7 +18,7 @@ from setups import CLAMP, marker, material
 from torchsoro.sim2real import pipeline
 from torchsoro.sim2real.data.recording import read_table
 from torchsoro.sim2real.inference.model import read_model
-from torchsoro.sim2real.inputs import chosen, read_inputs
+from torchsoro.sim2real.inputs import RECORDINGS, chosen, read_inputs
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -469,3 +469,15 @@ def test_drawn_input_is_accepted_or_refused_and_nothing_is_written(whole, mutati
 def test_a_gpu_is_chosen_where_there_is_one_and_much_to_simulate(monkeypatch, asked, seconds, there, wanted):
     monkeypatch.setattr("torch.cuda.is_available", lambda: there)
     assert chosen(asked, seconds) == wanted
+
+
+def test_an_experiment_that_comes_along_is_found_by_its_name_unless_a_folder_has_it(whole, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = read_inputs(Options(experiment=Path("bar"), out=tmp_path / "out"))
+    assert shipped.experiment.folder == RECORDINGS / "bar"
+    assert len(shipped.trials) == 3 and len(shipped.kept) == 1 and not shipped.hints
+    shutil.copytree(whole, "bar")
+    assert read_inputs(Options(experiment=Path("bar"), out=tmp_path / "out")).experiment.folder == Path("bar")
+    for name in ("nowhere", "./nowhere/bar"):
+        with pytest.raises(ValueError, match=f"{Path(name)}: not there, wanted a folder"):
+            read_inputs(Options(experiment=Path(name), out=tmp_path / "out"))
