@@ -312,6 +312,25 @@ def test_a_motion_is_simulated_once_though_a_body_does_not_bear_it(judge, tmp_pa
     assert len(judge.seal._motions((plan, [0], tmp_path, 1.0))) == (2 if broken else 1) * len(jobs)
 
 
+def test_a_case_is_written_as_soon_as_its_motions_are_there(judge, tmp_path, monkeypatch):
+    def motions(job):
+        # Of the second case a draw turns out broken.
+        draws = 2 if job[0] == "b" and (tmp_path / "b0-1").exists() else 1
+        return [(tmp_path / f"{job[0]}{draw}-{k}",) for draw in range(draws) for k in range(2)]
+
+    monkeypatch.setattr(judge.seal, "_simulate", lambda name: f"{name} as believed")
+    monkeypatch.setattr(judge.seal, "_motions", motions)
+    monkeypatch.setattr(judge.seal, "_one", lambda motion: motion[0].touch() or motion[0].name)
+    monkeypatch.setattr(judge.seal, "_work", lambda job: f"{job[0]} done")
+    (tmp_path / "c0-0").touch()
+    (tmp_path / "c0-1").touch()
+    lines = list(judge.seal._made(judge.seal._Here(), 1, ["bar"], [("a",), ("b",), ("c",)]))
+    assert lines[:2] == ["c done", "bar as believed"]
+    assert lines[2:5] == ["a0-0, 1 of 4", "a0-1, 2 of 4", "a done"]
+    assert sorted(lines[5:-1]) == ["b0-0, 3 of 4", "b0-1, 4 of 4", "b1-0, 6 of 6", "b1-1, 5 of 6"]
+    assert lines[-1] == "b done"
+
+
 def test_a_thrown_block_comes_to_rest_and_a_crawler_lifts_off_its_plate(judge):
     t = np.linspace(0, 0.5, 101)
     block = judge.believed.believed_motion("block", 0, judge.world.World(), 0.5)(t)

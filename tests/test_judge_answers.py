@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import numpy as np
@@ -248,3 +249,34 @@ def test_ask_takes_what_is_no_explanation_for_a_failure(judge, tmp_path):
     assert found["verdict"] == "failed" and "without a verdict" in found["error"]
     with pytest.raises(ValueError, match=r"tool = 'no-such-tool': wanted a command line that begins with a program"):
         judge.ask.ask(tmp_path / "batch", answers=tmp_path / "answers", tool="no-such-tool")
+
+
+def test_ask_follows_a_batch_that_is_still_being_made(judge, tmp_path, monkeypatch):
+    batch, answers = tmp_path / "batch", tmp_path / "answers"
+    monkeypatch.setattr(judge.ask, "LOOK", 0.05)
+
+    def made(name: str) -> None:
+        (batch / "cases" / name).mkdir(parents=True)
+        (batch / "cases" / name / "setup.toml").write_text("")
+
+    def answered(case, *_):
+        # What is made next is there by halves while the first one is answered, and whole once it is.
+        if case.name == "case-1":
+            made("case-0")
+            threading.Timer(0.3, lambda: (batch / "sealed" / "case-0.json").write_text("{}")).start()
+            threading.Timer(0.6, lambda: (batch / "truth.sealed").write_text("{}")).start()
+        else:
+            assert (batch / "sealed" / "case-0.json").exists()
+        (answers / case.name).mkdir()
+        (answers / case.name / "explanation.json").write_text("{}")
+        return {"verdict": "nothing_missing", "judge_seconds": 0.0}
+
+    with pytest.raises(ValueError, match=r"wanted a folder with sealed/seed.json, made by seal.py"):
+        judge.ask.ask(batch, answers=answers, tool="true", follow=True)
+    made("case-1")
+    (batch / "sealed").mkdir()
+    (batch / "sealed" / "seed.json").write_text('{"counts": [1, 1, 0, 0]}')
+    (batch / "sealed" / "case-1.json").write_text("{}")
+    monkeypatch.setattr(judge.ask, "answer", answered)
+    judge.ask.ask(batch, answers=answers, tool="true", follow=True)
+    assert sorted(path.name for path in answers.glob("case-*")) == ["case-0", "case-1"]

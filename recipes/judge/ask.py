@@ -39,6 +39,12 @@ SERVED = Path("/tmp/nvidia-mps/control")
 PIPE = "CUDA_MPS_PIPE_DIRECTORY"
 """Variable by which a process finds it."""
 
+SEED = "sealed/seed.json"
+"""Of a batch, with how many cases it will have."""
+
+LOOK = 5.0
+"""Time between two looks for cases that have been made [s]."""
+
 STOPPED = threading.Event()
 """Set once a run is interrupted: what the tools have not answered by then is asked for the next time."""
 
@@ -127,6 +133,12 @@ def _devices(gpus: int, workers: int) -> list[str]:
     return [names[worker % gpus] for worker in range(workers)] if gpus else [""] * workers
 
 
+def _whole(batch: Path, follow: bool) -> list[Path]:
+    """Cases that can be asked for; of a batch that is still being made, those whose truth is written."""
+    cases = sorted((batch / "cases").glob("*"))
+    return [case for case in cases if not follow or (batch / "sealed" / f"{case.name}.json").exists()]
+
+
 def _rank(case: Path) -> int:
     """How long an answer may take, by rank: a robot's mesh, a chamber and a plane each make it longer."""
     setup = (case / "setup.toml").read_text()
@@ -195,6 +207,7 @@ def ask(
     extra: str = "",
     workers: int = 1,
     gpus: int = 0,
+    follow: bool = False,
     timeout: float = 3600,
 ) -> str:
     """Ask for what has no answer yet.
@@ -209,6 +222,7 @@ def ask(
         gpus: Share the workers out to so many GPUs of this machine, and let those on one GPU compute side by side by
             NVIDIA's multi-process service where it is installed (started and ended here, unless it runs); tell the
             tool to use them (``--extra="--device cuda"``).
+        follow: Ask for each case of a batch that is still being made as soon as it is whole, until all are.
         timeout: For one command [s].
 
     Returns:
@@ -219,20 +233,25 @@ def ask(
             CUDA_VISIBLE_DEVICES.
     """
     STOPPED.clear()
-    if not (batch / "cases").is_dir():
-        raise ValueError(f"batch = {batch}: wanted a folder with cases/, made by seal.py")
+    if not (batch / (SEED if follow else "cases")).exists():
+        raise ValueError(f"batch = {batch}: wanted a folder with {SEED if follow else 'cases/'}, made by seal.py")
     if not (command := shlex.split(tool)) or shutil.which(command[0]) is None:
         raise ValueError(f"tool = {tool!r}: wanted a command line that begins with a program")
     _devices(gpus, workers)
-    cases = sorted((batch / "cases").iterdir())
-    todo = [case for case in cases if not (answers / case.name / "explanation.json").exists()]
-    todo.sort(key=_rank, reverse=True)
+    planned = sum(json.loads((batch / SEED).read_text())["counts"]) if follow else len(_whole(batch, follow))
     answers.mkdir(parents=True, exist_ok=True)
-    print(f"{len(cases)} cases, {len(cases) - len(todo)} of them answered already", flush=True)
-    with tqdm(total=len(cases), initial=len(cases) - len(todo), unit="case", smoothing=0) as bar:
+    known = sum(1 for _ in answers.glob("*/explanation.json"))
+    print(f"{planned} cases, {known} of them answered already", flush=True)
+    with tqdm(total=planned, initial=known, unit="case", smoothing=0) as bar:
+        begun: set[Path] = set()
 
-        def each(todo: list[Path], workers: int) -> list[Path]:
-            """Ask for these; returns what has no answer then."""
+        def waiting() -> list[Path]:
+            """What is to be begun, the longest first."""
+            left = [case for case in _whole(batch, follow) if case not in begun and not (answers / case.name).exists()]
+            return sorted(left, key=_rank, reverse=True)
+
+        def each(workers: int, follow: bool) -> None:
+            """Ask for these, and for what is made meanwhile."""
             free: queue.SimpleQueue[str] = queue.SimpleQueue()
             for device in _devices(gpus, workers):
                 free.put(device)
@@ -245,25 +264,35 @@ def ask(
                 finally:
                     free.put(device)
 
+            running: dict[concurrent.futures.Future[dict[str, Any]], Path] = {}
             with _shared(gpus, workers) as sharing, concurrent.futures.ThreadPoolExecutor(workers) as pool:
-                jobs = {pool.submit(answered, case): case for case in todo}
                 try:
-                    for job in concurrent.futures.as_completed(jobs):
-                        case, found = jobs[job], job.result()
-                        reason = f" ({found.get('error', '')[:200]})" if found["verdict"] == "failed" else ""
-                        if (answers / case.name).exists():
-                            bar.write(f"{case.name}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
-                            bar.update()
-                        else:
-                            bar.write(f"{case.name}: asked again, as a fault has ended what shared its GPU{reason}")
+                    while True:
+                        made = (batch / "truth.sealed").exists()  # before the cases are counted
+                        for case in waiting()[: workers - len(running)]:
+                            begun.add(case)
+                            running[pool.submit(answered, case)] = case
+                        if not running and (made or not follow):
+                            break
+                        if not running:
+                            time.sleep(LOOK)
+                        for job in concurrent.futures.wait(running, LOOK, concurrent.futures.FIRST_COMPLETED).done:
+                            case, found = running.pop(job), job.result()
+                            reason = f" ({found.get('error', '')[:200]})" if found["verdict"] == "failed" else ""
+                            if (answers / case.name).exists():
+                                bar.write(f"{case.name}: {found['verdict']} in {found['judge_seconds']:.0f} s{reason}")
+                                bar.update()
+                            else:
+                                bar.write(f"{case.name}: asked again, as a fault has ended what shared its GPU{reason}")
                 except BaseException:
                     STOPPED.set()
                     pool.shutdown(wait=True, cancel_futures=True)
                     raise
-            return [case for case in todo if not (answers / case.name).exists()]
 
-        if left := each(todo, workers):
-            each(left, gpus)
+        each(workers, follow)
+        begun.clear()
+        if waiting():
+            each(gpus, follow=False)
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
         for path in sorted(answers.rglob("*"))

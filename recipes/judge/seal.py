@@ -5,10 +5,10 @@
     python recipes/judge/seal.py --out runs/judge/calibration --batch calibration ...   # to tune on; disjoint seeds
 
 Writes OUT/cases/<id>/, which may be shown, OUT/truth.sealed and its SHA-256, and OUT/sealed/ with the recordings of the
-held-out trials. Each motion is a job of its own, and kept until its case is made: processes end together, and,
-interrupted, the same command goes on. What is always there and never counts as physics: the modulus may be off by 10 %,
-the pressure by 5 %, beside clock, scale, frame, marker places, noise and losses. The effect "modulus" is at least 25 %.
-Half of the nulls are decoys: errors of measurement larger than stated.
+held-out trials. Each motion is a job of its own, and kept until its case is made, as soon as all its motions are there:
+processes end together, and, interrupted, the same command goes on. What is always there and never counts as physics:
+the modulus may be off by 10 %, the pressure by 5 %, beside clock, scale, frame, marker places, noise and losses. The
+effect "modulus" is at least 25 %. Half of the nulls are decoys: errors of measurement larger than stated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,9 @@ import multiprocessing
 import os
 import secrets
 import time
-from collections.abc import Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -42,6 +44,9 @@ BATCHES = ("calibration", "test", "smoke")
 BELIEVED = "sealed/believed"  # folder of motions as believed, which cases share
 MOTIONS = "sealed/motions"  # of motions of cases that are not made yet
 DRAWS = 60  # of a case, until a body bears what was drawn
+
+Job = tuple["Plan", list[int], Path, float]
+"""A case to be made: its plan, its seed, the folder of the batch, and what divides the elements' edge."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -265,7 +270,7 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     }
 
 
-def _work(job: tuple[Plan, list[int], Path, float]) -> str:
+def _work(job: Job) -> str:
     plan, seed, out, finer = job
     target = out / "sealed" / f"{plan.name}.json"
     truth = make(plan, seed, out, finer)
@@ -283,7 +288,7 @@ def _simulate(job: tuple[str, int, World, float, Path]) -> str:
     return f"{name}: motion {number} as believed"
 
 
-def _motions(job: tuple[Plan, list[int], Path, float]) -> list[tuple[Path, str, int, World, Errors, float]]:
+def _motions(job: Job) -> list[tuple[Path, str, int, World, Errors, float]]:
     """Motions of the draw that a case is as far as is known, and of those before it that are broken."""
     plan, seed, out, finer = job
     specimen, found = SPECIMENS[plan.specimen](), []
@@ -304,6 +309,44 @@ def _one(motion: tuple[Path, str, int, World, Errors, float]) -> str:
     with contextlib.suppress(Broken):
         _motion(SPECIMENS[name](), number, world, errors, finer, path.parent)
     return f"{name}: motion {number}"
+
+
+class _Here(Executor):
+    """Does what it is given at once, in this process."""
+
+    def submit(self, what: Callable[..., Any], /, *args: Any, **more: Any) -> Future[Any]:
+        done: Future[Any] = Future()
+        done.set_result(what(*args, **more))
+        return done
+
+
+def _made(
+    pool: Executor, processes: int, expected: Sequence[tuple[str, int, World, float, Path]], jobs: Sequence[Job]
+) -> Iterator[str]:
+    """Make what is believed, all motions, and each case as soon as its own are there; tells what is done."""
+    todo: deque[tuple[int, Callable[..., str], Any]] = deque((-1, _simulate, one) for one in expected)
+    first = [[m for m in _motions(job) if not m[0].exists()] for job in jobs]
+    todo += [(k, _one, m) for k, motions in enumerate(first) for m in motions]
+    count, simulated, every = [len(motions) for motions in first], 0, sum(map(len, first))
+    todo.extendleft((k, _work, jobs[k]) for k, motions in enumerate(first) if not motions)
+    running: dict[Future[str], tuple[int, Callable[..., str]]] = {}
+    while todo or running:
+        while todo and len(running) < processes:
+            k, what, given = todo.popleft()
+            running[pool.submit(what, given)] = k, what
+        for done in wait(running, return_when=FIRST_COMPLETED).done:
+            k, what = running.pop(done)
+            if what is not _one:
+                yield done.result()
+                continue
+            simulated += 1
+            yield f"{done.result()}, {simulated} of {every}"
+            count[k] -= 1
+            if not count[k]:
+                # A draw that turns out broken is followed by another.
+                more = [m for m in _motions(jobs[k]) if not m[0].exists()]
+                count[k], every = len(more), every + len(more)
+                todo.extendleft([(k, _one, m) for m in more] or [(k, _work, jobs[k])])
 
 
 def _lasting(name: str, finer: float) -> float:
@@ -400,15 +443,8 @@ def seal(
         (name, i, world, finer, out / BELIEVED)
         for name in slow for i in range(len(SPECIMENS[name]().trials)) for world in _expected(SPECIMENS[name]())
     ]  # fmt: skip
-    with multiprocessing.get_context("spawn").Pool(processes) if processes > 1 else contextlib.nullcontext() as pool:
-        each = pool.imap_unordered if pool else map
-        for line in each(_simulate, expected):
-            print(line, flush=True)
-        # Draws that turn out broken are followed by others.
-        while motions := [m for job in jobs for m in _motions(job) if not m[0].exists()]:
-            for k, line in enumerate(each(_one, motions)):
-                print(f"{line}, {k + 1} of {len(motions)}", flush=True)
-        for line in each(_work, jobs):
+    with _Here() if processes == 1 else ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        for line in _made(pool, processes, expected, jobs):
             print(line, flush=True)
     if left:
         print(f"{left} cases of other bodies are left to be made; the truth is sealed when all are there")
