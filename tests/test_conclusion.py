@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -405,3 +406,17 @@ def test_an_extension_keeps_its_name_where_evidence_is_for_a_difference_that_mat
     assert not priced or distance < twin.size
     found = conclude(weighing, limit=0.0)
     assert (found.kind, found.chosen) == ("explained", (name,))
+
+
+@pytest.mark.parametrize(("simple", "called"), [(4e-6, "nothing"), (12e-6, "lag")])
+def test_an_extension_of_what_moves_less_than_the_twin_may_err_is_told_as_nothing(simple, called, monkeypatch):
+    monkeypatch.setattr(conclusion, "apart", lambda *_: 10e-6)  # less than what matters
+    near = SimpleNamespace(
+        numerics=SimpleNamespace(size=9e-6), model=SimpleNamespace(simpler=("lag",), effects=("leak",))
+    )
+    common = {"best": SimpleNamespace(near=near), "left": 0.0, "credible": True, "ln_evidence": 0.0}
+    leak = SimpleNamespace(name="leak", size=14e-6, probability=0.9, **common)
+    lag = SimpleNamespace(name="lag", size=simple, probability=0.01, **common)
+    names = {"leak": leak, "lag": lag}
+    found = conclusion._meaning(leak, names, 1e-4, 1e-4, 40e-6, 9e-6, lambda *_: True)
+    assert found == ("nothing", called)

@@ -9,17 +9,17 @@ import pytest
 from swings import draws, recorded
 
 from torchsoro.sim2real.inference.observed import size_of
-from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, cleared
+from torchsoro.sim2real.inference.remaining_error import ORDER, by_richardson, by_spread, cleared
 
 SHIFTS = np.linspace(-1.0, 1.0, 7)
 
 
-def test_richardson_finds_an_error_that_falls_with_the_square_of_the_edge():
+def test_richardson_finds_an_error_that_falls_with_a_power_of_the_edge():
     data, nothing, _ = recorded(0.0, 1)
     time = data.trials[0].time
     error = 0.03 * np.sin(40 * time)[:, None, None] * np.ones((1, 3, 2))
     finer = tuple(r + error for r in nothing.residuals)
-    coarser = tuple(r + 1.5**2 * error for r in nothing.residuals)
+    coarser = tuple(r + 1.5**ORDER * error for r in nothing.residuals)
     priced = by_richardson(data, dataclasses.replace(nothing, residuals=finer), coarser, 1.5)
     assert priced.numerics.amplitude == pytest.approx(float(np.sqrt((error**2).mean())), rel=1e-6)
     assert np.abs(priced.numerics.draws[0][0]) == pytest.approx(np.abs(error), abs=1e-12)

@@ -251,7 +251,7 @@ def pad() -> Specimen:
     names = ("friction", "friction", "adhesion", "adhesion", "wall_offset", "density", "viscoelastic",
              "attached_mass", "modulus", "soft_side")  # fmt: skip
     return Specimen(
-        name="pad", setup=setup, trials=trials, rate=150, edge=0.007, effects=names,
+        name="pad", setup=setup, trials=trials, rate=150, edge=0.0047, effects=names,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 

@@ -25,7 +25,6 @@ from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood,
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
-from torchsoro.sim2real.inference.resolution import between
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.weighing import Weighing
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
@@ -182,15 +181,13 @@ def _corrected(
             _spread(data, model, variants, edges, own)
             for model, own, variants in zip(models, others, touching, strict=True)
         ]
-    middle = between(problem.twin, fine)
-    by_middle = problem.by(middle)
-    dull = [_residuals(problem, f, motions) for f, motions in zip(fits, by_middle.simulate(ask), strict=True)]
-    ratio = max((fine.count / middle.count) ** (1 / 3), LEAST_RATIO)
+    # The coarser one moves as the finer one does, as far as a modulus and a pressure can make it.
+    ratio = max((fine.count / problem.twin.count) ** (1 / 3), LEAST_RATIO)
     return [
-        by_richardson(data, dataclasses.replace(model, residuals=finer[0]), coarser[0], ratio)
-        if model is not None and finer and coarser
+        by_richardson(data, dataclasses.replace(model, residuals=finer[0]), model.residuals, ratio)
+        if model is not None and finer
         else None
-        for model, finer, coarser in zip(models, sharp, dull, strict=True)
+        for model, finer in zip(models, sharp, strict=True)
     ]
 
 

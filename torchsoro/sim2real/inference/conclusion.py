@@ -173,7 +173,9 @@ def _meaning(
     called = c.name if adds else name
     unexplained = c.left > max(UNEXPLAINED * left, noise, error, own)
     if c.size < max(least, own):
-        return NOTHING, NOTHING if unexplained or c.size < own else called
+        # An extension that adds nothing to what moves the body by less than the twin may err is no more than that.
+        seen = min(c.size, names[called].size) >= own
+        return NOTHING, called if seen and not unexplained else NOTHING
     if unexplained:
         return UNKNOWN, UNKNOWN
     if c.left > max(c.size, own):

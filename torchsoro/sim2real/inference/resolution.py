@@ -77,7 +77,7 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
 
 
 def between(twin: Twin, fine: Twin) -> Twin:
-    """A twin with cells between those of two others, by which the error of the finer one is told.
+    """A twin with cells between those of two others, as good as these where it is decided which node touches when.
 
     Args:
         twin: The one in use.
