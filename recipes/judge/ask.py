@@ -238,7 +238,8 @@ def ask(
     if not (command := shlex.split(tool)) or shutil.which(command[0]) is None:
         raise ValueError(f"tool = {tool!r}: wanted a command line that begins with a program")
     _devices(gpus, workers)
-    planned = sum(json.loads((batch / SEED).read_text())["counts"]) if follow else len(_whole(batch, follow))
+    there = [] if follow else _whole(batch, follow)
+    planned = sum(json.loads((batch / SEED).read_text())["counts"]) if follow else len(there)
     answers.mkdir(parents=True, exist_ok=True)
     known = sum(1 for _ in answers.glob("*/explanation.json"))
     print(f"{planned} cases, {known} of them answered already", flush=True)
@@ -247,8 +248,8 @@ def ask(
 
         def waiting() -> list[Path]:
             """What is to be begun, the longest first."""
-            left = [case for case in _whole(batch, follow) if case not in begun and not (answers / case.name).exists()]
-            return sorted(left, key=_rank, reverse=True)
+            cases = [case for case in (there or _whole(batch, follow)) if case not in begun]
+            return sorted((case for case in cases if not (answers / case.name).exists()), key=_rank, reverse=True)
 
         def each(workers: int, follow: bool) -> None:
             """Ask for these, and for what is made meanwhile."""
@@ -290,8 +291,8 @@ def ask(
                     raise
 
         each(workers, follow)
-        begun.clear()
-        if waiting():
+        if left := {case for case in begun if not (answers / case.name).exists()}:
+            begun -= left
             each(gpus, follow=False)
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
