@@ -133,10 +133,10 @@ def _devices(gpus: int, workers: int) -> list[str]:
     return [names[worker % gpus] for worker in range(workers)] if gpus else [""] * workers
 
 
-def _whole(batch: Path, follow: bool) -> list[Path]:
-    """Cases that can be asked for; of a batch that is still being made, those whose truth is written."""
+def _whole(batch: Path) -> list[Path]:
+    """Cases of a batch that is being made whose truth is written, so that they are whole."""
     cases = sorted((batch / "cases").glob("*"))
-    return [case for case in cases if not follow or (batch / "sealed" / f"{case.name}.json").exists()]
+    return [case for case in cases if (batch / "sealed" / f"{case.name}.json").exists()]
 
 
 def _rank(case: Path) -> int:
@@ -238,20 +238,20 @@ def ask(
     if not (command := shlex.split(tool)) or shutil.which(command[0]) is None:
         raise ValueError(f"tool = {tool!r}: wanted a command line that begins with a program")
     _devices(gpus, workers)
-    there = [] if follow else _whole(batch, follow)
+    there = _whole(batch) if follow else sorted((batch / "cases").iterdir())
     planned = sum(json.loads((batch / SEED).read_text())["counts"]) if follow else len(there)
     answers.mkdir(parents=True, exist_ok=True)
-    known = sum(1 for _ in answers.glob("*/explanation.json"))
+    known = sum((answers / case.name / "explanation.json").exists() for case in there)
     print(f"{planned} cases, {known} of them answered already", flush=True)
     with tqdm(total=planned, initial=known, unit="case", smoothing=0) as bar:
         begun: set[Path] = set()
 
         def waiting() -> list[Path]:
             """What is to be begun, the longest first."""
-            cases = [case for case in (there or _whole(batch, follow)) if case not in begun]
+            cases = [case for case in (_whole(batch) if follow else there) if case not in begun]
             return sorted((case for case in cases if not (answers / case.name).exists()), key=_rank, reverse=True)
 
-        def each(workers: int, follow: bool) -> None:
+        def each(workers: int) -> None:
             """Ask for these, and for what is made meanwhile."""
             free: queue.SimpleQueue[str] = queue.SimpleQueue()
             for device in _devices(gpus, workers):
@@ -269,11 +269,11 @@ def ask(
             with _shared(gpus, workers) as sharing, concurrent.futures.ThreadPoolExecutor(workers) as pool:
                 try:
                     while True:
-                        made = (batch / "truth.sealed").exists()  # before the cases are counted
-                        for case in waiting()[: workers - len(running)]:
+                        made = not follow or (batch / "truth.sealed").exists()  # before the cases are counted
+                        for case in waiting()[: workers - len(running)] if len(running) < workers else ():
                             begun.add(case)
                             running[pool.submit(answered, case)] = case
-                        if not running and (made or not follow):
+                        if not running and made:
                             break
                         if not running:
                             time.sleep(LOOK)
@@ -290,10 +290,10 @@ def ask(
                     pool.shutdown(wait=True, cancel_futures=True)
                     raise
 
-        each(workers, follow)
+        each(workers)
         if left := {case for case in begun if not (answers / case.name).exists()}:
             begun -= left
-            each(gpus, follow=False)
+            each(gpus)
     lines = [
         f"{hashlib.sha256(path.read_bytes()).hexdigest()}  {path.relative_to(answers)}"
         for path in sorted(answers.rglob("*"))
