@@ -10,6 +10,7 @@ import pytest
 from ringing import bar, effect
 
 from torchsoro.sim2real.data.schema import PlaneTable
+from torchsoro.sim2real.hypotheses.body_effects import TautTether
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.hypotheses.outer_effects import Friction, WallOffset
 from torchsoro.sim2real.inference import likelihood
@@ -88,6 +89,7 @@ def test_priors_are_those_of_quantities(weighed):
     assert [p.high for p in mass.priors[2:5]] == [10.0, 10.0, 10.0]
     assert mass.own == (1, 2, 3, 4)
     assert model_of(problem, (effect("tether"),)).simpler == ("attached_mass",)
+    assert model_of(problem, (TautTether(),)).simpler == ("gravity_tilt",)
     assert model_of(problem, (effect("modulus"),)).own == (0,)  # the belief is held
     assert model_of(problem, (effect("modulus"),)).released == (0,)
     assert model_of(problem, (effect("density"), effect("modulus"))).released == (1,)
@@ -309,3 +311,17 @@ def test_cells_that_are_as_good_count_where_bodies_touch(on_a_plane):
     assert other is not None
     assert len(other.numerics.draws) == len(one.numerics.draws) + 1
     assert other.numerics.size > one.numerics.size
+
+
+def test_the_difference_to_larger_cells_counts_where_walls_are_two_of_these_wide(on_a_plane):
+    known = measure(on_a_plane.experiment, on_a_plane.twin, on_a_plane.fine)
+    (fit,) = on_a_plane.fit([((), None)], rounds=0)
+    assert fit is not None
+    (one,), (other,) = (
+        near(on_a_plane.only(on_a_plane.trials, discretization=known.replace(walls=w)), [fit]) for w in ((1, 2), (2, 4))
+    )
+    assert one is not None
+    assert other is not None
+    deviation = np.mean([d**2 for d in known.deviation.values()], 0).T
+    assert other.numerics.amplitude**2 == pytest.approx(one.numerics.amplitude**2 + deviation, rel=1e-9)
+    assert other.numerics.size > 1.05 * one.numerics.size

@@ -145,6 +145,17 @@ def test_where_no_model_is_right_the_one_that_leaves_less_is_told(wrong):
     assert (found.chosen, found.partly) == (("leak",), True)
 
 
+def test_where_no_model_is_right_an_extension_that_leaves_less_is_told_only_if_evidence_is_for_it(wrong):
+    data, nothing, smooth, rough = wrong
+    drag, pair = smooth("drag"), rough("drag + leak")
+    for simpler, told_first in (((), "drag + leak"), (("drag",), "drag")):
+        model = dataclasses.replace(pair.model, simpler=simpler)
+        weighing = weighed(data, nothing, drag, dataclasses.replace(pair, model=model))
+        evidence = {p.near.model.name: p.ln_evidence for p in weighing.effects}
+        assert weighing.best.matters and evidence["drag"] - evidence["drag + leak"] > 40
+        assert conclude(weighing, limit=0.0).chosen == (told_first,)
+
+
 @pytest.mark.parametrize(("priced", "drag"), [(0.1, 0.0), (0.15, 1.0)])
 def test_evidence_is_heard_beside_size_for_a_name_that_leaves_no_more_than_the_twin_may_err(wrong, priced, drag):
     """How much more or less probable than the one that leaves less is the one that evidence is for."""

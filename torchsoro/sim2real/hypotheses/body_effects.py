@@ -261,7 +261,10 @@ class Tether(Hypothesis):
 
 
 class TautTether(Hypothesis):
-    """A taut tube pulls at a place, with a force that hardly changes as the body moves."""
+    """A taut tube pulls at a place, with a force that hardly changes as the body moves.
+
+    Spread over the body, the force would be that of a tilt.
+    """
 
     name, affected_quantity, local, model_form_deviation = "tether", "force at a place", True, LAW
     nonnegative = frozenset({"pull_n"})
@@ -271,6 +274,10 @@ class TautTether(Hypothesis):
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
         """Its size as well."""
         return {**super().reported(values, scenario, twin), "pull_n": (float(np.linalg.norm(values[:3])), "N")}
+
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
+        """Without a place, a tilt: none, as its size hangs on the weight of the body."""
+        return [Simpler("gravity_tilt", np.zeros(2))]
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
         """One force for each place, on the variations whose place it is."""

@@ -34,6 +34,7 @@ FAR = 10.0  # deviations of a measurement error, beyond which its slope at rest 
 # a rigid one, as it sticks here and there, in cells of 6.5 to 2.6 mm and in another code.
 SLIDING = 0.03
 LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the other
+RESOLVED = 2  # cells through the thinnest wall, from which on the error falls with their edge
 
 Moved = Mapping[Fit, Sequence[Motions]]  # residuals by the finer twin with planes moved; none where one breaks down
 
@@ -157,10 +158,14 @@ def _corrected(
     data = data_of(problem)
     by_fine = problem.by(fine)
     edges = problem.twin.edge / fine.edge
+    known = _by_larger_cells(problem)
     if problem.rough and closely:
         fresh = [f for f in fits if f not in moved]
         moved = {**moved, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
-        return [_spread(data, model, moved[f], edges, own) for f, model, own in zip(fits, models, others, strict=True)]
+        return [
+            _spread(data, model, moved[f], edges, own, known)
+            for f, model, own in zip(fits, models, others, strict=True)
+        ]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
@@ -170,7 +175,7 @@ def _corrected(
         touching = _touching(problem, coarse, fits)
         for model, own, finer, variants in zip(models, others, sharp, touching, strict=True):
             finest = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
-            found.append(_spread(data, model, finest, edges, own))
+            found.append(_spread(data, model, finest, edges, own, known))
         return found
     if problem.touches:
         # Chance is about the same at all points, as long as nothing is looked at closely: that at the setup as stated.
@@ -178,7 +183,7 @@ def _corrected(
             _with_planes_moved(problem, f, m) if finer else [] for f, m, finer in zip(fits, motions, sharp, strict=True)
         ]
         return [
-            _spread(data, model, variants, edges, own)
+            _spread(data, model, variants, edges, own, known)
             for model, own, variants in zip(models, others, touching, strict=True)
         ]
     # The coarser one moves as the finer one does, as far as a modulus and a pressure can make it.
@@ -192,12 +197,24 @@ def _corrected(
 
 
 def _spread(
-    data: Data, model: Linearised | None, variants: Sequence[Motions], edges: float, others: Sequence[Motions]
+    data: Data,
+    model: Linearised | None,
+    variants: Sequence[Motions],
+    edges: float,
+    others: Sequence[Motions],
+    known: np.ndarray,
 ) -> Linearised | None:
     """A model by equally good twins, with the ratio of edges of cells; none where a simulation broke down."""
     if model is None or not variants:
         return None
-    return by_spread(data, model, variants, GAPS, model.residuals, edges, others)
+    return by_spread(data, model, variants, GAPS, model.residuals, edges, others, known)
+
+
+def _by_larger_cells(problem: FitProblem) -> np.ndarray:
+    """Standard deviation of the error by the difference to larger cells [A, M] m; 0 where they are as wide as walls."""
+    known = problem.discretization
+    deviation = np.sqrt(np.mean([known.of(t) ** 2 for t in problem.trials], 0)).T
+    return np.asarray(deviation * (min(known.walls, default=0) >= RESOLVED))
 
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:

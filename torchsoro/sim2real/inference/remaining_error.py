@@ -16,8 +16,8 @@ where planes are is stated. Beside that line, their mean at no shift predicts be
     S = (1 + 1/R) 1/(R - 2) sum_r d_r d_r',    d_r = y_r - mean - g_r sum_q g_q y_q / sum_q g_q^2,    sum_q g_q = 0,
 
 to which that of other cells is added, which are as good. The whole difference to larger cells, the error of the finer
-ones at order one, is a direction in which these may be off, but no measure of how far: of them, one is as wide as a
-wall.
+ones at order one, is a direction in which these may be off. It is no measure of how far where one of them is as wide as
+a wall; where walls have two or more, what it is of motions as believed counts beside chance.
 
 In both, only that counts which beliefs and measurement errors cannot take up.
 """
@@ -76,6 +76,7 @@ def by_spread(
     coarser: Motions | None = None,
     ratio: float = math.inf,
     others: Sequence[Motions] = (),
+    known: np.ndarray | float = 0.0,
 ) -> Linearised:
     """The mean of equally good twins, with the error that this has, in each trial by itself.
 
@@ -91,6 +92,7 @@ def by_spread(
         coarser: Residuals by a twin with larger cells.
         ratio: Edge of its cells over that of the variants'.
         others: Errors of other kinds: what other cells that are as good, or another coefficient of friction, change.
+        known: Standard deviation of an error that is known by its size alone [A, M] m.
 
     Raises:
         ValueError: for fewer than three variants, shifts that are not theirs or do not sum to zero, or a ratio that is
@@ -114,7 +116,9 @@ def by_spread(
     apart = [cleared(data, near, other) for other in others]
     process = _process(data, [*draws, *apart], [*modes, *apart])
     together = tuple(np.stack(same, -1) for same in zip(*modes, *whole, *apart, strict=True))
-    numerics = dataclasses.replace(process, draws=(*draws, *whole, *apart), modes=together)
+    numerics = dataclasses.replace(
+        process, amplitude=np.hypot(process.amplitude, known), draws=(*draws, *whole, *apart), modes=together
+    )
     return dataclasses.replace(near, residuals=mean, numerics=numerics)
 
 

@@ -16,7 +16,8 @@ not known, of root mean square r, left by a model with K numbers of its own, hav
 
     ln p = -N ln r - K/2 ln N,
 
-times what the prior says of stated numbers. So it does between modes of one name, by r alone.
+times what the prior says of stated numbers. So it does between modes of one name, by r alone. An extension always
+leaves less than what it extends, so that beside that it is no more probable than by evidence.
 
 Two names are told apart no better than the twin can. What the first leaves may be the twin's error, up to the size that
 this is priced at, and it may lie along their difference. With an error of that size, all samples count as few numbers,
@@ -329,6 +330,10 @@ class Weighing:
                 own = len(modes[0].near.model.own)
                 size = math.hypot(left[name], self.data.noise)
                 rest[name] = ln_prior[name] - count * math.log(size) - 0.5 * own * math.log(count) + self._strain(name)
+            # Those of one effect first, as pairs extend these.
+            for name, (mode, *_) in sorted(groups.items(), key=lambda g: len(g[1][0].near.model.effects)):
+                for plain in set(mode.near.model.simpler) & set(rest):
+                    rest[name] = min(rest[name], rest[plain] + ln_p[name] - ln_p[plain])
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         if groups:
             probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_p, ln_prior, left)
