@@ -125,14 +125,13 @@ def near(
             models.append(None)
             continue
         moving = ~held_of(problem, f.effects)
-        stated = np.mean([bare.of(t) ** 2 for t in problem.trials], 0).T
         models.append(
             Linearised(
                 model=model_of(problem, f.effects),
                 at=np.concatenate([f.point[moving], f.errors]),
                 residuals=_left(problem, [m.alone(0) for m in motions], f.errors),
                 slopes=_slopes(problem, motions, h, moving, f.errors),
-                numerics=TwinError(amplitude=np.sqrt(stated)),
+                numerics=TwinError(amplitude=_deviation(problem, bare)),
             )
         )
     if finer is None:
@@ -158,14 +157,20 @@ def _corrected(
     data = data_of(problem)
     by_fine = problem.by(fine)
     edges = problem.twin.edge / fine.edge
-    known = _by_larger_cells(problem)
+    # Of larger cells, one as wide as a wall is no measure.
+    resolved = min(problem.discretization.walls, default=0) >= RESOLVED
+    known = _deviation(problem, problem.discretization) if resolved else 0.0
+
+    def spread(model: Linearised | None, variants: Sequence[Motions], own: Sequence[Motions]) -> Linearised | None:
+        """A model by equally good twins; none where a simulation broke down."""
+        if model is None or not variants:
+            return None
+        return by_spread(data, model, variants, GAPS, model.residuals, edges, own, known)
+
     if problem.rough and closely:
         fresh = [f for f in fits if f not in moved]
         moved = {**moved, **dict(zip(fresh, _touching(problem, by_fine, fresh), strict=True))}
-        return [
-            _spread(data, model, moved[f], edges, own, known)
-            for f, model, own in zip(fits, models, others, strict=True)
-        ]
+        return [spread(model, moved[f], own) for f, model, own in zip(fits, models, others, strict=True)]
     ask: list[Request] = [(f.effects, f.point[None]) for f in fits]
     motions = by_fine.simulate(ask)
     sharp = [_residuals(problem, f, m) for f, m in zip(fits, motions, strict=True)]
@@ -175,17 +180,14 @@ def _corrected(
         touching = _touching(problem, coarse, fits)
         for model, own, finer, variants in zip(models, others, sharp, touching, strict=True):
             finest = [_sum(finer[0], v, model.residuals) for v in variants] if model is not None and finer else []
-            found.append(_spread(data, model, finest, edges, own, known))
+            found.append(spread(model, finest, own))
         return found
     if problem.touches:
         # Chance is about the same at all points, as long as nothing is looked at closely: that at the setup as stated.
         touching = [
             _with_planes_moved(problem, f, m) if finer else [] for f, m, finer in zip(fits, motions, sharp, strict=True)
         ]
-        return [
-            _spread(data, model, variants, edges, own, known)
-            for model, own, variants in zip(models, others, touching, strict=True)
-        ]
+        return [spread(model, variants, own) for model, own, variants in zip(models, others, touching, strict=True)]
     # The coarser one moves as the finer one does, as far as a modulus and a pressure can make it.
     ratio = max((fine.count / problem.twin.count) ** (1 / 3), LEAST_RATIO)
     return [
@@ -196,25 +198,9 @@ def _corrected(
     ]
 
 
-def _spread(
-    data: Data,
-    model: Linearised | None,
-    variants: Sequence[Motions],
-    edges: float,
-    others: Sequence[Motions],
-    known: np.ndarray,
-) -> Linearised | None:
-    """A model by equally good twins, with the ratio of edges of cells; none where a simulation broke down."""
-    if model is None or not variants:
-        return None
-    return by_spread(data, model, variants, GAPS, model.residuals, edges, others, known)
-
-
-def _by_larger_cells(problem: FitProblem) -> np.ndarray:
-    """Standard deviation of the error by the difference to larger cells [A, M] m; 0 where they are as wide as walls."""
-    known = problem.discretization
-    deviation = np.sqrt(np.mean([known.of(t) ** 2 for t in problem.trials], 0)).T
-    return np.asarray(deviation * (min(known.walls, default=0) >= RESOLVED))
+def _deviation(problem: Likelihood, error: DiscretizationError) -> np.ndarray:
+    """Standard deviation of the twin's error that is stated, over the trials [A, M] m."""
+    return np.asarray(np.sqrt(np.mean([error.of(t) ** 2 for t in problem.trials], 0)).T)
 
 
 def _touching(problem: Likelihood, twin: Likelihood, fits: Sequence[Fit]) -> list[list[Motions]]:

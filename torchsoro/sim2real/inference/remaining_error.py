@@ -17,7 +17,7 @@ where planes are is stated. Beside that line, their mean at no shift predicts be
 
 to which that of other cells is added, which are as good. The whole difference to larger cells, the error of the finer
 ones at order one, is a direction in which these may be off. It is no measure of how far where one of them is as wide as
-a wall; where walls have two or more, what it is of motions as believed counts beside chance.
+a wall; where walls have two or more, the standard deviation by which searches are weighted counts beside chance.
 
 In both, only that counts which beliefs and measurement errors cannot take up.
 """
