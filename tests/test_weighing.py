@@ -112,14 +112,16 @@ def test_the_adjustment_of_a_twin_that_errs_along_a_response_grows_with_the_squa
     data, nothing, drag = recorded(0.0, 21)
     size = np.full_like(data.amplitudes[0], 0.02)
 
-    def kappa(error):
+    def kappa(error, share=1.0):
         twin = TwinError(amplitude=size, draws=(tuple(error * J[..., 0] for J in drag.slopes),))
         found = infer(data, dataclasses.replace(nothing, numerics=twin))
-        fixed = dataclasses.replace(found.none, discrepancy=Discrepancy(share=0.01))
+        fixed = dataclasses.replace(found.none, discrepancy=Discrepancy(share=0.01, twin=share))
         return adjustment(data, dataclasses.replace(found, some=fixed, none=fixed), drag.slopes)
 
     assert kappa(0.0) == 1.0
     assert kappa(0.2) - 1 == pytest.approx(4 * (kappa(0.1) - 1), rel=1e-9)
+    # An error along a response is taken up by the effect, so that what is left of it says nothing of its size.
+    assert kappa(0.1, share=0.1) > kappa(0.1)
 
 
 def test_a_mode_that_was_found_twice_counts_once():

@@ -11,7 +11,6 @@ import numpy as np
 
 from torchsoro.sim2real.hypotheses.outer_effects import Friction
 from torchsoro.sim2real.inference.decision import FREEDOM, STRENGTH, TOLERANCE
-from torchsoro.sim2real.inference.discretization import GAPS, shifted
 from torchsoro.sim2real.inference.evidence import (
     Linearised,
     Model,
@@ -25,6 +24,7 @@ from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood,
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
+from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.weighing import Weighing
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
@@ -116,9 +116,10 @@ def near(
     bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
     steps = [problem.steps(f.effects, f.point) for f in fits]
-    beside = coarse.simulate(
-        [(f.effects, np.concatenate([f.point[None], f.point + np.diag(h)])) for f, h in zip(fits, steps, strict=True)]
-    )
+    asked = [
+        (f.effects, np.concatenate([f.point[None], f.point + np.diag(h)])) for f, h in zip(fits, steps, strict=True)
+    ]
+    beside = averaged(coarse, asked, problem.looks)
     models: list[Linearised | None] = []
     for f, h, motions in zip(fits, steps, beside, strict=True):
         if not all(m.sound.all() for m in motions):

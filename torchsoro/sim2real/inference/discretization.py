@@ -10,20 +10,19 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial
-from torchsoro.sim2real.hypotheses.outer_effects import WallOffset
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, STEP, WITHIN, Likelihood, Request, added
+from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.observed import Motions
 from torchsoro.sim2real.inference.remaining_error import chance_in
 from torchsoro.sim2real.inference.resolution import between
+from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
-GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
-NEARER = 2e-5 * np.array([-1.0, 1.0])  # the same, of the twin in use
+NEARER = 2e-5 * np.array([-1.0, 1.0])  # shifts of planes by which the twin in use may be off [m]
 # Of recordings without measurement errors.
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
 OWN = 1 / 3  # share of the difference to a supplied simulation that may change with an effect
@@ -57,18 +56,20 @@ def measure(
     there = FitProblem(experiment, fine, trials=everything, **common)
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     cells: Mapping[str, MarkerTrajectory] = {}
-    chance = math.inf
+    chance = in_use = math.inf
     if there.touches and not any(t.simulated for t in trials):
         believed, touching, chance = _chance(there, len(trials))
+        _, _, in_use = _chance(FitProblem(experiment, twin, trials=trials, **common), len(trials))
         middle = _believed(FitProblem(experiment, between(twin, fine), trials=trials, **common))
         cells = added(trials, believed[: len(trials)], middle)
     else:
         believed = _believed(there)
     other = [as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
-    here = FitProblem(experiment, twin, trials=trials, priors=EXACT, **common)
+    rough = DiscretizationError(chance=chance, chance_in_use=in_use)
+    here = FitProblem(experiment, twin, trials=trials, discretization=rough, priors=EXACT, **common)
     fit = here.only(_recordings_of(here, other)).fit([((), None)], rounds=4)[0]
     shift = (0.0,) * len(here.common) if fit is None else tuple(fit.ln_factors.values())
-    known = DiscretizationError(shift=shift)
+    known = rough.replace(shift=shift)
     own = _believed(FitProblem(experiment, twin, trials=everything, discretization=known, **common))
     correction = added(everything, own, other)
     here = FitProblem(experiment, twin, trials=trials, discretization=known, **common)
@@ -94,23 +95,10 @@ def measure(
         touching=touching,
         between=cells,
         chance=chance,
+        chance_in_use=in_use,
         edges=(twin.edge, fine.edge),
         walls=thinnest,
     )
-
-
-def shifted(problem: Likelihood, points: Sequence[Request], gaps: np.ndarray) -> list[list[MarkerTrajectory]]:
-    """Motions of all trials with planes a little nearer and farther, for each request at one point.
-
-    Args:
-        problem: By whose twin.
-        points: Effects, and where [1, K].
-        gaps: By which planes are moved, towards the body if positive [R] m.
-    """
-    wall = WallOffset()
-    by = gaps[:, None] / wall.quantities[0].scale
-    asked = [((*effects, wall), np.concatenate([np.tile(at, (len(by), 1)), by], 1)) for effects, at in points]
-    return problem.simulate(asked)
 
 
 def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
@@ -122,10 +110,10 @@ def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
 
 
 def _chance(
-    fine: FitProblem, count: int
+    problem: FitProblem, count: int
 ) -> tuple[list[MarkerTrajectory], tuple[Mapping[str, MarkerTrajectory], ...], float]:
     """The motion as stated; what moved planes add to it in the first trials, by shift; how much is chance [m]."""
-    (motions,) = shifted(fine, [((), np.zeros((1, len(fine.common))))], GAPS)
+    (motions,) = shifted(problem, [((), np.zeros((1, len(problem.common))))], GAPS)
     middle = [m.alone(len(GAPS) // 2) for m in motions]
     if not all(m.sound.all() for m in middle):
         raise ValueError(BREAKS)
@@ -133,11 +121,11 @@ def _chance(
     if not all(m.sound.all() for m in kept):
         return middle, (), math.inf
     moved = [[m.alone(k) for m in kept] for k in range(len(GAPS))]
-    none = np.zeros(len(fine.observation.deviations))
+    none = np.zeros(len(problem.observation.deviations))
     seen: list[Motions] = [
-        tuple(fine.observation.observe(m, i, none) for i, m in enumerate(variant)) for variant in moved
+        tuple(problem.observation.observe(m, i, none) for i, m in enumerate(variant)) for variant in moved
     ]
-    touching = tuple(added(fine.trials[:count], middle[:count], variant) for variant in moved)
+    touching = tuple(added(problem.trials[:count], middle[:count], variant) for variant in moved)
     return middle, touching, chance_in(seen, GAPS)
 
 
@@ -171,14 +159,15 @@ def _apart(
     Returns:
         For each of the others and each trial [M, A] m.
     """
-    none, count = np.zeros(len(here.observation.deviations)), len(here.common)
-    motions = here.simulate([((), np.concatenate([np.zeros((1, count)), STEP * np.eye(count)]))])[0]
+    none, count, step = np.zeros(len(here.observation.deviations)), len(here.common), here.step
+    asked = np.concatenate([np.zeros((1, count)), step * np.eye(count)])
+    (motions,) = averaged(here, [((), asked)], here.looks)
     seen, columns = [], []
     for i, motion in enumerate(motions):
         own, by = here.observation.linearise(motion.alone(0), i, none)
         beside = [here.observation.observe(motion.alone(1 + k), i, none) for k in range(count)]
         seen.append(own)
-        columns.append(np.concatenate([*((x - own)[..., None] / STEP for x in beside), by], -1))
+        columns.append(np.concatenate([*((x - own)[..., None] / step for x in beside), by], -1))
     X = np.concatenate([c.reshape(-1, c.shape[-1]) for c in columns]) / here.noise
     H = X.T @ X + np.diag(np.concatenate([np.full(count, WITHIN), 1 / here.observation.deviations]) ** 2)
     found = []

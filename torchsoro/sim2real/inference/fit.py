@@ -14,6 +14,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Answer, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.probing import ranked_starts
+from torchsoro.sim2real.inference.touching import averaged
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.kernels.lanes import LANES
@@ -21,7 +22,7 @@ from torchsoro.simulation.kernels.lanes import LANES
 # Damping of the step that leaves a trial out: an unknown that the other trials hardly determine stays as it was.
 LEAVE_OUT_DAMPING = 1e-3
 ROOM = 2 * LANES  # simulations up to which derivatives are taken along; the same on any machine, as results are
-WEAK = 0.2  # of a probe point's strength: the response is also taken there, where it is nearer to linear
+WEAK = 0.2  # of a probe point's strength, at least: the response is also taken there, where it is nearer to linear
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -81,7 +82,9 @@ class FitProblem(Likelihood):
         """
         if self.fine is None:
             raise ValueError("fine: none, wanted a twin with smaller cells")
-        return dataclasses.replace(self.by(self.fine), coarser=(self.twin, tuple(self.shift)))
+        fine = self.by(self.fine)
+        error = fine.discretization.replace(chance_in_use=self.discretization.chance_in_use)
+        return dataclasses.replace(fine, discretization=error, coarser=(self.twin, tuple(self.shift)))
 
     @cached_property
     def _coarsely(self) -> Self | None:
@@ -104,7 +107,7 @@ class FitProblem(Likelihood):
             return self.simulate(requests)
         found = self.simulate([(effects, points[:1]) for effects, points in requests])
         several = [k for k, (_, points) in enumerate(requests) if len(points) > 1]
-        for k, motions in zip(several, coarsely.simulate([requests[k] for k in several]), strict=True):
+        for k, motions in zip(several, averaged(coarsely, [requests[k] for k in several], self.looks), strict=True):
             found[k] = [_changed(m.alone(), m, at.alone()) for m, at in zip(motions, found[k], strict=True)]
         return found
 
@@ -113,7 +116,7 @@ class FitProblem(Likelihood):
         coarsely = self._coarsely
         if coarsely is None:
             return self.simulate(requests)
-        middle, *found = coarsely.simulate([((), base.at[None]), *requests])
+        middle, *found = averaged(coarsely, [((), base.at[None]), *requests], self.looks)
         return [
             [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]
             for motions in found
@@ -149,7 +152,8 @@ class FitProblem(Likelihood):
             For each effect its probe points, best first: chi-squared that the linear response promises, and the point
             to begin a search with, in scales. Probe points whose simulation breaks down are left out.
         """
-        linear = [e.probe_points(self.twin) if e.joint else e.weak_probe_points(self.twin, WEAK) for e in effects]
+        weak = max(WEAK, self.step)
+        linear = [e.probe_points(self.twin) if e.joint else e.weak_probe_points(self.twin, weak) for e in effects]
         linear = [[e.with_masses_aside(d, self.twin) for d in own] for e, own in zip(effects, linear, strict=True)]
         points = [own if e.joint else own + e.probe_points(self.twin) for e, own in zip(effects, linear, strict=True)]
         requests = [
@@ -158,7 +162,7 @@ class FitProblem(Likelihood):
         ]
         simulated = self.responses(requests, base)
         return [
-            ranked_starts(self, e, own, len(through_zero), WEAK, motions, base)
+            ranked_starts(self, e, own, len(through_zero), weak, motions, base)
             for e, own, through_zero, motions in zip(effects, points, linear, simulated, strict=True)
         ]
 

@@ -21,10 +21,11 @@ from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.observed import Motions
+from torchsoro.sim2real.inference.touching import averaged
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SAME = 0.97  # cosine above which one effect passes for another
-SMALL = 0.1  # strength of a weak response, over that of the weakest probe point: it is linear there
+SMALL = 0.1  # strength of a weak response, over that of the weakest probe point, at least: it is linear there
 ROUNDING = 0.05  # whitened length of a response, below which it may be rounding in single precision
 
 
@@ -83,26 +84,27 @@ def isolability(
     # Effects that are fitted always need no simulation of their own.
     fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
     others = [e for e in effects if type(e) not in fitted]
-    looks = [_probe_points(effect, problem) for effect in others]
+    small = max(SMALL, problem.step)
+    looks = [_probe_points(effect, problem, small) for effect in others]
     probe_points = [[*weak, *strong] for weak, strong in looks]
-    still = np.concatenate([np.zeros((1, n)), SMALL * np.eye(n)])
+    still = np.concatenate([np.zeros((1, n)), small * np.eye(n)])
     asked = [
         ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
     ]
     problem = problem.only(problem.trials, even=True)
-    base, *found = problem.simulate([((), still), *asked])
+    base, *found = averaged(problem, [((), still), *asked], problem.looks)
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)
     believed = [m.alone(0) for m in base]
     moved = [moved_by(problem.observation, believed, motions) for motions in (base, *found)]
     blocks = [whitened(problem.noise_models, by) for by in moved]
-    blocks[0] = blocks[0][:, 1:] / SMALL
+    blocks[0] = blocks[0][:, 1:] / small
     by = errors_of(problem.observation, problem.noise_models, believed)
     common, *rest = np.split(
         shortened(blocks, by, problem.observation), np.cumsum([b.shape[1] for b in blocks])[:-1], 1
     )
     known = {
-        id(effect): _response(effect, mine, block, np.all([m.sound for m in motions], axis=0))
+        id(effect): _response(effect, mine, block, np.all([m.sound for m in motions], axis=0), small)
         for effect, mine, block, motions in zip(others, probe_points, rest, found, strict=True)
     }
     for effect in effects:
@@ -178,13 +180,13 @@ def _seen(problem: FitProblem, changes: Sequence[Motions]) -> Motions:
     return tuple(change[..., some] for change in found)
 
 
-def _probe_points(effect: Hypothesis, problem: FitProblem) -> tuple[list[np.ndarray], list[np.ndarray]]:
+def _probe_points(effect: Hypothesis, problem: FitProblem, small: float) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Weak and strong probe points of an effect: alternatives, each with directions [D, K] in scales.
 
     A weak one suffices for an effect whose response begins at zero strength. One that has a threshold, as sliding on a
     plane, is also simulated at full strengths.
     """
-    weak = effect.weak_probe_points(problem.twin, SMALL)
+    weak = effect.weak_probe_points(problem.twin, small)
     if effect.joint:  # of many places, every other
         return weak[:: -2 if effect.local else 1], []
     if effect.local or len(effect.quantities) > 1 or not problem.scenarios[0].planes:
@@ -193,7 +195,9 @@ def _probe_points(effect: Hypothesis, problem: FitProblem) -> tuple[list[np.ndar
     return weak, [known[0], known[-1]]
 
 
-def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.ndarray, sound: np.ndarray) -> Response:
+def _response(
+    effect: Hypothesis, probe_points: list[np.ndarray], columns: np.ndarray, sound: np.ndarray, small: float
+) -> Response:
     """An effect's changes [N, K] by probe point, without those whose simulation breaks down."""
     kinds = len(effect.quantities)
     backwards = np.array([q.least < 0 for q in effect.quantities])
@@ -207,7 +211,7 @@ def _response(effect: Hypothesis, probe_points: list[np.ndarray], columns: np.nd
             same_unit = [q.unit == effect.quantities[0].unit for q in effect.quantities]
             some = mine[:, directions[:, :kinds][:, same_unit].any(1)]
             turn = np.linalg.svd(some, full_matrices=False)[2][:1]
-            paths.append((np.array([SMALL]), some @ turn.T * (1 if turn.sum() > 0 else -1)))
+            paths.append((np.array([small]), some @ turn.T * (1 if turn.sum() > 0 else -1)))
         return Response(paths=tuple(paths), cones=tuple(cones), either=bool(backwards[0]))
     if kinds == 1 and not effect.local and kept and np.linalg.norm(kept[0][1]) < ROUNDING:
         # Its response has a threshold.

@@ -29,7 +29,8 @@ from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 EDGE = 0.15  # width of the edge of a prior, over its tolerance
 FEWEST = 8  # samples of the first part of a trial, below which it is not used
 STEP = 0.05  # of an unknown, in its scale, for difference quotients
-SECANT = 1.0  # the same of rough motions: a noticeable change, so that it is not drowned by chance in touching
+SECANT = 1.0  # the most of the same, where chance in touching would drown less: a noticeable change
+LOOKS = 7  # shifts of the planes over which such differences are averaged, at most
 CALM = 0.5  # of the noise: chance in which node touches when that is less adds less than a quarter to its variance
 VALLEYS = 2.0  # times the noise: chance of sliding blocks, whose searches end where they should, is up to 1.3
 WITHIN = 0.3  # slope of the prior residual within its tolerance, where values are nearly as good as another
@@ -168,6 +169,24 @@ class Likelihood:
         return self.chance > VALLEYS
 
     @property
+    def drowned(self) -> float:
+        """Error by chance of the difference of two motions that are a noticeable change apart, over what is calm."""
+        chance = self.discretization.chance_in_use if self.touches else 0.0
+        return math.sqrt(2) * chance / (CALM * self.noise) if math.isfinite(chance) else 0.0
+
+    @property
+    def step(self) -> float:
+        """Of unknowns, in their scales, for difference quotients: so long that this error is calm, if it can be."""
+        if self.rough and math.isfinite(self.chance):
+            return SECANT
+        return float(np.clip(self.drowned, STEP, SECANT))
+
+    @property
+    def looks(self) -> int:
+        """Shifts of the planes over which differences are averaged, so that it is calm where no step is enough."""
+        return int(np.clip(math.ceil((self.drowned / SECANT) ** 2), 1, LOOKS))
+
+    @property
     def searched_finely(self) -> bool:
         """Whether the finer twin searches, too: of bodies that meet planes, however noisy their recordings are."""
         return self.touches and self.finer_twin is not None
@@ -198,7 +217,9 @@ class Likelihood:
 
     def by(self, twin: Twin) -> Self:
         """The same by another twin as it is, which nothing corrects; touching hangs on chance as much."""
-        return self.only(self.trials, twin=twin, discretization=DiscretizationError(chance=self.discretization.chance))
+        chance = self.discretization.chance
+        error = DiscretizationError(chance=chance, chance_in_use=chance)
+        return self.only(self.trials, twin=twin, discretization=error)
 
     def corrected(self, at: np.ndarray) -> Self:
         """The same, corrected by the finer twin where one is now: at the stated numbers [K], in scales.
@@ -284,8 +305,7 @@ class Likelihood:
     def steps(self, effects: Effects, at: np.ndarray) -> np.ndarray:
         """Of the unknowns at a point [K], in scales, for difference quotients: to the side where there is room."""
         low, high = self.bounds(effects)
-        step = SECANT if self.rough and math.isfinite(self.chance) else STEP
-        up, down = np.minimum(step, high - at), np.minimum(step, at - low)
+        up, down = np.minimum(self.step, high - at), np.minimum(self.step, at - low)
         return np.where(up >= down, up, -down)
 
     def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:

@@ -30,6 +30,7 @@ class DiscretizationError:
         between: What a twin with cells between those of the two adds to the finer one, by trial; none without planes.
         chance: Root mean square of what of that is not in proportion to the shift, so that which node touches when
             decides it [m]; not finite if it was not measured.
+        chance_in_use: The same of the twin in use, by which derivatives are taken.
         edges: Of the cells of the twins that were compared [m], the one in use first.
         walls: Cells through the thinnest wall, or edge, of each.
     """
@@ -41,6 +42,7 @@ class DiscretizationError:
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     between: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
     chance: float = math.inf
+    chance_in_use: float = math.inf
     edges: tuple[float, ...] = ()
     walls: tuple[int, ...] = ()
 

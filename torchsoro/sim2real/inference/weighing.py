@@ -8,7 +8,8 @@ likelihood: Ribatet, Cooley and Davison 2012),
 
     kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
-C without what it has of d, and the likelihood is taken to the power of 1 / kappa.
+C without what it has of d, and the likelihood is taken to the power of 1 / kappa. The draws count in full, whatever
+share c of its price the residual shows: an error along the change is taken up by the effect, and not left.
 
 Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
 how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
@@ -366,7 +367,7 @@ def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
     for k, draw in enumerate(numerics.draws):
         # A sample that was lost tells nothing of a change either.
         columns = [
-            np.concatenate([np.where(np.isfinite(d)[..., None], c, np.nan), found.discrepancy.twin * d[..., None]], -1)
+            np.concatenate([np.where(np.isfinite(d)[..., None], c, np.nan), d[..., None]], -1)
             for c, d in zip(changes, draw, strict=True)
         ]
         # What a draw is worth to an effect is seen where it is none of the errors that are known.

@@ -1,0 +1,87 @@
+"""Differences of motions that hang on which node touches when."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from ringing import bar, effect
+
+from torchsoro.sim2real.data.schema import PlaneTable
+from torchsoro.sim2real.inference.discretization import measure
+from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
+from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
+from torchsoro.sim2real.inference.twin_error import DiscretizationError
+from torchsoro.sim2real.twin.twin import Twin
+
+
+@pytest.fixture(scope="module")
+def on_a_floor(tmp_path_factory):
+    """A bar, clamped, that swings onto a floor."""
+    twin, record = bar(tmp_path_factory.mktemp("bar"))
+    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
+    experiment = record(None)
+    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
+    experiment = dataclasses.replace(experiment, trials=tuple(trials))
+    return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5), noise=1e-4)
+
+
+def known(problem, chance):
+    return problem.only(problem.trials, discretization=DiscretizationError(chance=0.0, chance_in_use=chance))
+
+
+def test_a_mean_over_shifts_of_the_planes_is_that_of_their_motions(on_a_floor):
+    problem, density = on_a_floor, effect("density")
+    points = np.array([[0.0, 0.0], [0.5, 1.0]])
+    requests = [((), points[:1, :1]), ((density,), points)]
+    looks = 3
+    gaps = np.linspace(GAPS[0], GAPS[-1], looks)
+    still, (first, *_) = averaged(problem, requests, looks)
+    assert [m.position.shape[0] for m in still] == [1] * len(problem.trials)
+    assert first.position.shape[0] == len(points)
+    by_hand = shifted(problem, [((density,), point[None]) for point in points], gaps)
+    for k, motions in enumerate(by_hand):
+        np.testing.assert_allclose(first.position[k], motions[0].position.mean(0), rtol=0, atol=1e-12)
+        assert np.ptp(motions[0].position, axis=0).max() > 1e-6  # the planes are where they matter
+    (alone,), (simulated,) = averaged(problem, requests[:1], 1), problem.simulate(requests[:1])
+    assert all(np.array_equal(a.position, b.position) for a, b in zip(alone, simulated, strict=True))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.2, 0.99, 1.5, 50.0])
+def test_steps_and_shifts_keep_the_error_of_a_difference_calm_if_they_can(on_a_floor, share):
+    chance = share * CALM * on_a_floor.noise / math.sqrt(2)
+    problem = known(on_a_floor, chance)
+    assert STEP <= problem.step <= SECANT
+    assert 1 <= problem.looks <= LOOKS
+    error = math.sqrt(2 / problem.looks) * chance / problem.step
+    least = math.sqrt(2 / LOOKS) * chance / SECANT
+    assert error <= max(CALM * on_a_floor.noise, least) * (1 + 1e-9)
+    # No longer and no more than that takes.
+    assert problem.step == pytest.approx(min(max(share, STEP), SECANT))
+    assert problem.looks == min(max(math.ceil(share**2), 1), LOOKS)
+    assert np.abs(problem.steps((), np.zeros(1))) == pytest.approx(problem.step)
+
+
+def test_a_body_that_meets_no_plane_is_differentiated_closely(on_a_floor):
+    free = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=())) for t in on_a_floor.trials]
+    problem = known(on_a_floor.only(free), 1.0)
+    assert (problem.step, problem.looks) == (STEP, 1)
+
+
+def test_changes_by_larger_cells_are_differentiated_as_these_touch(on_a_floor):
+    loud = known(on_a_floor, on_a_floor.noise)
+    assert loud.finely().step == loud.step == SECANT
+    assert loud.finely().looks == loud.looks > 1
+    assert loud.by(loud.fine).step == STEP  # by itself it touches calmly
+
+
+def test_the_chance_of_both_twins_is_measured(on_a_floor):
+    found = measure(on_a_floor.experiment, on_a_floor.twin, on_a_floor.fine)
+    for twin, chance in ((on_a_floor.twin, found.chance_in_use), (on_a_floor.fine, found.chance)):
+        problem = on_a_floor.only(on_a_floor.trials, twin=twin)
+        (motions,) = shifted(problem, [((), np.zeros((1, 1)))], GAPS)
+        moved = np.concatenate([np.ptp(m.position, axis=0).ravel() for m in motions])
+        assert 0 < chance < moved.max()
