@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import STEP, Effects
+from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 RIDGE = 0.1  # weight of a force itself, beside that of its changes between windows
@@ -142,7 +142,7 @@ class Lines:
         weights = np.concatenate([np.maximum(slope, 1e-6), 1 / problem.observation.deviations])
         self.G = np.concatenate([G, np.zeros((len(weights), G.shape[1]))])
         self.target = np.concatenate([r + G @ forces.reshape(-1), -believed, -errors / problem.observation.deviations])
-        along = np.concatenate([slopes[:, : self.n] / STEP, J], 1)
+        along = np.concatenate([slopes[:, : self.n] / problem.step, J], 1)
         self.Q, self.R = np.linalg.qr(np.concatenate([along, np.diag(weights)]))
         self.histories = Histories(self._left(self.G), self._left(self.target), len(r), forces.shape)
 
@@ -206,7 +206,7 @@ def simulate(
         points = np.concatenate([at, np.diff(forces[:, t], axis=2, prepend=0.0).reshape(len(at), -1)], 1)
         if slopes:
             moves = np.eye(points.shape[1])
-            moves[: at.shape[1]] *= STEP
+            moves[: at.shape[1]] *= problem.step
             moves = np.delete(moves, np.s_[len(problem.common) : at.shape[1]], axis=0)
             points = np.concatenate([points, points[0] + moves])
         # One trial fills all lanes.

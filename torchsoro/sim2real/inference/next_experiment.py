@@ -12,7 +12,7 @@ from torchsoro.sim2real.data.experiment import ForceTable, Marker, Setup, Trial,
 from torchsoro.sim2real.inference.cosines import cleared, imitation, settle
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.isolability import errors_of, moved_by, prior_residual_of, shortened, whitened
-from torchsoro.sim2real.inference.likelihood import STEP, Effects
+from torchsoro.sim2real.inference.likelihood import Effects
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
@@ -92,7 +92,7 @@ def next_experiment(problem: FitProblem, one: Explained, other: Explained) -> li
         tally=problem.tally,
     )
     n = len(problem.common)
-    still = np.concatenate([np.zeros((1, n)), STEP * np.eye(n)])
+    still = np.concatenate([np.zeros((1, n)), problem.step * np.eye(n)])
     around = [_around(problem, effects, at) for effects, at in (one, other)]
     asked = [((), still), *((effects, points) for (effects, _), points in zip((one, other), around, strict=True))]
     simulated = wide.simulate(asked)
@@ -215,7 +215,7 @@ def _proposal(problem: FitProblem, choice: Choice, motions: list[MarkerTrajector
     blocks = [whitened(noise_models, moved_by(observation, believed, [m])) for m in motions]
     widths = np.cumsum([b.shape[1] for b in blocks])[:-1]
     still, *both = np.split(shortened(blocks, errors_of(observation, noise_models, believed), observation), widths, 1)
-    common = still[:, 1:] / STEP
+    common = still[:, 1:] / problem.step
     # What each makes, and how it may still change.
     cones = [np.concatenate([b[:, :1], b[:, 1:] - b[:, :1]], 1) for b in both]
     cosine, distance = 0.0, np.inf

@@ -13,7 +13,6 @@ from scipy.signal import savgol_filter
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction
-from torchsoro.sim2real.inference.likelihood import STEP
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SHORT = 0.02  # of a trial: no phase is shorter
@@ -135,7 +134,7 @@ def mismatches(
     """
     there, n = problem.only(trials), len(problem.common)
     point = np.clip(null_model.point[:n], -1, 1)
-    (motions,) = there.simulate([((), point + np.concatenate([np.zeros((1, n)), STEP * np.eye(n)]))])
+    (motions,) = there.simulate([((), point + np.concatenate([np.zeros((1, n)), there.step * np.eye(n)]))])
     found = []
     for i, (trial, motion, other) in enumerate(zip(trials, motions, after, strict=True)):
         recording = trial.recording
@@ -165,7 +164,7 @@ def _before(there: FitProblem, i: int, motion: MarkerTrajectory, point: np.ndarr
 
     def off(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         seen, by = there.observation.linearise(motion.alone(0), i, x[n:])
-        rise = [(there.observation.observe(motion.alone(k + 1), i, x[n:]) - seen) / STEP for k in range(n)]
+        rise = [(there.observation.observe(motion.alone(k + 1), i, x[n:]) - seen) / there.step for k in range(n)]
         slopes = np.concatenate([np.stack(rise, -1), by], -1) / wide[..., None]
         return (recording.position - seen) / wide - slopes[..., :n] @ x[:n], slopes
 
