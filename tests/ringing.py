@@ -12,6 +12,7 @@ from test_experiment import experiment
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial, read_experiment
 from torchsoro.sim2real.data.recording import Recording
+from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.twin.batch import simulate
@@ -70,3 +71,10 @@ def bar(folder: Path):
         return dataclasses.replace(found, trials=tuple(trials))
 
     return twin, record
+
+
+def onto_a_floor(experiment: Experiment) -> Experiment:
+    """The same, in which the bar swings onto a floor."""
+    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
+    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
+    return dataclasses.replace(experiment, trials=tuple(trials))

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from ringing import bar, effect
+from ringing import bar, effect, onto_a_floor
 
 from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.hypotheses.body_effects import TautTether
@@ -111,11 +111,7 @@ def test_a_model_without_a_finer_twin_has_the_error_that_its_problem_states(weig
 @pytest.fixture
 def on_a_plane(made):
     twin, record = made
-    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
-    experiment = record(None)
-    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
-    experiment = dataclasses.replace(experiment, trials=tuple(trials))
-    return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
+    return FitProblem(onto_a_floor(record(None)), twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
 
 
 def test_a_body_that_meets_a_plane_is_searched_by_the_finer_twin_however_noisy_its_recording(on_a_plane):

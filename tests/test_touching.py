@@ -7,9 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from ringing import bar, effect
+from ringing import bar, effect, onto_a_floor
 
-from torchsoro.sim2real.data.schema import PlaneTable
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
@@ -22,11 +21,9 @@ from torchsoro.sim2real.twin.twin import Twin
 def on_a_floor(tmp_path_factory):
     """A bar, clamped, that swings onto a floor."""
     twin, record = bar(tmp_path_factory.mktemp("bar"))
-    ground = PlaneTable(point=(0.0, 0.0, -0.005), normal=(0.0, 0.0, 1.0), friction="stick")
-    experiment = record(None)
-    trials = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=(ground,))) for t in experiment.trials]
-    experiment = dataclasses.replace(experiment, trials=tuple(trials))
-    return FitProblem(experiment, twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5), noise=1e-4)
+    return FitProblem(
+        onto_a_floor(record(None)), twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5), noise=1e-4
+    )
 
 
 def known(problem, chance):

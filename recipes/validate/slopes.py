@@ -59,10 +59,11 @@ def main(options: Options) -> None:
         ValueError: for a folder without the cases.
     """
     names = options.cases or tuple(sorted(p.name for p in options.folder.iterdir() if (p / "setup.toml").exists()))
-    print("case      number          noise  response  error: step 0.05   step (shifts)  as chosen  [um]")
     for name in names:
         if not (options.folder / name / "setup.toml").exists():
             raise ValueError(f"cases: {name} is not in {options.folder}, wanted a folder with setup.toml")
+    print("case      number          noise  response  error: step 0.05   step (shifts)  as chosen  [um]")
+    for name in names:
         inputs = read_inputs(
             Explaining(experiment=options.folder / name, out=Path("runs/slopes"), threads=options.threads)
         )
@@ -70,13 +71,12 @@ def main(options: Options) -> None:
         problem = FitProblem(
             inputs.experiment, inputs.twin, trials=inputs.trials[:1], discretization=error, threads=inputs.threads
         )
-        plain = problem.only(problem.trials, discretization=error.replace(correction={}))
-        near, far, chosen = (quotients(plain, step) for step in (STEP, SECANT, plain.step))
-        for k, (belief, _) in enumerate(plain.common):
+        near, far, chosen = (quotients(problem, step) for step in (STEP, SECANT, problem.step))
+        for k, (belief, _) in enumerate(problem.common):
             print(
-                f"{name:9s} {type(belief).__name__:14s} {1e6 * plain.noise:6.0f}  {rms(far[k].mean(0)):8.0f}"
-                f"  {rms(near[k] - near[k].mean(0)):16.0f}   {plain.step:.2f} ({plain.looks})"
-                f"  {rms(chosen[k] - chosen[k].mean(0)) / math.sqrt(plain.looks):15.0f}",
+                f"{name:9s} {type(belief).__name__:14s} {1e6 * problem.noise:6.0f}  {rms(far[k].mean(0)):8.0f}"
+                f"  {rms(near[k] - near[k].mean(0)):16.0f}   {problem.step:.2f} ({problem.looks})"
+                f"  {rms(chosen[k] - chosen[k].mean(0)) / math.sqrt(problem.looks):15.0f}",
                 flush=True,
             )
 
