@@ -28,6 +28,7 @@ from torchsoro.sim2real.inference.candidates import (
 from torchsoro.sim2real.inference.conclusion import conclude
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.gauss_newton import Asked
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.likelihood import CALM
 from torchsoro.sim2real.inference.resolution import between
@@ -270,7 +271,7 @@ def test_larger_cells_tell_what_changes_in_the_finer_twin(sliding):
     density = effect("density")
     points = np.array([[0.1, 0.0, 0.0], [0.1, 1.0, 0.0], [0.1, -2.0, 1.0]])
     ((coarse,), (fine,)) = (p.simulate([((density,), points)]) for p in (problem, problem.by(problem.fine)))
-    (mixed,) = finely.beside([((density,), points)])
+    (mixed,) = finely.beside([Asked((density,), points)])
     base = finely.base()
     assert len(finely.probe([density], base)[0]) > 0
     # Without the effect, what is added to the motions of the base is nothing.
@@ -285,6 +286,18 @@ def test_larger_cells_tell_what_changes_in_the_finer_twin(sliding):
             assert np.abs(one - other).max() < 0.25 * np.abs(other - b.position[0]).max()
     with pytest.raises(ValueError, match="wanted a twin with smaller cells"):
         sliding.only(sliding.trials, fine=None).finely()
+
+
+def test_what_is_known_is_not_simulated_again(sliding):
+    asked = Asked((effect("density"),), np.array([[0.1, 0.0, 0.0], [0.1, 1.0, 0.0], [0.1, -2.0, 1.0]]))
+    for problem, simulated in (sliding, 2), (sliding.finely(), 3):  # of the latter, all of them with larger cells
+        (whole,) = problem.beside([asked])
+        before = problem.tally.simulations
+        (again,) = problem.beside([dataclasses.replace(asked, known=[m.alone(0) for m in whole])])
+        assert problem.tally.simulations - before == simulated * len(problem.trials)
+        for one, other in zip(again, whole, strict=True):
+            np.testing.assert_allclose(one.position, other.position, atol=1e-12)
+            assert one.sound.shape == other.sound.shape
 
 
 def test_a_fit_whose_derivatives_are_those_of_larger_cells_ends_where_one_by_the_finer_twin_does(sliding):

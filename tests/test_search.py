@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from torchsoro.sim2real.inference import search
 from torchsoro.sim2real.inference.gauss_newton import GaussNewton, Point
@@ -146,3 +148,81 @@ def test_a_step_that_rounding_swallows_ends_a_search_with_its_derivatives():
             break
     assert found is not None and np.isfinite(found.columns).all() and found.columns.any()
     assert len(asked) == 1
+
+
+class Curved(GaussNewton):
+    """A search of residuals that bend with its unknowns by a share ``bent``, with numbers in place of simulations."""
+
+    bent = 0.0
+    eager = True
+    held = places = np.zeros(2, bool)
+    weight = np.array([0.5, 2.0, 1.0])
+    A, B, noise = (np.random.default_rng(3).normal(size=n) for n in ((40, 2), (40, 3), 40))
+
+    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, known: Any = None) -> Any:
+        yield at, len(moving), known
+        r = self.A @ (np.array([1.5, -1.0]) - at - self.bent * at**2) + 0.5 * self.noise
+        errors = np.linalg.solve(self.B.T @ self.B + np.diag(self.weight**2), self.B.T @ r)
+        r, prior = r - self.B @ errors, self.weight * errors
+        chi2 = float(r @ r + prior @ prior + 0.01 * at @ at)
+        columns = self.A * (1 + 2 * self.bent * at) if len(moving) else np.zeros((40, 2))
+        return Point(chi2=chi2, at=at, errors=errors, r=r, J=self.B, columns=columns, motions=[at]), self.eager
+
+
+def searched(step: float = 0.05, **settings: Any) -> Curved:
+    likelihood: Any = SimpleNamespace(
+        bounds=lambda effects: (np.full(2, -9.0), np.full(2, 9.0)),
+        prior_residual=lambda at, held: (0.1 * at, np.full(2, 0.1)),
+        step=step,
+    )
+    search = Curved(likelihood, ())
+    for name, value in settings.items():
+        object.__setattr__(search, name, value)
+    return search
+
+
+def led(asking: Any) -> tuple[list[Any], Any]:
+    """What is asked for, and what comes of it."""
+    asked = []
+    try:
+        asked.append(next(asking))
+        while True:
+            asked.append(asking.send(None))
+    except StopIteration as end:
+        return asked, end.value
+
+
+def test_a_step_gains_what_linear_residuals_promise():
+    search, at, step = searched(), np.array([1.0, -2.0]), np.array([0.7, 1.3])
+    (_, (begin, _)), (_, (end, _)) = (led(search.linearise(x, np.zeros(3), np.arange(2))) for x in (at, at + step))
+    assert begin.chi2 - end.chi2 > 10
+    assert search.promised(begin, step) == pytest.approx(begin.chi2 - end.chi2, rel=1e-9)
+
+
+def test_a_search_ends_where_no_step_promises_anything_without_simulating_it():
+    asked, found = led(searched().search(np.zeros(2), np.zeros(3), 8, settle=True))
+    assert len(asked) == 2, "the start, and one step"
+    assert np.abs(searched().step(found, 0.0)).max() < 0.05 < np.abs(found.at).min()
+
+
+@pytest.mark.parametrize("step", [0.05, 5.0])
+def test_derivatives_of_an_earlier_point_are_kept_as_long_as_they_lead(step):
+    every, best = led(searched(bent=0.1).search(np.zeros(2), np.zeros(3), 20, settle=True))
+    asked, found = led(searched(bent=0.1, eager=False, step=step).search(np.zeros(2), np.zeros(3), 20, settle=True))
+    np.testing.assert_allclose(found.at, best.at, atol=0.1)
+    assert found.columns.any() and found.chi2 < best.chi2 + 0.5
+    assert sum(bool(n) for _, n, _ in every) == len(every)
+    assert sum(bool(n) for _, n, _ in asked) < len(asked) - 1
+    # A point that has been simulated comes with its motions.
+    assert all((known is not None) == bool(n) for _, n, known in asked[1:])
+    assert all(known is None or known[0] is at for at, _, known in asked)
+
+
+def test_chance_in_a_short_step_does_not_change_derivatives():
+    search, at = searched(step=0.05), np.array([1.0, -2.0])
+    begin = led(search.linearise(at, np.zeros(3), np.arange(2)))[1][0]
+    for step, alike in (np.array([0.01, 0.04]), True), (np.array([0.3, 0.1]), False):
+        after = led(search.linearise(at + step, np.zeros(3), np.arange(0)))[1][0]
+        by_chance = dataclasses.replace(after, r=after.r + 1.0)
+        assert np.array_equal(search.columns(begin, by_chance), begin.columns) is alike
+        np.testing.assert_allclose(search.columns(begin, after), begin.columns, atol=1e-9)

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
-from torchsoro.sim2real.inference.gauss_newton import Answer, GaussNewton, Point
+from torchsoro.sim2real.inference.gauss_newton import Answer, Asked, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.probing import ranked_starts
 from torchsoro.sim2real.inference.touching import averaged
@@ -94,20 +94,23 @@ class FitProblem(Likelihood):
         twin, shift = self.coarser
         return self.only(self.trials, twin=twin, coarser=None, discretization=DiscretizationError(shift=shift))
 
-    def beside(self, requests: Sequence[Request]) -> list[list[MarkerTrajectory]]:
-        """As :meth:`simulate`, but what other points change of the first of each request is simulated by larger cells.
+    def beside(self, asked: Sequence[Asked]) -> list[list[MarkerTrajectory]]:
+        """As :meth:`simulate`, but what other points change of the first of each is simulated by larger cells.
 
         Larger cells change a motion by as much as effects do, but the difference of two motions by a share of it only.
 
         Args:
-            requests: Effects and points.
+            asked: Effects and points; what is known of the first of these is not simulated.
         """
         coarsely = self._coarsely
         if coarsely is None:
-            return self.simulate(requests)
-        found = self.simulate([(effects, points[:1]) for effects, points in requests])
-        several = [k for k, (_, points) in enumerate(requests) if len(points) > 1]
-        for k, motions in zip(several, averaged(coarsely, [requests[k] for k in several], self.looks), strict=True):
+            fresh = self.simulate([(a.effects, a.points if a.known is None else a.points[1:]) for a in asked])
+            return [_all(a.known, motions) for a, motions in zip(asked, fresh, strict=True)]
+        begun = iter(self.simulate([(a.effects, a.points[:1]) for a in asked if a.known is None]))
+        found = [next(begun) if a.known is None else a.known for a in asked]
+        several = [k for k, a in enumerate(asked) if len(a.points) > 1]
+        requests = [(asked[k].effects, asked[k].points) for k in several]
+        for k, motions in zip(several, averaged(coarsely, requests, self.looks), strict=True):
             found[k] = [_changed(m.alone(), m, at.alone()) for m, at in zip(motions, found[k], strict=True)]
         return found
 
@@ -180,7 +183,7 @@ class FitProblem(Likelihood):
             tasks: Effects (none, one or two) and where to begin, in scales; all zero if None.
             errors: Measurement errors to begin with.
             rounds: Steps at most, each a simulation of all trials. Derivatives, a simulation for each unknown, are
-                taken at the first point, at the last, and where a step gains little.
+                taken at the first point, at the last, and where those of an earlier point promise too much.
             settle: Take them at the last point; without it, intervals are rough.
 
         Returns:
@@ -196,9 +199,9 @@ class FitProblem(Likelihood):
         asked = {i: next(search) for i, search in enumerate(searches)}
         while asked:
             order = list(asked)
-            # Where there is room in a batch, or larger cells do for them, derivatives take hardly longer than the step.
+            # Where there is room in a batch, derivatives take hardly longer than the step.
             wide = sum(1 + solvers[i].unknowns for i in order) * len(self.trials)
-            eager = self.coarser is not None or wide <= ROOM
+            eager = self.coarser is None and wide <= ROOM
             answers = self.beside([asked[i] for i in order])
             for i, motions in zip(order, answers, strict=True):
                 try:
@@ -249,6 +252,11 @@ class FitProblem(Likelihood):
             point=point.at,
             end=point,
         )
+
+
+def _all(known: list[MarkerTrajectory] | None, motions: list[MarkerTrajectory]) -> list[MarkerTrajectory]:
+    """Motions of each trial with those that are known before the others."""
+    return motions if known is None else [m.following(k) for k, m in zip(known, motions, strict=True)]
 
 
 def _changed(one: MarkerTrajectory, others: MarkerTrajectory, at: MarkerTrajectory) -> MarkerTrajectory:

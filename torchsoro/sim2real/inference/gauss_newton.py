@@ -13,21 +13,38 @@ from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.likelihood import Effects, Likelihood, Request
+from torchsoro.sim2real.inference.likelihood import Effects, Likelihood
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 LONGEST_STEP = 0.5  # of a search, over the unknown's size plus four scales
 LONGEST_MOVE = 1.5  # of a place in a step, in tenths of the body's size
 DAMPING = 1e-2  # of the first step (Levenberg and Marquardt), times the diagonal of the normal matrix
 DAMPING_LIMITS = (1e-4, 10.0)  # least damping of a step; a search ends that would need more than the most
+LITTLE = (0.5, 1e-3)  # gain in chi-squared, and its share, below which a search has converged
+LEADS = 0.5  # of the gain that a step promises, which derivatives of an earlier point have to lead to
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """What a search asks for.
+
+    Attributes:
+        effects: That are simulated.
+        points: Where [B, K], in scales: a point, and those beside it that its derivatives need.
+        known: Motions of each trial at the first of them, where it has been simulated before.
+    """
+
+    effects: Effects
+    points: np.ndarray
+    known: list[MarkerTrajectory] | None = None
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Answer:
-    """What a search is sent for its request.
+    """What a search is sent for what it asks.
 
     Attributes:
-        motions: Of each trial.
+        motions: Of each trial, in a batch of all points.
         eager: Whether derivatives may be asked for with every step, as where there is room for their simulations.
     """
 
@@ -35,8 +52,8 @@ class Answer:
     eager: bool = False
 
 
-Search = Generator[Request, Answer, "Point | None"]
-Linearisation = Generator[Request, Answer, "tuple[Point | None, bool]"]
+Search = Generator[Asked, Answer, "Point | None"]
+Linearisation = Generator[Asked, Answer, "tuple[Point | None, bool]"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,40 +142,48 @@ class GaussNewton:
             # A step that rounding swallows leads nowhere, too: nothing could be learnt from it of the derivatives.
             if not (current.at + step != current.at).any():
                 break
-            asked = moving if eager else moving[:0]
-            complete = eager
-            ahead, eager = yield from self.linearise(current.at + step, current.errors, asked)
-            gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
-            if ahead is not None and gained > 0:
-                if not complete:
-                    ahead = dataclasses.replace(ahead, columns=_updated(current, ahead))
-                converged = fresh and gained < max(0.5, 1e-3 * ahead.chi2)
-                current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), complete
-                if converged:
+            promised = self.promised(current, step)
+            if _little(promised, current.chi2):
+                if fresh:
                     break
-            elif fresh:
-                if damping > DAMPING_LIMITS[1]:
-                    break
-                damping *= 10
-                continue
-            # Derivatives that were updated along the way no longer lead far.
-            if not fresh and gained < 0.3 * current.chi2:
-                again, eager = yield from self.linearise(current.at, current.errors, moving)
+                leads = False
+            else:
+                complete = eager
+                asked = moving if eager else moving[:0]
+                ahead, eager = yield from self.linearise(current.at + step, current.errors, asked)
+                gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
+                if ahead is not None and gained > 0:
+                    if not complete:
+                        ahead = dataclasses.replace(ahead, columns=self.columns(current, ahead))
+                    converged = fresh and _little(gained, ahead.chi2)
+                    current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), complete
+                    if converged:
+                        break
+                elif fresh:
+                    if damping > DAMPING_LIMITS[1]:
+                        break
+                    damping *= 10
+                    continue
+                leads = fresh or gained > LEADS * promised
+            if not leads:
+                again, eager = yield from self.linearise(current.at, current.errors, moving, current.motions)
                 if again is None:
                     break
                 current, fresh = again, True
         if settle and not fresh:
-            again, _ = yield from self.linearise(current.at, current.errors, moving)
+            again, _ = yield from self.linearise(current.at, current.errors, moving, current.motions)
             current = again or current
         return current
 
-    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray) -> Linearisation:
+    def linearise(
+        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, known: list[MarkerTrajectory] | None = None
+    ) -> Linearisation:
         """A point with its derivatives by the unknowns ``moving``, None if its simulation breaks down.
 
         Beside it whether the next may have derivatives, too, as where there is room for them.
         """
         steps = self.likelihood.steps(self.effects, at)
-        answer = yield self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps])
+        answer = yield Asked(self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps]), known)
         return self._point(at, errors, moving, steps, answer.motions), answer.eager
 
     def _point(
@@ -204,6 +229,26 @@ class GaussNewton:
             fixed |= beyond
         return np.clip(point.at + step, low, high) - point.at
 
+    def promised(self, point: Point, step: np.ndarray) -> float:
+        """By how much a step reduces chi-squared, as far as derivatives hold, with the best measurement errors."""
+        r = point.r - point.columns @ step
+        H = point.J.T @ point.J + np.diag(self.weight**2)
+        more = np.linalg.solve(H, point.J.T @ r - self.weight**2 * point.errors)
+        left, errors = r - point.J @ more, self.weight * (point.errors + more)
+        prior, _ = self.likelihood.prior_residual(point.at + step, self.held)
+        return point.chi2 - float(left @ left + errors @ errors + prior @ prior)
+
+    def columns(self, before: Point, after: Point) -> np.ndarray:
+        """Derivatives by the unknowns that agree with what a step did (Broyden's update).
+
+        Of a step that is shorter than those of difference quotients, chance in touching would decide what it did.
+        """
+        step = after.at - before.at
+        if float(np.abs(step).max()) < self.likelihood.step:
+            return before.columns
+        expected = before.r - before.columns @ step - before.J @ (after.errors - before.errors)
+        return before.columns - np.outer(after.r - expected, step) / float(step @ step)
+
     def covariance(self, point: Point) -> np.ndarray:
         """Of the unknowns at a point, in scales [K, K]; zero where they are held."""
         free = ~self.held
@@ -216,8 +261,7 @@ class GaussNewton:
         return found
 
 
-def _updated(before: Point, after: Point) -> np.ndarray:
-    """Derivatives by the unknowns that agree with what a step did (Broyden's update)."""
-    step = after.at - before.at
-    expected = before.r - before.columns @ step - before.J @ (after.errors - before.errors)
-    return before.columns - np.outer(after.r - expected, step) / float(step @ step)
+def _little(gained: float, chi2: float) -> bool:
+    """Whether a gain in chi-squared is of no account."""
+    least, share = LITTLE
+    return gained < max(least, share * chi2)

@@ -52,6 +52,13 @@ class MarkerTrajectory:
         names = "position", "velocity", "deformation", "sound"
         return dataclasses.replace(self, **{name: getattr(self, name)[number] for name in names})
 
+    def following(self, first: MarkerTrajectory) -> MarkerTrajectory:
+        """A batch with another motion [S, M, ...] before its own, sampled at the same times."""
+        names = "position", "velocity", "deformation", "sound"
+        return dataclasses.replace(
+            self, **{n: np.concatenate([getattr(first, n)[None], getattr(self, n)]) for n in names}
+        )
+
     def plus(self, other: MarkerTrajectory, share: float = 1.0) -> MarkerTrajectory:
         """With a share of another motion [S', M, ...] added, which is constant after its last sample."""
         at = np.minimum(np.arange(len(self.time)), len(other.time) - 1)
