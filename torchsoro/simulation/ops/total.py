@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
@@ -21,6 +22,7 @@ from torchsoro.simulation.ops.tiles import tiles_of
 from torchsoro.simulation.ops.total_selfcontact import TotalSelfContact
 from torchsoro.simulation.runtime import init
 from torchsoro.simulation.sums import pairwise_sum
+from torchsoro.simulation.threads import gpu_share
 
 CHUNK = 1024  # substeps between two checks for divergence
 LAUNCH = 256  # substeps in a launch on a GPU, lest one that also drives a screen takes a large body's for hung
@@ -38,6 +40,11 @@ def most_blocks(device: torch.device, shape: int, dtype: torch.dtype) -> int:
     gpu = torch.cuda.get_device_properties(device)
     shared = 1024 + layout.SHAPES[shape].pad * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
     return min(BLOCKS, gpu.shared_memory_per_multiprocessor // shared) * gpu.multi_processor_count
+
+
+def blocks_of(most: int, share: float) -> int:
+    """Blocks of a share of a GPU, which runs so many at the same time; one at least."""
+    return max(1, math.floor(share * most))
 
 
 def _features(scene: Scene) -> int:
@@ -102,7 +109,9 @@ class TotalSegmentIntegrator:
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
         items = self.batch * max(tiles + self.wall_chunks + self.ties, chunks)
-        self.blocks = min(most_blocks(like.device, self.tiles.shape, like.dtype), items) if self.gpu else 0
+        most = most_blocks(like.device, self.tiles.shape, like.dtype) if self.gpu else 0
+        self.most = blocks_of(most, gpu_share())
+        self.blocks = min(self.most, items) if self.gpu else 0
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, layout.WALL_VECTORS, self.wall_chunks * layout.TILE
@@ -270,8 +279,7 @@ class TotalSegmentIntegrator:
         """A function that takes the substeps from its first number to before its second, or these back."""
         if self.gpu:
             real = ti.f64 if buffers[1].dtype == torch.float64 else ti.f32
-            most = most_blocks(buffers[0].device, self.tiles.shape, buffers[1].dtype)
-            launch = capture(on_gpu, real, most, self.features, self.tiles.shape, 0, 0, 0, *buffers)
+            launch = capture(on_gpu, real, self.most, self.features, self.tiles.shape, 0, 0, 0, *buffers)
             arrivals = 0
 
             def go(first: int, last: int) -> None:
