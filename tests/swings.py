@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 
+from torchsoro.sim2real.inference.decision import LASTING
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
     Linearised,
@@ -22,7 +23,7 @@ MARKERS, AXES = 3, 2
 EXACT = TwinError(amplitude=np.zeros((AXES, MARKERS)))
 
 
-def recorded(share, seed, trials=2, count=60, effect=0.0):
+def recorded(share, seed, trials=2, count=60, effect=0.0, lasting=LASTING):
     """Markers that swing, with a discrepancy of a share of the motion, noise, and an effect that slows the swing."""
     rng = np.random.default_rng(seed)
     time = np.linspace(0, 1, count)
@@ -32,7 +33,9 @@ def recorded(share, seed, trials=2, count=60, effect=0.0):
     believed = tuple(s[:, None, None] * shape.T for s in swing)
     slopes = tuple((s[:, None, None] * shape.T)[..., None] for s in slope)
     quiet = Data(
-        trials=tuple(TrialData(name=str(i), time=time, position=b) for i, b in enumerate(believed)), noise=0.01
+        trials=tuple(TrialData(name=str(i), time=time, position=b) for i, b in enumerate(believed)),
+        noise=0.01,
+        lasting=lasting,
     )
     model, *_ = errors(quiet, EXACT, Discrepancy(share, 0.1))
     position = []

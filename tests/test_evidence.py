@@ -336,7 +336,7 @@ def test_recordings_cannot_be_changed():
 
 def test_the_range_that_residuals_leave_next_to_a_steep_bound_has_a_probability(monkeypatch):
     # The log-likelihood falls so steeply that a parabola fitted beside the bound misses its top.
-    monkeypatch.setattr(evidence, "_ln_likelihood", lambda data, near, left, x: -1e6 * float(x[0]) ** 3)
+    monkeypatch.setattr(evidence, "ln_likelihood", lambda data, near, left, x: -1e6 * float(x[0]) ** 3)
     low, high = np.zeros(3), np.array([5.0, 0.0, 0.0])
     mass = quad(lambda x: math.exp(-1e6 * x**3), 0, 0.1)[0]
     found = evidence._ln_occam(None, None, None, np.zeros(3), low, high)

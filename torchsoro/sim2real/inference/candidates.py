@@ -20,8 +20,10 @@ from torchsoro.sim2real.inference.evidence import (
 )
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.laplace import Mode
+from torchsoro.sim2real.inference.lasting import with_lasting_noise
+from torchsoro.sim2real.inference.least_squares import closest
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
-from torchsoro.sim2real.inference.observed import Data, Motions, TrialData
+from torchsoro.sim2real.inference.observed import Data, Motions, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
 from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
@@ -46,7 +48,7 @@ def data_of(problem: Likelihood) -> Data:
         for t in problem.trials
         if t.recording is not None
     ]
-    return Data(trials=tuple(trials), noise=problem.noise)
+    return Data(trials=tuple(trials), noise=problem.noise, lasting=problem.lasting)
 
 
 def model_of(problem: Likelihood, effects: Effects) -> Model:
@@ -294,16 +296,31 @@ def weigh(
         closely: See :func:`near`.
         moved: The same.
     """
+    return inferred(problem, fits, near(problem, fits, closely=closely, moved=moved))
+
+
+def inferred(
+    problem: FitProblem, fits: Sequence[Fit], models: Sequence[Linearised | None]
+) -> list[tuple[Fit, Posterior]]:
+    """Posteriors of models near fits, see :func:`near`, each with the fit; without those that broke down."""
     data = data_of(problem)
-    models = [
-        (fit, model)
-        for fit, model in zip(fits, near(problem, fits, closely=closely, moved=moved), strict=True)
-        if model is not None
-    ]
+    sound = [(fit, model) for fit, model in zip(fits, models, strict=True) if model is not None]
     # Two pools, as a thread that waits for others of its own pool may wait for ever.
     with ThreadPoolExecutor(problem.threads) as pool, ThreadPoolExecutor(problem.threads) as inner:
-        after = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), models)
-        return list(zip((f for f, _ in models), after, strict=True))
+        after = pool.map(lambda m: infer(data, m[1], side_by_side=inner.map), sound)
+        return list(zip((f for f, _ in sound), after, strict=True))
+
+
+def with_noise_left(problem: FitProblem, models: Sequence[Linearised | None]) -> FitProblem:
+    """The problem with the lasting noise, and its size if that is not stated, that the best of some models leaves."""
+    data = data_of(problem)
+    sound = [model for model in models if model is not None]
+    if not sound:
+        return problem
+    best = min(sound, key=lambda model: size_of(model.left(closest(data, model).at)))
+    stated = problem.experiment.setup.noise is not None
+    data = with_lasting_noise(data, infer(data, best), stated=stated)
+    return problem.only(problem.trials, noise=data.noise, lasting=data.lasting)
 
 
 def planes_moved(problem: FitProblem, fit: Fit) -> Moved:

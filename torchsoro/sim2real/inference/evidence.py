@@ -22,7 +22,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy.optimize import minimize
 
-from torchsoro.sim2real.inference.decision import COMMON, LASTING
+from torchsoro.sim2real.inference.decision import COMMON
 from torchsoro.sim2real.inference.laplace import Mode, ln_box, posterior
 from torchsoro.sim2real.inference.observed import Data, Motions, independent
 from torchsoro.sim2real.inference.priors import Prior, bounds
@@ -239,8 +239,8 @@ def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> list[Er
 def _unscaled(data: Data, numerics: TwinError) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, ...]]:
     """White noise, and loadings of the noise that lasts, of the twin's error and of what is left of each trial."""
     one = np.full_like(numerics.amplitude, data.noise)
-    lasting = _each(math.sqrt(LASTING) * one)
-    return math.sqrt(1 - LASTING) * one, lasting, _moving(numerics.amplitude), tuple(map(_moving, data.amplitudes))
+    lasting = _each(math.sqrt(data.lasting) * one)
+    return math.sqrt(1 - data.lasting) * one, lasting, _moving(numerics.amplitude), tuple(map(_moving, data.amplitudes))
 
 
 def _moving(deviation: np.ndarray) -> np.ndarray:
@@ -294,7 +294,7 @@ def _settled(data: Data, near: Linearised, start: np.ndarray, low: np.ndarray, h
     x = start
     for k in range(ALTERNATIONS):
         left = near.left(mode_of(data, near, _discrepancy(x)).at)
-        before, x = x, _restricted(data, near, left, x, low, high, AGAIN if k else FIRST)
+        before, x = x, restricted(data, near, left, x, low, high, AGAIN if k else FIRST)
         if np.abs(x - before).max() < NARROW:
             break
     mode = mode_of(data, near, _discrepancy(x))
@@ -384,16 +384,16 @@ def _discrepancy(x: np.ndarray) -> Discrepancy:
     return Discrepancy(share=share, time=time, twin=twin)
 
 
-def _ln_likelihood(data: Data, near: Linearised, left: Sequence[np.ndarray], x: np.ndarray) -> float:
-    """Of residuals, with a discrepancy."""
+def ln_likelihood(data: Data, near: Linearised, left: Motions, x: np.ndarray) -> float:
+    """Of what a model leaves of each trial, with ln s, ln tau and ln c."""
     found = products(data, near.numerics, _discrepancy(x), [r[..., None] for r in left])
     return -0.5 * sum(float(gram.product[0, 0]) + gram.ln_det for gram in found)
 
 
-def _restricted(
+def restricted(
     data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray, step: float
 ) -> np.ndarray:
-    """Ln s, ln tau and ln c with which residuals are most probable, within bounds, near x."""
+    """Ln s, ln tau and ln c with which what a model leaves is most probable, within bounds, near x."""
     moving = np.flatnonzero(high > low)
 
     def at(free: np.ndarray) -> np.ndarray:
@@ -404,7 +404,7 @@ def _restricted(
     start = np.clip(x, low, high)[moving]
     away = np.where(start > 0.5 * (low + high)[moving], -step, step)
     found = minimize(
-        lambda free: -_ln_likelihood(data, near, left, at(free)),
+        lambda free: -ln_likelihood(data, near, left, at(free)),
         start,
         method="Nelder-Mead",
         bounds=[(low[k], high[k]) for k in moving],
@@ -420,14 +420,14 @@ def _restricted(
 
 def _ln_occam(data: Data, near: Linearised, left: Motions, x: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
     """Ln of the share of the prior range of ln s, ln tau and ln c that residuals leave: by a parabola along each."""
-    found, top = 0.0, _ln_likelihood(data, near, left, x)
+    found, top = 0.0, ln_likelihood(data, near, left, x)
     for k in np.flatnonzero(high > low):
         middle = float(np.clip(x[k], low[k] + APART, high[k] - APART))
         values = []
         for off in (-APART, 0.0, APART):
             y = x.copy()
             y[k] = middle + off
-            values.append(_ln_likelihood(data, near, left, y))
+            values.append(ln_likelihood(data, near, left, y))
         slope = (values[2] - values[0]) / (2 * APART)
         bend = min((values[2] + values[0] - 2 * values[1]) / APART**2, 0.0)
         # Finer steps where the parabola is narrow, so that its top is not missed.

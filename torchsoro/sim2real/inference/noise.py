@@ -116,3 +116,16 @@ def estimate_noise(recordings: Sequence[Recording]) -> float:
     pooled = np.sort(np.concatenate(found))
     # Where a normal distribution has its lower quartile of absolute values; motion fills the upper part.
     return float(np.quantile(pooled, 0.25)) / 0.3186 / math.sqrt(20.0)
+
+
+def lasting_noise(white: float, lasting: float, interval: float) -> float:
+    """Standard deviation of noise of which a share lasts [m], with the third differences of white noise of another.
+
+    Args:
+        white: Standard deviation of that white noise [m], as :func:`estimate_noise` finds it.
+        lasting: Share of the variance that is correlated, 0 to 1.
+        interval: Between samples [s].
+    """
+    kept = np.exp(-interval / CORRELATION * np.arange(1, 4))
+    third = 20 - float(np.array([30, -12, 2]) @ kept)  # variance of a third difference of what is correlated
+    return white * math.sqrt(20 / (20 * (1 - lasting) + lasting * third))

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import MATTERS
+from torchsoro.sim2real.inference.decision import LASTING, MATTERS
 
 STILL = 0.1  # of the mean motion: least amplitude of a discrepancy along an axis without motion
 
@@ -52,10 +52,12 @@ class Data:
     Attributes:
         trials: Recordings.
         noise: Standard deviation of a sample's noise [m].
+        lasting: Share of its variance that lasts from sample to sample.
     """
 
     trials: tuple[TrialData, ...]
     noise: float
+    lasting: float = LASTING
 
     @cached_property
     def motions(self) -> tuple[np.ndarray, ...]:

@@ -13,7 +13,17 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.hypotheses.supply_effects import PressureGain
 from torchsoro.sim2real.inference import visible
-from torchsoro.sim2real.inference.candidates import at_mode, data_of, planes_moved, weigh, weighing_of, with_chance_of
+from torchsoro.sim2real.inference.candidates import (
+    at_mode,
+    data_of,
+    inferred,
+    near,
+    planes_moved,
+    weigh,
+    weighing_of,
+    with_chance_of,
+    with_noise_left,
+)
 from torchsoro.sim2real.inference.conclusion import Conclusion, conclude
 from torchsoro.sim2real.inference.evidence import Posterior
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
@@ -142,13 +152,16 @@ def weighed(
         heldout: The same.
         report: The same.
     """
-    data, names = data_of(problem), len({e.name for e in effects})
+    names = len({e.name for e in effects})
     believed = dataclasses.replace(
         null_model, point=np.clip(null_model.point, -1, 1), errors=np.zeros_like(null_model.errors)
     )
     strained = [believed] if np.abs(null_model.point).max(initial=0.0) > 1 else []
     simpler = [*_as_beliefs(problem, null_model, ends), *_as_simpler(problem, effects, ends)]
-    known = weigh(problem, [null_model, *strained, *simpler, *_as_pairs(problem, effects, ends), *ends])
+    begun = [null_model, *strained, *simpler, *_as_pairs(problem, effects, ends), *ends]
+    models = near(problem, begun)
+    problem = with_noise_left(problem, models)
+    data, known = data_of(problem), inferred(problem, begun, models)
     weighing = weighing_of(problem, [p for _, p in known], names)
     best = weighing.leading
     leading = at_mode(problem, _fit_of(known, best), told(data, best))

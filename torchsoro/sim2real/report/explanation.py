@@ -210,6 +210,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         },
         "noise": {
             "standard_deviation_m": problem.noise,
+            "lasting_share": problem.lasting,
             "simulation_m": e.own_error,
             "evidence_divided_by": c.kappa,
             "motion_m": c.motion,
