@@ -115,7 +115,7 @@ def test_probabilities_are_compared_with_how_often_they_are_right(judge):
             told(0, ("drag",), "drag", 0.9),
             told(1, ("drag",), "leak", 0.9),
             told(2, ("leak",), "leak", 0.5),
-            told(3, (), "nothing", 1.0, priced_ratio=1.5),
+            told(3, (), "nothing", 1.0, priced_ratio=1.5, noise_ratio=0.9),
         ],
         1.0,
     )
@@ -124,6 +124,7 @@ def test_probabilities_are_compared_with_how_often_they_are_right(judge):
     error = rows["  expected calibration error of the most probable"]
     assert error == f"{(0.8 + 0.5) / 4:.2f} (4)"
     assert rows["own error, as told / real, nothing missing"].startswith("1.5 ")
+    assert rows["noise, as told / real, where it is not stated"].startswith("0.9 ")
 
 
 def test_the_error_that_is_told_is_compared_with_that_of_the_sealed_trial(judge, tmp_path):
@@ -133,11 +134,20 @@ def test_the_error_that_is_told_is_compared_with_that_of_the_sealed_trial(judge,
     for where, value in ((folder / "predicted.csv", place + 2e-4), (sealed / "clean.csv", place)):
         where.parent.mkdir(parents=True)
         judge.experiment.Recording(time=time, value=value, names=clean.names, axes="xyz").write(where)
-    answer = {"verdict": "nothing_missing", "effects": [], "noise": {"simulation_m": 3e-4}}
+    answer = {
+        "verdict": "nothing_missing",
+        "effects": [],
+        "noise": {"simulation_m": 3e-4, "standard_deviation_m": 9e-5},
+    }
     (folder / "explanation.json").write_text(json.dumps(answer))
     truth = {"case": "case-000", "specimen": "bar", "kind": "null", "strength": 0.0, "body_length_m": 0.1}
     found = judge.answers.match({**truth, "effects": [], "believed_heldout_rms_mm": 0.4}, folder.parent, tmp_path, {})
     assert found.priced_ratio == pytest.approx(1.5)
+    assert found.noise_ratio is None  # older batches do not say
+    for stated, ratio in (True, None), (False, pytest.approx(0.9)):
+        camera = {"noise": 1e-4, "told": stated}
+        asked = {**truth, "effects": [], "believed_heldout_rms_mm": 0.4, "measurement": camera}
+        assert judge.answers.match(asked, folder.parent, tmp_path, {}).noise_ratio == ratio
     assert found.sealed_ratio == pytest.approx(0.5)
     # A prediction counts as a whole or not at all, whatever the order of its markers and with others beside them.
     read, write = judge.experiment.Recording.read, judge.experiment.Recording

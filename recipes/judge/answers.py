@@ -43,6 +43,7 @@ class Scored:
         sealed_ratio: The same for the sealed trial, if the answer predicted it.
         priced_ratio: Error that the answer ascribes to its simulation over that of the sealed trial as predicted, where
             nothing is missing.
+        noise_ratio: Standard deviation of the noise, as the answer has it, over the real one, where it was not stated.
         seconds: That the answer took.
     """
 
@@ -65,6 +66,7 @@ class Scored:
     told_ratio: float | None = None
     sealed_ratio: float | None = None
     priced_ratio: float | None = None
+    noise_ratio: float | None = None
     seconds: float = 0.0
 
 
@@ -190,7 +192,9 @@ def _read(
     probabilities = answer.get("probabilities") or {"": 0.0}
     likely = max(probabilities, key=lambda name: probabilities[name])
     sealed = _sealed(truth, folder / truth["case"], batch)
-    priced = (answer.get("noise") or {}).get("simulation_m")
+    errors_told = answer.get("noise") or {}
+    priced, noise = errors_told.get("simulation_m"), errors_told.get("standard_deviation_m")
+    camera = truth.get("measurement") or {}
     return Scored(
         **common,
         verdict=verdict,
@@ -206,5 +210,6 @@ def _read(
         told_ratio=_told(answer),
         sealed_ratio=None if sealed is None else 1e3 * sealed / truth["believed_heldout_rms_mm"],
         priced_ratio=priced / sealed if priced and sealed and not put else None,
+        noise_ratio=noise / camera["noise"] if noise and camera.get("told") is False else None,
         seconds=float(answer.get("judge_seconds", cost.get("seconds", 0.0)) or 0.0),
     )

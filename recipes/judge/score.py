@@ -124,6 +124,7 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
         "names told with 0.8 to 1, right": str(rate(certain, lambda c: c.likely in truths(c))),
         "  expected calibration error of the most probable": _calibration(sure),
         "own error, as told / real, nothing missing": _median([c.priced_ratio for c in quiet if c.priced_ratio]),
+        "noise, as told / real, where it is not stated": _median([c.noise_ratio for c in cases if c.noise_ratio]),
         "failed to answer": str(rate(cases, lambda c: c.verdict in MUTE)),
         "seconds for an answer": _median([c.seconds for c in cases if c.seconds]),
     }
