@@ -37,12 +37,12 @@ def test_third_differences_tell_the_size_of_noise_of_which_a_share_lasts(lasting
     assert lasting == 0 or white < 0.97
 
 
-@pytest.mark.parametrize("lasting", [0.05, 0.25, 0.5])
-def test_what_a_model_leaves_tells_how_much_of_the_noise_lasts(lasting):
+@pytest.mark.parametrize(("lasting", "level"), [(0.05, 1.0), (0.25, 1.0), (0.5, 1.0), (0.25, 1.2)])
+def test_what_a_model_leaves_tells_how_much_of_the_noise_lasts(lasting, level):
     shares, sizes = [], []
     for seed in range(4):
         data, _, drag = recorded(0.02, seed, trials=3, count=120, effect=0.3, lasting=lasting)
-        white = NOISE / lasting_noise(1.0, lasting, 1 / 119)  # as third differences tell it
+        white = level * NOISE / lasting_noise(1.0, lasting, 1 / 119)  # as third differences tell it, or more
         unknown = dataclasses.replace(data, noise=white, lasting=LASTING)
         found = with_lasting_noise(unknown, infer(unknown, drag), stated=False)
         shares.append(found.lasting)
