@@ -6,7 +6,6 @@ import dataclasses
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import LASTING
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
     Linearised,
@@ -15,6 +14,7 @@ from torchsoro.sim2real.inference.evidence import (
     errors,
     infer,
 )
+from torchsoro.sim2real.inference.noise import LASTING
 from torchsoro.sim2real.inference.observed import Data, TrialData
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.weighing import Weighing

@@ -10,10 +10,9 @@ import pytest
 from swings import recorded
 
 from torchsoro.sim2real.data.recording import Recording
-from torchsoro.sim2real.inference.decision import LASTING
 from torchsoro.sim2real.inference.evidence import infer
 from torchsoro.sim2real.inference.lasting import with_lasting_noise
-from torchsoro.sim2real.inference.noise import CORRELATION, estimate_noise, lasting_noise
+from torchsoro.sim2real.inference.noise import CORRELATION, LASTING, estimate_noise, lasting_noise
 
 NOISE = 0.01  # of the recordings of ``swings``
 

@@ -14,5 +14,4 @@ TOLERANCE = 0.5  # standard deviation of a belief over its stated tolerance, whi
 BELIEVED = 1.45  # tolerances by which a stated number may be off and still be credible: 2.9 standard deviations
 MISSING = 0.5  # prior probability that something is missing; names share it evenly, a pair has 1/n of a name's share
 COMMON = 0.5  # share of a discrepancy's variance that all markers have in common: bodies move in modes, not by markers
-LASTING = 0.25  # share of the noise's variance that lasts from sample to sample, as trackers drift
 UNEXPLAINED = 0.2  # of the difference: what leaves more of it than a fifth, a twenty-fifth of its square, is another's

@@ -12,7 +12,7 @@ import numpy as np
 from torchsoro.sim2real.data.recording import Recording
 
 CORRELATION = 0.03  # correlation time of the twin's own error, and of the lasting part of the noise [s]
-LASTING = 0.25  # share of the noise's variance that is correlated in time
+LASTING = 0.25  # share of the noise's variance that is correlated in time, until it is fitted (see ``lasting``)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -8,7 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import LASTING, MATTERS
+from torchsoro.sim2real.inference.decision import MATTERS
+from torchsoro.sim2real.inference.noise import LASTING
 
 STILL = 0.1  # of the mean motion: least amplitude of a discrepancy along an axis without motion
 
