@@ -52,7 +52,7 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None, shar
             should take its part: a simulation holds what it fills until its last substep, and others wait for it.
 
     Raises:
-        ValueError: if the device is neither, or there is none, or the share is not above 0 and up to 1.
+        ValueError: if the device is neither, CUDA is asked for where there is none, or the share is out of range.
     """
     global _started
     kind = str(device).partition(":")[0]

@@ -24,11 +24,11 @@ from scipy.optimize import minimize
 
 from torchsoro.sim2real.inference.decision import COMMON
 from torchsoro.sim2real.inference.laplace import Mode, ln_box, posterior
+from torchsoro.sim2real.inference.noise import CORRELATION
 from torchsoro.sim2real.inference.observed import Data, Motions, independent
 from torchsoro.sim2real.inference.priors import Prior, bounds
 from torchsoro.sim2real.inference.state_space import ROWS, ErrorModel, Gram, Process, integrated, tempered, total
 
-NOISE_TIME = 0.03  # correlation time of the part of the noise that lasts [s]
 NARROW = 0.05  # of ln s, ln tau and ln c: what they need not be known better than
 FIRST, AGAIN = 0.5, 0.1  # steps in ln s, ln tau and ln c with which their search begins; and where it was before
 APART = 0.15  # of ln s, ln tau and ln c, for second differences
@@ -49,7 +49,7 @@ class Discrepancy:
     """
 
     share: float = 0.0
-    time: float = NOISE_TIME
+    time: float = CORRELATION
     twin: float = 1.0
 
 
@@ -66,7 +66,7 @@ class TwinError:
     """
 
     amplitude: np.ndarray
-    time: float = NOISE_TIME
+    time: float = CORRELATION
     draws: tuple[Motions, ...] = ()
     modes: Motions = ()
 
@@ -226,7 +226,10 @@ def errors(data: Data, numerics: TwinError, discrepancy: Discrepancy) -> list[Er
         discrepancy: What the model does not explain.
     """
     white, lasting, twin, unexplained = _unscaled(data, numerics)
-    known = Process(time=NOISE_TIME, loading=lasting), Process(time=numerics.time, loading=twin, scale=discrepancy.twin)
+    known = (
+        Process(time=CORRELATION, loading=lasting),
+        Process(time=numerics.time, loading=twin, scale=discrepancy.twin),
+    )
     return [
         ErrorModel(
             white=white, processes=(*known, Process(time=discrepancy.time, loading=own, scale=discrepancy.share))

@@ -333,6 +333,8 @@ class Likelihood:
             requests: Effects and points.
             of: Numbers of the trials of each; all if None.
         """
+        if not requests:
+            return []  # without a word to the progress
         begin = time.perf_counter()
         asked = [range(len(self.trials)) for _ in requests] if of is None else of
         lanes = [(k, i) for k, own in enumerate(asked) for i in own]

@@ -109,9 +109,8 @@ class TotalSegmentIntegrator:
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
         items = self.batch * max(tiles + self.wall_chunks + self.ties, chunks)
-        most = most_blocks(like.device, self.tiles.shape, like.dtype) if self.gpu else 0
-        self.most = blocks_of(most, gpu_share())
-        self.blocks = min(self.most, items) if self.gpu else 0
+        most = blocks_of(most_blocks(like.device, self.tiles.shape, like.dtype), gpu_share()) if self.gpu else 0
+        self.most, self.blocks = most, min(most, items)
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, layout.WALL_VECTORS, self.wall_chunks * layout.TILE
