@@ -108,17 +108,3 @@ def test_a_chamber_between_lattice_planes_has_the_gradient_on_cuda_that_it_has_o
     torchsoro.init("cpu")
     assert air == pytest.approx(exact, rel=1e-4)
     assert (gradient - exact_gradient).norm() < 1e-2 * exact_gradient.norm()
-
-
-@pytest.mark.slow
-def test_a_share_of_a_gpu_does_not_change_a_bit(cuda: torch.device) -> None:
-    domain = Domain(size=(0.04,) * 3, particles=(24,) * 3)
-    body = fill(domain, torch.ones(len(domain.positions), device=cuda), solid=Solid(), epsilon=1e-3)
-    simulator = Simulator(cell=domain.cell, dt=4e-5, low=(-0.1,) * 3, high=(0.1,) * 3, formulation="total")
-    ends, acting = [], {"planes": (ground(friction=0.5),), "gravity": (0.0, 0.0, -9.8)}
-    for share in (1.0, 0.02):
-        torchsoro.init(cuda, share=share)
-        with torch.no_grad():
-            ends.append(simulator(body, duration=0.02, probes=torch.arange(0, 24**3, 97), **acting).position)
-    torchsoro.init("cpu", share=1.0)
-    assert torch.equal(*ends)

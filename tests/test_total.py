@@ -12,9 +12,6 @@ from torch import Tensor
 
 from torchsoro import Body, Domain, Force, Gas, Plane, Prony, Solid, Spring, fill, ground
 from torchsoro.simulation.ops.lattice import Lattice
-from torchsoro.simulation.ops.total import blocks_of
-from torchsoro.simulation.runtime import init
-from torchsoro.simulation.threads import gpu_share
 
 FREE, G = (0.0, 0.0, 0.0), 9.81
 CELL = 2 * H
@@ -311,15 +308,3 @@ def test_bodies_of_a_batch_may_lie_apart():
     # What falls a way first ends elsewhere; along the ground a shift is a shift.
     (by,) = torch.autograd.grad(together.center_of_gravity[:, -1, :2].sum(), shift)
     torch.testing.assert_close(by[:, :2], torch.ones(2, 2).double(), rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("share", [0.0, -0.5, 1.5, math.nan])
-def test_a_share_of_a_gpu_out_of_range_is_refused(share):
-    with pytest.raises(ValueError, match=r"share = .*wanted a number above 0 and up to 1"):
-        init("cpu", share=share)
-    assert gpu_share() == 1.0
-
-
-def test_blocks_of_a_share_of_a_gpu_are_never_more_than_it_runs_and_one_at_least():
-    assert [blocks_of(264, share) for share in (1.0, 0.5, 1 / 16, 1e-6)] == [264, 132, 16, 1]
-    assert sum(blocks_of(264, 1 / n) for n in [17] * 17) <= 264

@@ -6,7 +6,7 @@ from .design.objective import center_of_gravity, intermediate_density, stride, t
 from .errors import SimulationDiverged
 from .simulation.actuation import Waveform, read_pressure_csv, square_wave
 from .simulation.contact import Plane, ground
-from .simulation.loads import Clamp, Drag, Force, PointMass, QuadraticDrag, Spring
+from .simulation.loads import Chain, Clamp, Drag, Force, PointMass, QuadraticDrag, Spring
 from .simulation.material import Body, Gas, Prony, Solid
 from .simulation.runtime import init
 from .simulation.simulator import Simulator
@@ -17,6 +17,7 @@ __version__: str
 __all__ = [
     "AugmentedLagrangian",
     "Body",
+    "Chain",
     "Chamber",
     "Clamp",
     "DesignField",

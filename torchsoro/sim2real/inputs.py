@@ -125,7 +125,6 @@ def check_numbers(options: Options) -> None:
         "edge": (options.edge, lambda v: 0 <= v <= 10, "a positive length in metres, or 0 to choose one"),
         "walls": (options.walls, lambda v: 1 <= v <= 32, "1 to 32 cells"),
         "threads": (options.threads, lambda v: 0 <= v <= 1024, "1 to 1024, or 0 for the number of processors"),
-        "share": (options.share, lambda v: 0 < v <= 1, "a number above 0 and up to 1"),
     }
     for name, (value, good, wanted) in ranges.items():
         whole = name in ("walls", "threads")

@@ -34,5 +34,3 @@ class Options:
     many; "auto" takes one if there is one and the body has so many points."""
     threads: int = 0
     """That simulate side by side; 0 for as many as there are processors."""
-    share: float = 1.0
-    """Of a GPU that twins fill at most; where several explanations run on one at the same time, 1 over their number."""

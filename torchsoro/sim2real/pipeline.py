@@ -36,7 +36,6 @@ from torchsoro.sim2real.report.improvement import worst_of
 from torchsoro.sim2real.report.report import write
 from torchsoro.sim2real.report.sentences import lead
 from torchsoro.sim2real.twin.batch import THREADS
-from torchsoro.simulation.threads import set_share
 from torchsoro.storage import check_folder
 
 __all__ = ["Explanation", "Options", "explain", "predict_markers", "run"]
@@ -75,7 +74,6 @@ def predict_markers(options: Options) -> dict[str, np.ndarray]:
     check_folder("out", out.parent, [out.name])
     model = read_model(Path(options.predict))
     threads, device = options.threads or THREADS, chosen(options.device, 0.0)
-    set_share(options.share)
     columns = predict_trial(model, Path(options.trial), Path(options.predict), threads, device)
     write_table(out, columns)
     return columns
@@ -120,7 +118,6 @@ def explain(options: Options) -> Explanation:
     torch.set_num_threads(1)  # threads belong to groups of simulations
     begin = time.perf_counter()
     inputs = read_inputs(options)
-    set_share(options.share)
     progress = Progress()
     try:
         for note in (*inputs.notes, *(f"Hint: {hint}" for hint in inputs.hints)):

@@ -8,9 +8,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from torchsoro.simulation.hanging import chain_numbers
 from torchsoro.simulation.kernels import layout
 from torchsoro.simulation.loads import (
     Attached,
+    Chain,
     Clamp,
     Drag,
     Force,
@@ -34,6 +36,9 @@ def load_tensors(attached: Attached) -> list[tuple[Tensor, int]]:
         amount = {PointMass: "mass", Drag: "coefficient", QuadraticDrag: "coefficient", Spring: "stiffness"}
         if type(load) in amount:
             found.append((torch.as_tensor(getattr(load, amount[type(load)])), 0))
+        if isinstance(load, Chain):
+            numbers = load.length, load.mass, load.stiffness, load.damping
+            found += [(load.support, 1), *((torch.as_tensor(number), 0) for number in numbers)]
         share = getattr(load, "share", None)
         if share is not None:
             found.append((share, 1))
@@ -88,6 +93,8 @@ def on_nodes(
         scene = replace(scene, softens=depth.requires_grad or bool((depth != 0).any()))
         changes["softening"] = wide(body.softening, 1)
     weights, drags, shares, fluid, ties, means = [], [], [], [], [], []
+    chains: list[Tensor] = []
+    chain_steps = 0
     held = torch.zeros(lattice.nodes, dtype=torch.bool, device=like.device)
     for load in attached.more:
         if isinstance(load, QuadraticDrag):
@@ -99,6 +106,13 @@ def on_nodes(
         elif isinstance(load, Spring):
             ties.append(wide(load_amount("stiffness", load.stiffness, like), 0))
             means.append(wide(_share(load, lattice, like), 1))
+            chains.append(like.new_zeros(len(like), layout.CHAIN))
+        elif isinstance(load, Chain):
+            ties.append(like.new_zeros(len(like)))
+            means.append(wide(_share(load, lattice, like), 1))
+            found, steps = chain_numbers(load, inputs.gravity[0], scene.dt, wide)
+            chains.append(found)
+            chain_steps = max(chain_steps, steps)
         else:
             name, kept = ("mass", weights) if isinstance(load, PointMass) else ("coefficient", drags)
             amount = wide(load_amount(name, getattr(load, name), like), 0)
@@ -113,7 +127,9 @@ def on_nodes(
         scene = replace(scene, immersed=True)
     if ties:
         changes["ties"] = torch.stack(ties, 1)
-        scene = replace(scene, tie_share=torch.stack(means, 1))
+        scene = replace(scene, tie_share=torch.stack(means, 1), chain_steps=chain_steps)
+        if chain_steps:
+            changes["chains"] = torch.stack(chains, 1)
     if shares:
         scene = replace(scene, node_share=torch.stack(shares))
     if bool(held.any()):
@@ -154,9 +170,9 @@ def held_still(scene: Scene, state: Tensor, *, continued: bool) -> Tensor:
     return torch.cat([torch.where(still, 0.0, state[:, : 6 * nodes]), state[:, 6 * nodes :]], 1)
 
 
-def _share(load: Force | PointMass | Spring | Drag, lattice: Lattice, like: Tensor) -> Tensor:
+def _share(load: Force | PointMass | Spring | Chain | Drag, lattice: Lattice, like: Tensor) -> Tensor:
     """Each node's share of a load [..., nodes]."""
-    if load.particles is not None:
+    if not isinstance(load, Chain) and load.particles is not None:
         count = lattice.count if lattice.index is None else len(lattice.index)
         group = group_shares(load.particles, load.share, count, like)
         return lattice.to_nodes(lattice.spread(group).reshape(-1, lattice.count)).reshape(*group.shape[:-1], -1)

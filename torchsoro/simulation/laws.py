@@ -1,4 +1,4 @@
-"""Laws of contact, drag and softening as functions of numbers: one text, for Taichi, lanes of a CPU and plain Python.
+"""Laws of contact, drag, softening and links as functions of numbers: one text, for Taichi, lanes and plain Python.
 
 ``kernels.laws_taichi`` and ``kernels.laws_lanes`` compile it. So that all three read it alike, and lanes of a vector
 register go through it together, a law
@@ -392,3 +392,28 @@ def repulsion_adjoint(square, reach, a, b, push_bar):
         a_bar = by_series * b * b
         b_bar = by_series * a * a
     return square_bar, a_bar, b_bar
+
+
+def link(d0, d1, d2, r0, r1, r2, rest, stiffness, damping):
+    """Force of a link of a chain, which pulls where it is longer than at rest, and never pushes.
+
+    Args:
+        d0: From its one end to the other, x [m].
+        d1: Likewise y.
+        d2: Likewise z.
+        r0: Rate of that, x [m/s].
+        r1: Likewise y.
+        r2: Likewise z.
+        rest: Length at rest, above 0 where it is stiff [m].
+        stiffness: [N/m].
+        damping: [N s/m].
+
+    Returns:
+        Force on the one end [N].
+    """
+    span = sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    pull = span * 0
+    if span > rest:
+        rate = (d0 * r0 + d1 * r1 + d2 * r2) / span
+        pull = max(stiffness * (span - rest) + damping * rate, span * 0) / span
+    return pull * d0, pull * d1, pull * d2

@@ -1,4 +1,4 @@
-"""What is attached to groups of particles or nodes: forces, point masses, springs, drag, clamps; together a tube.
+"""What is attached to groups of particles or nodes: forces, point masses, springs, chains, drag, clamps.
 
 A group shares its load equally, or by ``share`` [..., n], whose sum is 1. Without ``particles`` a share is one of each
 node of the lattice, which ``Total(lattice=...)`` is told: so a load can be anywhere in the body.
@@ -112,6 +112,30 @@ class Spring:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Chain:
+    """A tube that hangs between a group's mean place and a fixed end: beads in a row, joined by links that only pull.
+
+    It begins at rest, with the body where it is undeformed. Total formulation only, without a gradient, and not in a
+    simulation that goes on from another.
+
+    Attributes:
+        share: Of each node [..., nodes].
+        support: The fixed end, as seen from the group's mean place in the undeformed body [..., 3] m.
+        length: Unstretched [...] m.
+        mass: [...] kg; one of none does not pull.
+        stiffness: Of the whole chain when taut [...] N/m.
+        damping: Of each link, over that which is critical for a bead on it [...].
+    """
+
+    share: Tensor
+    support: Tensor
+    length: Tensor | float
+    mass: Tensor | float
+    stiffness: Tensor | float
+    damping: Tensor | float
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Drag:
     """Linear drag on a group.
 
@@ -162,7 +186,7 @@ class Clamp:
     high: tuple[float, float, float]
 
 
-Load = Force | PointMass | Spring | Drag | QuadraticDrag | Clamp
+Load = Force | PointMass | Spring | Chain | Drag | QuadraticDrag | Clamp
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,7 +238,7 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
     for force in forces:
         _check_vector("force", force.value)
     for load in loads:
-        assert not isinstance(load, QuadraticDrag | Clamp)
+        assert not isinstance(load, QuadraticDrag | Clamp | Chain)
         assert load.particles is not None
         group = group_shares(load.particles, load.share, count, x)
         if isinstance(load, Force):
@@ -255,7 +279,11 @@ def attach(body: Body, loads: Sequence[Load]) -> Attached:
 
 def _elsewhere(load: Load) -> bool:
     """Whether a load is not on particles, each by itself."""
-    return isinstance(load, QuadraticDrag | Clamp) or load.particles is None or (isinstance(load, Spring) and load.mean)
+    return (
+        isinstance(load, QuadraticDrag | Clamp | Chain)
+        or load.particles is None
+        or (isinstance(load, Spring) and load.mean)
+    )
 
 
 def vectors_at(name: str, time: Tensor, value: Tensor, t: Tensor) -> Tensor:

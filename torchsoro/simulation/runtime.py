@@ -11,7 +11,7 @@ import taichi as ti
 import torch
 from taichi.lang.ast.ast_transformer_utils import ASTTransformerContext
 
-from torchsoro.simulation.threads import set_share, set_threads
+from torchsoro.simulation.threads import set_threads
 
 _started: str | None = None
 
@@ -39,7 +39,7 @@ def _remember_positions() -> None:
 _remember_positions()
 
 
-def init(device: str | torch.device = "cpu", *, threads: int | None = None, share: float | None = None) -> None:
+def init(device: str | torch.device = "cpu", *, threads: int | None = None) -> None:
     """Start Taichi for a device; called by the first simulation, so that importing torchsoro costs nothing.
 
     A process works on one kind of device at a time. Asking for another starts Taichi anew, which recompiles (from the
@@ -48,11 +48,9 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None, shar
     Args:
         device: "cpu" or "cuda".
         threads: CPU threads; all cores if None.
-        share: Of a GPU, that simulations of the total formulation fill at most. Where several processes share one, each
-            should take its part: a simulation holds what it fills until its last substep, and others wait for it.
 
     Raises:
-        ValueError: if the device is neither, CUDA is asked for where there is none, or the share is out of range.
+        ValueError: if the device is neither, or CUDA is asked for where there is none.
     """
     global _started
     kind = str(device).partition(":")[0]
@@ -60,8 +58,6 @@ def init(device: str | torch.device = "cpu", *, threads: int | None = None, shar
         raise ValueError(f"device = {str(device)!r}: wanted 'cpu' or 'cuda'")
     if kind == "cuda" and not torch.cuda.is_available():
         raise ValueError("device = 'cuda': this machine has no CUDA device that torch can use; wanted 'cpu'")
-    if share is not None:
-        set_share(share)
     if threads is not None:
         set_threads(threads)
     if _started == kind and threads is None:

@@ -220,6 +220,8 @@ class Simulator(nn.Module):
         scene, whole, x, velocity, weights = self.formulation.place(scene, whole, x, velocity, weights)
         if scene.lattice is not None:
             scene, whole = on_nodes(scene, whole, attached, wide)
+            if scene.chain_steps and isinstance(start, Trajectory | Tensor):
+                raise ValueError("start: a state beside a Chain, whose beads it does not tell, wanted None or a Start")
             refuse_shifted(scene, x, started=isinstance(start, Start))
         if where.is_floating_point():
             if scene.lattice is None:
@@ -319,7 +321,9 @@ class Simulator(nn.Module):
         differentiable = torch.is_grad_enabled() and any(
             t.requires_grad for t in (state, weight, *(getattr(whole, f.name) for f in fields(whole)))
         )
-        segment, keep = steps if progress is None else max(64, math.ceil(steps / 100)), False
+        # A chain knows its beads within a segment only.
+        whole_run = progress is None or scene.chain_steps > 0
+        segment, keep = steps if whole_run else max(64, math.ceil(steps / 100)), False
         if differentiable:
             plan = plan_checkpoints(
                 steps=steps,

@@ -1,4 +1,4 @@
-"""What a simulation takes of the machine: threads of a CPU, and a share of a GPU."""
+"""Number of CPU threads that a simulation takes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 
 _asked: int | None = None
-_share = 1.0
 _here: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
@@ -38,20 +37,3 @@ def thread_count() -> int:
     if given is not None and given.isdigit() and int(given) > 0:
         return int(given)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def set_share(share: float) -> None:
-    """Fill no more than such a share of a GPU from now on.
-
-    Raises:
-        ValueError: if it is not above 0 and up to 1.
-    """
-    global _share
-    if not 0 < share <= 1:
-        raise ValueError(f"share = {share:g}: wanted a number above 0 and up to 1")
-    _share = share
-
-
-def gpu_share() -> float:
-    """Share of a GPU that a simulation fills at most."""
-    return _share

@@ -13,9 +13,13 @@ from torch import Tensor
 from torchsoro.sim2real.hypotheses.hypothesis import LAW, Hypothesis, Quantity, Simpler
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import Twin
-from torchsoro.simulation.loads import Drag, Force, Load, PointMass, Spring
+from torchsoro.simulation.hanging import pull_at_rest
+from torchsoro.simulation.loads import Chain, Drag, Force, Load, PointMass, Spring
 from torchsoro.simulation.material import Prony
 
+TUBE = 3000.0  # 1/s2, stiffness of a taut tube over its mass: waves of 5 m/s in one of 0.1 m
+MOVED = 4e-3  # m, to both sides, over which the stiffness of a hanging tube is told
+LOSS = 0.5  # of critical damping, in a link of a tube
 HALF_WIDTH = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
 
 
@@ -286,4 +290,73 @@ class TautTether(Hypothesis):
         own = (which == torch.arange(len(places))[:, None]).to(values)
         return scenario.plus(
             *(Force(share=s, value=values[:, :3] * w[:, None]) for s, w in zip(shares, own, strict=True))
+        )
+
+
+class HangingTether(Hypothesis):
+    """A tube that hangs from a support to a place of the body: it swings, it pulls when taut, and it never pushes.
+
+    Its stiffness is that of its material, so in proportion to its mass; its links lose half of what critical damping
+    takes.
+    """
+
+    name, affected_quantity, local, model_form_deviation = "tether", "a tube that hangs on a place", True, LAW
+    ratios = frozenset({"stiffness_n_m"})
+    quantities = (
+        Quantity("mass_kg", "kg", 0.002, 0.0, 1000.0),
+        *(Quantity(f"support_{axis}_m", "m", 0.02, -50.0, 50.0) for axis in "xyz"),
+        Quantity("slack", "1", 0.02, -10.0, 50.0),
+        Quantity("ln_stiffness", "1", 1.0, -5.0, 5.0),
+    )
+    starts, rugged = ((1.0, 3.0, 0.0, 0.0, 0.5, 0.0),), True
+
+    def spread(self, twin: Twin, u: np.ndarray) -> np.ndarray:
+        """Tubes of half a percent to 30 % of the body's mass, 40 to 120 mm long, hardly taut to slack, to any side."""
+        setup = twin.setup
+        size, origin = np.array(setup.size), np.array(setup.origin)
+        mass = setup.density * float(twin.volumes.sum()) * np.exp(np.interp(u[:, 0], [0, 1], np.log([0.005, 0.3])))
+        up, turn, span = 2 * u[:, 1] - 1, 2 * np.pi * u[:, 2], 0.04 * 3 ** u[:, 3]
+        around = np.sqrt(1 - up**2)
+        support = span * np.stack([around * np.cos(turn), around * np.sin(turn), up])
+        slack, ln_stiffness = np.interp(u[:, 4], [0, 1], [-0.02, 0.04]), 2 * u[:, 5] - 1
+        scales = np.array([q.scale for q in self.quantities])
+        values = np.stack([mass, *support, slack, ln_stiffness], 1) / scales
+        return np.concatenate([values, 10 * (origin / size + u[:, 6:])], 1)
+
+    def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
+        """What it hangs on the body at rest, how much harder it pulls when that moves away, its own mass and length."""
+        gravity = scenario.gravity.reshape(-1, 3)[:1].double()
+        given = torch.from_numpy(values).double()
+        mass, support, span = given[:1], given[None, 1:4], given[1:4].norm()
+        length, stiffness = (span * (1 + given[4]))[None], mass * TUBE * given[5].exp()
+        away = support / span
+        moved = torch.cat([support, support + MOVED * away, support - MOVED * away])
+        three = (t.expand(3, *t.shape[1:]) for t in (length, mass, stiffness, gravity))
+        pull = pull_at_rest(moved, *three)
+        down = gravity[0] / gravity.norm().clamp(min=1e-12)
+        return {
+            "mass_kg": (float(pull[0] @ down / gravity.norm().clamp(min=1e-12)), "kg"),
+            "stiffness_n_m": (float((pull[1] - pull[2]) @ away[0]) / (2 * MOVED), "N/m"),
+            "tube_mass_kg": (float(mass), "kg"),
+            "tube_length_m": (float(length), "m"),
+        }
+
+    def simpler(self, values: np.ndarray) -> list[Simpler]:
+        """Half of its mass, at the same place."""
+        return [Simpler("attached_mass", np.append(values[0] / 2, values[6:]))]
+
+    def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
+        """A chain."""
+        mass, support = values[:, 0], values[:, 1:4]
+        span = support.norm(dim=1)
+        stiffness = mass * TUBE * values[:, 5].exp()
+        return scenario.plus(
+            Chain(
+                share=twin.at(values[:, 6:]),
+                support=support,
+                length=span * (1 + values[:, 4]),
+                mass=mass,
+                stiffness=stiffness,
+                damping=torch.full_like(mass, LOSS),
+            )
         )

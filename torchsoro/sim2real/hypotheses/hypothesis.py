@@ -73,6 +73,8 @@ class Hypothesis(nn.Module):
         local: Whether it acts at one place, which is then fitted as well.
         starts: Values of the quantities at the probe points, in scales: alternatives, or, if ``joint``, one along each.
         joint: Whether the quantities are components that add up, as those of a vector.
+        rugged: Whether chi-squared has so many valleys that searches begin at many points, see :meth:`spread`; they do
+            only where no other effect explains what is seen.
         mass: Number of the quantity, if any, that is a mass, whose weight bends a body off its middle.
         ratios: Reported quantities that are exponentials of an unknown, so that their interval is a ratio.
         nonnegative: Reported quantities that cannot be negative.
@@ -87,6 +89,7 @@ class Hypothesis(nn.Module):
     local: ClassVar[bool] = False
     starts: tuple[tuple[float, ...], ...] = ()
     joint: ClassVar[bool] = False
+    rugged: ClassVar[bool] = False
     mass: ClassVar[int | None] = None
     ratios: ClassVar[frozenset[str]] = frozenset()
     nonnegative: ClassVar[frozenset[str]] = frozenset()
@@ -144,6 +147,15 @@ class Hypothesis(nn.Module):
         if not self.local:
             return alternatives
         return [np.concatenate([a, np.tile(p, (len(a), 1))], 1) for p in _places(twin) for a in alternatives]
+
+    def spread(self, twin: Twin, u: np.ndarray) -> np.ndarray:
+        """Where searches of a rugged effect begin [N, K] in scales, with the place of a local one.
+
+        Args:
+            twin: The body.
+            u: Points of the unit cube [N, K].
+        """
+        raise NotImplementedError
 
     def weak_probe_points(self, twin: Twin, strength: float) -> list[np.ndarray]:
         """Probe points at a small strength, where responses are nearly linear; one of those that differ in strength.

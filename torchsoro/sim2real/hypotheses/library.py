@@ -5,6 +5,7 @@ from __future__ import annotations
 from torchsoro.sim2real.hypotheses.body_effects import (
     AttachedMass,
     Density,
+    HangingTether,
     LoadInertia,
     Modulus,
     PrintOffset,
@@ -44,7 +45,7 @@ def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
         *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftHalf, PrintOffset, Density),
-        *(AttachedMass, Tether, TautTether, LoadInertia, FluidDrag),
+        *(AttachedMass, Tether, TautTether, HangingTether, LoadInertia, FluidDrag),
         *(PressureLag, PressureGain, ThrottledLoss, Leak, OrificeLeak, AirStiffness, AirTwice),
         *(
             Sliding,

@@ -79,7 +79,8 @@ def isolability(
     Raises:
         ValueError: if the simulation of the setup as stated breaks down.
     """
-    effects = problem.thought_of(library() if effects is None else effects)
+    thought_of = problem.thought_of(library() if effects is None else effects)
+    effects = [e for e in thought_of if not e.rugged]
     n = len(problem.common)
     # Effects that are fitted always need no simulation of their own.
     fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}

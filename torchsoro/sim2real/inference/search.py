@@ -17,6 +17,7 @@ from torchsoro.sim2real.inference.starts import (
     EARLY_ABOVE,
     STARTS,
     Task,
+    even_points,
     likely,
     looked_at,
     null_starts,
@@ -28,6 +29,8 @@ from torchsoro.sim2real.inference.starts import (
 
 COMPLETED = 6  # searches that are completed, of those that are best after a few rounds
 EARLY = (0.12, 0.35)  # first parts of the trials, one after the other
+MOST_RUGGED = 40  # searches of a rugged effect that are begun, at most
+LOOKS = 20  # points at which it is simulated, for each of them
 PAIRS = 0.002  # share of the budget for one simulation of all trials, below which pairs of effects are tried
 CORRECTED = 1.5  # chi-squared per sample of the null model, above which the finer twin corrects each effect by itself
 REFINED = 2  # rounds in which the best are corrected by the finer twin
@@ -41,6 +44,7 @@ BEHIND = 0.1  # share of the best search's gain, by which another may be behind 
 TWICE = 0.25  # excess of chi-squared of a pair over that of the best single effect, below which the pair is kept
 TRIED = 4  # rounds of a search before the best are chosen
 ROUNDS = 12  # of a search that is completed
+RUGGED = ((TRIED, 10), (10, 3), (40, 1))  # rounds of searches of a rugged effect, and how many go on after them
 ENDS = 10  # that are weighed, at most
 ENDS_FINER = 16  # the same where a finer twin is searched, too
 ENDS_PAIR = 3  # of each pair, that more of the trials decide between
@@ -65,6 +69,7 @@ def search(
         searches that are in the running: others without an effect, where there are many valleys, then those with
         effects.
     """
+    rugged, effects = [e for e in effects if e.rugged], [e for e in effects if not e.rugged]
     problem, null_model = _fit_null_model(problem, [((), None)], report, rounds=3)
     # By count, not by the clock: what is searched must not depend on the machine.
     each = cost(problem.twin, len(problem.trials), PARTLY)
@@ -110,8 +115,17 @@ def search(
     best = _best([*completed, *tried])
     if best and null_model.chi2 > CORRECTED * null_model.samples:
         problem, null_model, best = _refined(problem, null_model, best, report)
+
+    def unexplained() -> bool:
+        """Whether the best leaves far more than noise, where searches take little and chance hides little."""
+        much = not best or best[0].chi2 > EARLY_ABOVE * best[0].samples
+        return much and not problem.rough and each < PAIRS * budget
+
+    if unexplained():
+        most = int(np.clip(0.3 * budget / (10 * each), COMPLETED, MOST_RUGGED))
+        best = _best([*best, *(f for effect in rugged for f in _from_many(problem, effect, null_model, most, report))])
     # A second effect would take up what chance in touching leaves.
-    if best and not problem.rough and best[0].chi2 > EARLY_ABOVE * best[0].samples and each < PAIRS * budget:
+    if best and unexplained():
         left = best[0].chi2 - best[0].samples
         pairs = _pairs(problem, effects, running(problem, best), report)
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
@@ -124,6 +138,24 @@ def search(
     nothing, finer = _by_finer(problem, effects, null_model, ends, report)
     mixed = [f for pair in itertools.zip_longest(finer, ends) for f in pair if f is not None]
     return problem, null_model, [*valleys, *nothing, *distinct(mixed, ENDS_FINER)]
+
+
+def _from_many(
+    problem: FitProblem, effect: Hypothesis, null_model: Fit, most: int, report: Callable[[str], None]
+) -> list[Fit]:
+    """Fits of a rugged effect: simulated at many points, and searched from those that leave the least."""
+    points = effect.spread(problem.twin, even_points(LOOKS * most, len(effect.quantities) + 3 * effect.local))
+    stated = np.tile(null_model.point[: len(problem.common)], (len(points), 1))
+    started = [(effect, point) for point in np.concatenate([stated, points], 1)]
+    looks = looked_at(problem, started, errors=null_model.errors)
+    tasks: list[Task] = [((effect,), point) for _, _, point in sorted(looks, key=lambda look: look[0])[:most]]
+    found: list[Fit] = []
+    for rounds, kept in RUGGED:
+        ends = [f for f in problem.fit(tasks, errors=null_model.errors, rounds=rounds, settle=False) if f is not None]
+        found = sorted([*ends, *found], key=lambda fit: fit.chi2)
+        tasks = [(f.effects, f.point) for f in distinct(found, kept)]
+    report(f"{effect.name}, from {len(points)} points: {', '.join(f'{f.chi2:.0f}' for f in found[:4])}")
+    return found
 
 
 def distinct(fits: Iterable[Fit], most: int) -> list[Fit]:
@@ -274,6 +306,7 @@ def _pairs(
     """
     count = len(problem.common)
     first = {effect: effect.probe_points(problem.twin)[0][0] for effect in effects}
+    first = {f.effects[0]: f.point[count:] for f in singles if f.effects[0] not in first} | first  # a rugged one
     begun: list[tuple[np.ndarray, dict[Hypothesis, np.ndarray]]] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
@@ -288,7 +321,7 @@ def _pairs(
     # Of a leading effect by itself at first, one start is that of its pair: each is simulated once.
     distinct_tasks: dict[tuple[tuple[Hypothesis, ...], bytes], Task] = {}
     for stated, own in begun:
-        both = tuple(effect for effect in effects if effect in own)
+        both = tuple(effect for effect in first if effect in own)
         point = np.concatenate([stated, *(own[effect] for effect in both)])
         distinct_tasks.setdefault((both, point.tobytes()), (both, point))
     tasks = list(distinct_tasks.values())

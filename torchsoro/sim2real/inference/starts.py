@@ -107,20 +107,24 @@ def screened(
 
 
 def looked_at(
-    problem: FitProblem, started: Sequence[tuple[Hypothesis, np.ndarray]], base: Point | None = None
+    problem: FitProblem,
+    started: Sequence[tuple[Hypothesis, np.ndarray]],
+    base: Point | None = None,
+    errors: np.ndarray | None = None,
 ) -> list[Look]:
-    """Chi-squared of effects at points, with no measurement errors; without those that break down.
+    """Chi-squared of effects at points; without those that break down.
 
     Args:
         problem: Recordings and twin.
         started: Effects and points.
         base: See :func:`screened`.
+        errors: Measurement errors; none if None.
     """
     points: dict[Hypothesis, list[np.ndarray]] = {}
     for effect, point in started:
         points.setdefault(effect, []).append(point)
     asked = [((effect,), np.stack(own)) for effect, own in points.items()]
-    left = _simulated(problem, asked, np.zeros(len(problem.observation.deviations)), base)
+    left = _simulated(problem, asked, np.zeros(len(problem.observation.deviations)) if errors is None else errors, base)
     return [
         (chi2, effects[0], own[k]) for (effects, own), at in zip(asked, left, strict=True) for k, chi2 in at.items()
     ]
@@ -149,8 +153,7 @@ def spread(twin: Twin, effect: Hypothesis) -> np.ndarray:
     kinds, starts = len(effect.quantities), np.array(effect.starts)
     low, high = np.array([[q.least, q.most] for q in effect.quantities]).T
     count = SCREENED * (4 if effect.local else 1)
-    u = torch.quasirandom.SobolEngine(kinds + 3 * effect.local).draw(count + 2, dtype=torch.float64).numpy()
-    u = u[2:]  # after a corner and the middle
+    u = even_points(count, kinds + 3 * effect.local)
     if effect.joint:
         values = 4 * (u[:, :kinds] - 0.5) * starts.max(0)
     else:
@@ -163,6 +166,11 @@ def spread(twin: Twin, effect: Hypothesis) -> np.ndarray:
         origin, size = np.array(twin.setup.origin), np.array(twin.setup.size)
         values = np.concatenate([values, 10 * origin / size + 10 * u[:, kinds:]], 1)
     return values[np.sort(np.unique(values, axis=0, return_index=True)[1])]
+
+
+def even_points(count: int, axes: int) -> np.ndarray:
+    """Evenly spread points of the unit cube [N, K], of which none is a corner or the middle."""
+    return torch.quasirandom.SobolEngine(axes).draw(count + 2, dtype=torch.float64).numpy()[2:]
 
 
 def within_tolerances(problem: FitProblem) -> np.ndarray:

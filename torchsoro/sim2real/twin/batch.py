@@ -23,7 +23,7 @@ from torchsoro.simulation.contact import Plane
 from torchsoro.simulation.formulation import Total
 from torchsoro.simulation.kernels.lanes import LANES
 from torchsoro.simulation.kernels.layout import LARGEST, lattice_components
-from torchsoro.simulation.loads import Clamp, Drag, Force, Load, PointMass, QuadraticDrag, Spring
+from torchsoro.simulation.loads import Chain, Clamp, Drag, Force, Load, PointMass, QuadraticDrag, Spring
 from torchsoro.simulation.material import Body, Prony
 from torchsoro.simulation.simulator import Simulator
 from torchsoro.simulation.threads import threads_here
@@ -341,11 +341,12 @@ class _Group:
         return [Force(share=shares[key], value=value, start=start) for (key, start), value in values.items()]
 
     def other_loads(self) -> list[Load]:
-        """Point masses, springs and drag: the first ones of each scenario together, then the second ones, ..."""
+        """Point masses, springs, drag, chains: the first ones of each scenario together, then the second ones, ..."""
         found: list[Load] = [*self._alike(PointMass, "mass"), *self._alike(Spring, "stiffness", mean=True)]
-        return [*found, *self._alike(Drag, "coefficient"), *self._alike(QuadraticDrag, "coefficient")]
+        found += [*self._alike(Drag, "coefficient"), *self._alike(QuadraticDrag, "coefficient")]
+        return [*found, *self._alike(Chain, "length", "mass", "stiffness", "damping")]
 
-    def _alike(self, kind: type, name: str, **settings) -> list[Load]:
+    def _alike(self, kind: type, *names: str, **settings) -> list[Load]:
         known = {i: [x for x in self.scenarios[i].loads if isinstance(x, kind)] for i in {i for i, _ in self.lanes}}
         loads = []
         for number in range(max(map(len, known.values()))):
@@ -357,7 +358,9 @@ class _Group:
                 t = t[b if b < len(t) else 0] if t.ndim > rank else t
                 return t if number < len(own) or field == "share" else torch.zeros_like(t)
 
-            given = {name: torch.stack([of(i, b, name, 0) for i, b in self.lanes]).float()}
+            given = {name: torch.stack([of(i, b, name, 0) for i, b in self.lanes]).float() for name in names}
+            if kind is Chain:
+                given["support"] = torch.stack([of(i, b, "support", 1) for i, b in self.lanes]).float()
             if kind is not QuadraticDrag:
                 given["share"] = torch.stack([of(i, b, "share", 1) for i, b in self.lanes]).float()
             loads.append(kind(**given, **settings))

@@ -70,7 +70,7 @@ class Scenario:
             (t, 0) for g in self.planes for t in (g.offset, g.adhesion, g.reach, g.friction) if isinstance(t, Tensor)
         ]
         for load in self.loads:
-            named = {"value": 1, "mass": 0, "stiffness": 0, "coefficient": 0, "share": 1}
+            named = {"value": 1, "mass": 0, "stiffness": 0, "coefficient": 0, "share": 1, "support": 1, "length": 0}
             given = [(getattr(load, name, None), rank) for name, rank in named.items()]
             ranks += [(t, rank) for t, rank in given if isinstance(t, Tensor)]
         if self.prony is not None:

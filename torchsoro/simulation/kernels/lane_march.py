@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchsoro.simulation.kernels.lane_chains import chains_forward
 from torchsoro.simulation.kernels.lane_nodes import advance
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
@@ -105,6 +106,8 @@ class Case(NamedTuple):
     force_start: np.ndarray
     tie_share: np.ndarray
     tie_stiffness: np.ndarray
+    chains: np.ndarray
+    chain_steps: int
     quadratic: np.ndarray
     plane_numbers: np.ndarray
     plane_stick: np.ndarray
@@ -135,6 +138,7 @@ class Work(NamedTuple):
     swept: np.ndarray
     by_plane: np.ndarray
     tension: np.ndarray
+    beads: np.ndarray
     collapsed: np.ndarray
     sync: np.ndarray
     scratch: np.ndarray
@@ -250,6 +254,8 @@ def march(mesh, case, work, rank, threads, begin, steps, ring, history_ring, sto
         if rank == 0 and case.tie_stiffness.size:
             for g in range(case.groups):
                 ties_forward(mesh, case, work, g, now + g * 6 * mesh.component)
+                if case.chain_steps:
+                    chains_forward(mesh, case, work, g, now + g * 6 * mesh.component, t)
         for g in range(rank, case.groups, threads):
             if work.contact.actives[g] > 0:
                 contact_forward(mesh, work.contact, work.states, g, now + g * 6 * mesh.component)

@@ -82,11 +82,11 @@ COLLAPSED, ARRIVED = 0, 1
 SIZES = (
     *("batch", "nx", "ny", "nz", "mx", "my", "mz", "tx", "ty", "tz", "elements", "chambers", "groups", "springs"),
     *("viscous", "planes", "slots", "ring", "kept_ring", "steps", "want_prony", "tallies", "blocks", "histories"),
-    *("faced", "ties", "pushes", "wall_chunks", "wall_rows", "fluid", "watched", "sample_at", "row_at"),
+    *("faced", "ties", "pushes", "wall_chunks", "wall_rows", "fluid", "watched", "sample_at", "row_at", "chain_steps"),
 )
 BATCH, NX, NY, NZ, MX, MY, MZ, TX, TY, TZ, ELEMENTS, CHAMBERS, GROUPS, SPRINGS = range(2, 16)
 VISCOUS, PLANES, SLOTS, RING, KEPT_RING, STEPS, WANT_PRONY, TALLIES, BLOCKS, HISTORIES = range(16, 26)
-FACED, TIES, PUSHES, WALL_CHUNKS, WALL_ROWS, FLUID, WATCHED, SAMPLE_AT, ROW_AT = range(26, 35)
+FACED, TIES, PUSHES, WALL_CHUNKS, WALL_ROWS, FLUID, WATCHED, SAMPLE_AT, ROW_AT, CHAIN_STEPS = range(26, 36)
 
 # What a kernel is compiled for, a sum of these: forces on points, springs or viscosity; solids that stiffen, that
 # soften; quadratic drag; springs to mean displacements; forces on nodes; hollow chambers; nodes whose motion is
@@ -106,11 +106,11 @@ BUFFERS = {
     ),
     "fixed": (
         *("numbers", "coefficients", "prony", "plane_numbers", "nodal", "chamber", "share", "areas", "softening"),
-        *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights", "tile_axes"),
+        *("quadratic", "tie_share", "ties", "node_share", "walls", "wall_weights", "tile_axes", "chains"),
     ),
     "supply": ("pressure", "gravity", "force"),
     "kept": ("volumes", "pushed", "seen"),
-    "scratch": ("partials", "swept", "pads", "tension", "normals", "repulsion"),
+    "scratch": ("partials", "swept", "pads", "tension", "normals", "repulsion", "beads"),
     "backward": ("forces", "surfaces", "volume_bar", "jacobians"),
     "sums": tuple(
         f"{name}_bar"
@@ -120,17 +120,24 @@ BUFFERS = {
         )
     ),
 }
-KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(35, 44)
-WALL_CHUNK, WALL_KIND, WALL_ROW, WALL_COUNT, WALL_ENTRY, NEAR_NUMBER = range(44, 50)
-NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(50, 59)
-QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES = range(59, 66)
-PRESSURE, GRAVITY, FORCE = range(66, 69)
-VOLUMES, PUSHED, SEEN = range(69, 72)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION = range(72, 78)
-FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(78, 82)
-COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(82, 90)
-SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(90, 93)
-HEAD = 93
+KIND, PLANE_KIND, FIRSTS, TILES, CHAMBER_START, SLOT_START, SLOT_CHAMBER, SOURCES, NEAR_NODES = range(36, 45)
+WALL_CHUNK, WALL_KIND, WALL_ROW, WALL_COUNT, WALL_ENTRY, NEAR_NUMBER = range(45, 51)
+NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, AREA, SOFTENING = range(51, 60)
+QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES, CHAINS = range(60, 68)
+PRESSURE, GRAVITY, FORCE = range(68, 71)
+VOLUMES, PUSHED, SEEN = range(71, 74)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION, BEADS_AT = range(74, 81)
+FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(81, 85)
+COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(85, 93)
+SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(93, 96)
+HEAD = 96
+
+# A hanging chain: beads; its numbers: fixed end, rest length, stiffness and damping of a link, one over the mass of a
+# bead, where beads are at first; and its state: places of beads, their velocities, where the end on the body was.
+BEADS = 4
+CHAIN_REST, CHAIN_STIFFNESS, CHAIN_DAMPING, CHAIN_LIGHTNESS, CHAIN_START = 3, 4, 5, 6, 7
+CHAIN = CHAIN_START + 3 * BEADS
+CHAIN_STATE = 6 * BEADS + 3
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors. Number by number, so that threads

@@ -11,6 +11,7 @@ from torchsoro.simulation.kernels.fold import TOTALS, fold
 from torchsoro.simulation.kernels.lattice import nodes_per_axis, product, state_length
 from torchsoro.simulation.kernels.layout import (
     BATCH,
+    CHAIN_STEPS,
     CHAMBER,
     CHAMBER_NUMBERS,
     CHAMBER_STIFFNESS,
@@ -41,6 +42,7 @@ from torchsoro.simulation.kernels.layout import (
 )
 from torchsoro.simulation.kernels.tensor import add, load_vector, store_vector
 from torchsoro.simulation.kernels.tile import chamber_slots, sync, thread
+from torchsoro.simulation.kernels.total_chains import chain_pass
 
 AT_HAND = 2 * TILE  # of the pad: where what wall points hand over begins
 
@@ -90,6 +92,10 @@ def tie_pass(block: ti.template(), tie, t):
         if q < 3:
             stiffness = block.fixed[head[TIE_STIFFNESS] + tie]
             block.scratch[head[TENSION] + 3 * tie + q] = stiffness * block.pad[block.base + TOTALS + q]
+    sync(block.gpu)
+    for each in range(block.q0, block.q1):
+        if thread(block, each) == 0 and head[CHAIN_STEPS] > 0:
+            chain_pass(block, tie, t)
     sync(block.gpu)
 
 

@@ -36,12 +36,15 @@ class Fixed:
 
 def fixed(scene: Scene, inputs: Inputs) -> Fixed:
     """The constants of a run, computed once for the same tensors."""
-    names = ("coefficients", "prony", "planes", "attached", "softening", "fluid", "ties", "air")
+    names = ("coefficients", "prony", "planes", "attached", "softening", "fluid", "ties", "air", "chains")
     given = [getattr(inputs, name) for name in names]
     chambers = inputs.pressure.shape[2]
 
     def compute() -> Fixed:
-        lattice, (c, prony, planes, attached, softening, fluid, ties, air) = scene.lattice, (t.detach() for t in given)
+        lattice, (c, prony, planes, attached, softening, fluid, ties, air, chains) = (
+            scene.lattice,
+            (t.detach() for t in given),
+        )
         assert lattice is not None
         nodal = lattice.nodal(c[:, layout.MASS], c[:, layout.DRAG], scene.dt, attached)
         chamber = chamber_means(scene, c, scene.gas_chambers)
@@ -68,7 +71,7 @@ def fixed(scene: Scene, inputs: Inputs) -> Fixed:
                 *(none if scene.tie_share is None else scene.tie_share.to(c), ties),
                 none if scene.node_share is None else scene.node_share.to(c),
                 *(torch.from_numpy(walls).to(c) for walls in wall_numbers(lattice)),
-                torch.from_numpy(tile_axes(lattice, tiles_of(lattice, c))).to(c),
+                *(torch.from_numpy(tile_axes(lattice, tiles_of(lattice, c))).to(c), chains),
             ),
         )
 

@@ -93,7 +93,7 @@ class LaneIntegrator:
         # Nodes whose motion is observed; all if None.
         self.near = scene.markers.near if scene.only_markers and scene.markers is not None else None
         constants = [like, inputs.prony, inputs.planes, inputs.softening, inputs.fluid, inputs.ties]
-        constants += [inputs.air, inputs.attached]
+        constants += [inputs.chains, inputs.air, inputs.attached]
         self.nodal, case, self.surface, self.contact = once(scene, "case", constants, self._constants)
         self.case = case._replace(**self._supply())
 
@@ -193,6 +193,8 @@ class LaneIntegrator:
             force_start=self._starts(),
             tie_share=lanes.from_nodes(ties).numpy().reshape(-1),
             tie_stiffness=lanes.from_batch(i.ties).numpy().reshape(-1),
+            chains=numbers(lanes.from_batch(i.chains)),
+            chain_steps=s.chain_steps,
             quadratic=quadratic,
             plane_numbers=numbers(lanes.from_batch(numbered)),
             plane_stick=s.plane_kind[:, layout.PLANE_STICK].bool().numpy(),
@@ -316,6 +318,7 @@ class LaneIntegrator:
             swept=numbers(like.new_zeros(tasks, mesh.chambers, LANES)),
             by_plane=numbers(like.new_zeros(groups, mesh.planes, mesh.chambers, LANES)),
             tension=np.zeros(3 * self.case.tie_stiffness.size, numbers(like).dtype),
+            beads=np.zeros(layout.CHAIN_STATE * self.case.tie_stiffness.size, numbers(like).dtype),
             collapsed=np.full(8 * threads, NEVER),
             sync=np.zeros(SYNC, np.int64),
             scratch=aligned(threads * SCRATCH, numbers(like).dtype),

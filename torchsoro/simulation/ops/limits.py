@@ -11,6 +11,8 @@ def refuse_gradient(scene: Scene) -> None:
     Raises:
         ValueError: naming it.
     """
+    if scene.chain_steps:
+        raise ValueError("a Chain: no gradient, wanted tensors that require none, or torch.no_grad()")
     if scene.apart:
         raise ValueError(
             "simulations that diverge apart: no gradient, wanted tensors that require none, or torch.no_grad()"

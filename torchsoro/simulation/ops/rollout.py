@@ -286,6 +286,7 @@ def rollout(
         "softening": (inputs.softening, (batch, 2)),
         "fluid": (inputs.fluid, (batch,)),
         "ties": (inputs.ties, (batch, ties)),
+        "chains": (inputs.chains, (batch, ties if scene.chain_steps else 0, layout.CHAIN)),
         "air": (inputs.air, (batch, hollow)),
         "attached": (inputs.attached, (batch, 2, attached)),
     }

@@ -54,6 +54,7 @@ class Scene:
             substeps; None if it has one for each. In lanes without gradient only.
         tie_share: [B, Q, nodes], each node's share of the groups whose mean displacement a spring resists; None if
             there are none.
+        chain_steps: Steps that chains take within a substep; 0 if there are none. Without gradient, in one segment.
         probes: int64 [P], particles whose motion is recorded.
         markers: Places whose motion is recorded instead, with its gradient; of the total-Lagrangian form.
         lattice: Of the total-Lagrangian form; None for the updated form.
@@ -86,6 +87,7 @@ class Scene:
     node_share: Tensor | None = None
     force_start: tuple[int, ...] | None = None
     tie_share: Tensor | None = None
+    chain_steps: int = 0
     lattice: Lattice | None = None
     markers: Markers | None = None
     lanes: bool = True
@@ -171,6 +173,7 @@ class Inputs:
         fluid: [B] density of what surrounds the body times its drag coefficient [kg/m3]: along each axis a force of
             half of it times the area (``Faces.front``) times v |v|, taken implicitly.
         ties: [B, Q] stiffness of springs to the mean displacement of some nodes (``Scene.tie_share``) [N/m].
+        chains: [B, Q, CHAIN] chains on the mean place of the same nodes (``kernels.layout``); [B, 0, CHAIN] for none.
         air: [B, hollow chambers] pressure that the air in each loses as its volume doubles [Pa].
         attached: [B, 2, nodes] mass [kg] and drag coefficient [N s/m] attached to nodes; [B, 2, 0] for none.
     """
@@ -185,13 +188,15 @@ class Inputs:
     softening: Tensor = _NONE
     fluid: Tensor = _NONE
     ties: Tensor = _NONE
+    chains: Tensor = _NONE
     air: Tensor = _NONE
     attached: Tensor = _NONE
 
     def __post_init__(self) -> None:
         """Fill in what is left out."""
         like = self.coefficients
-        none = {"fluid": (len(like),), "ties": (len(like), 0), "air": (len(like), 0), "attached": (len(like), 2, 0)}
+        none = {"fluid": (len(like),), "ties": (len(like), 0), "chains": (len(like), 0, layout.CHAIN)}
+        none |= {"air": (len(like), 0), "attached": (len(like), 2, 0)}
         for name, shape in none.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, like.new_zeros(shape))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 
@@ -22,7 +21,6 @@ from torchsoro.simulation.ops.tiles import tiles_of
 from torchsoro.simulation.ops.total_selfcontact import TotalSelfContact
 from torchsoro.simulation.runtime import init
 from torchsoro.simulation.sums import pairwise_sum
-from torchsoro.simulation.threads import gpu_share
 
 CHUNK = 1024  # substeps between two checks for divergence
 LAUNCH = 256  # substeps in a launch on a GPU, lest one that also drives a screen takes a large body's for hung
@@ -40,11 +38,6 @@ def most_blocks(device: torch.device, shape: int, dtype: torch.dtype) -> int:
     gpu = torch.cuda.get_device_properties(device)
     shared = 1024 + layout.SHAPES[shape].pad * dtype.itemsize + 4 * total.KEPT  # CUDA takes the kilobyte
     return min(BLOCKS, gpu.shared_memory_per_multiprocessor // shared) * gpu.multi_processor_count
-
-
-def blocks_of(most: int, share: float) -> int:
-    """Blocks of a share of a GPU, which runs so many at the same time; one at least."""
-    return max(1, math.floor(share * most))
 
 
 def _features(scene: Scene) -> int:
@@ -109,13 +102,14 @@ class TotalSegmentIntegrator:
         self.slots = tiles + in_chambers + tiles * int(scene.viscous)
         self.ties = inputs.ties.shape[1]
         items = self.batch * max(tiles + self.wall_chunks + self.ties, chunks)
-        most = blocks_of(most_blocks(like.device, self.tiles.shape, like.dtype), gpu_share()) if self.gpu else 0
+        most = most_blocks(like.device, self.tiles.shape, like.dtype) if self.gpu else 0
         self.most, self.blocks = most, min(most, items)
         pads = 0 if self.gpu else items
         shapes = (self.batch, self.slots, self.tiles.of.slot), (self.batch, in_chambers), (pads, self.tiles.of.pad)
         vectors = self.batch, layout.WALL_VECTORS, self.wall_chunks * layout.TILE
         repulsion = self.batch, 3, self.nodes if scene.self_contact else 0
-        self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors, repulsion)
+        beads = self.batch, self.ties if scene.chain_steps else 0, layout.CHAIN_STATE
+        self.scratch = Arena.zeros("scratch", like, *shapes, (self.batch, self.ties, 3), vectors, repulsion, beads)
         self.kept = Arena.zeros("kept", like, (0,), (0,), (0,))
 
     def _started(self, steps: Tensor) -> Tensor:
@@ -310,6 +304,7 @@ class TotalSegmentIntegrator:
             **{"faced": int(self.lattice.faces is not None), "ties": self.ties},
             **{"wall_chunks": self.wall_chunks, "wall_rows": self.wall_rows},
             **{"pushes": self.scene.forces - self.groups, "fluid": int(self.scene.immersed)},
+            "chain_steps": self.scene.chain_steps,
             **{"watched": self.watched, "sample_at": layout.HEAD + len(self.tables.buffer)},
             **{"row_at": layout.HEAD + len(self.tables.buffer) + (self.steps if self.watched else 0)},
             **{name: int(value) for name, value in more.items()},
