@@ -184,7 +184,7 @@ def test_where_no_model_is_right_a_stated_number_that_is_off_is_held_against_a_n
     )
     probable = []
     for deviation in (1.0, 1 / 5):
-        model = Model(effects=("mass",), priors=(Prior(deviation), Prior(1.0)), own=(1,), beliefs=1)
+        model = Model(effects=("mass",), priors=(Prior(deviation), Prior(1.0)), own=(1,), stated=("modulus",))
         mass = dataclasses.replace(leak, model=model, at=np.zeros(2), slopes=slopes)
         probable.append(weighed(data, nothing, leak, mass).candidates()[0])
     assert probable[0]["mass"] > 0.95
@@ -351,7 +351,7 @@ def test_a_belief_beyond_its_tolerance_is_held_against_a_name_however_alike_it_m
     error = 0.15 * moved * np.sqrt(2) * np.sin(60 * data.trials[0].time)[:, None, None]
     # What drag does a belief does as well, at eight deviations of its own; the effect beside it does next to nothing,
     # or what the twin errs by, so that evidence is for it.
-    belief = Model(effects=("leak",), priors=(Prior(0.3 / 8), Prior(1.0)), own=(1,), beliefs=1)
+    belief = Model(effects=("leak",), priors=(Prior(0.3 / 8), Prior(1.0)), own=(1,), stated=("modulus",))
     own = error[..., None] if fits_the_error else np.array(1e-3)
     other = tuple(np.concatenate([J, own * np.ones_like(J)], -1) for J in drag.slopes)
     leak = Linearised(model=belief, at=np.zeros(2), residuals=drag.residuals, slopes=other, numerics=numerics)

@@ -41,7 +41,7 @@ def test_likelihood_at_the_best_point_is_that_of_the_linear_model(dragged):
     best, beside = nested.likelihood(problem, fit, found)(cube)
     faults = dataclasses.replace(
         found,
-        model=dataclasses.replace(found.model, priors=found.model.priors[count:], own=(), beliefs=0, released=()),
+        model=dataclasses.replace(found.model, priors=found.model.priors[count:], own=(), stated=(), released=()),
         at=found.at[count:],
         slopes=tuple(J[..., count:] for J in found.slopes),
     )

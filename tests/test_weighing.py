@@ -144,7 +144,7 @@ def test_an_error_tells_as_much_as_its_independent_numbers_whatever_the_rate_of_
 def test_nothing_has_the_evidence_of_all_its_modes_as_names_have():
     data, nothing, drag = recorded(0.0, 4)
     once = weighed(data, nothing, drag)
-    model = Model(effects=(), priors=(Prior(1e3),), beliefs=1)
+    model = Model(effects=(), priors=(Prior(1e3),), stated=("modulus",))
     still = tuple(np.zeros_like(J) for J in drag.slopes)
     modes = [dataclasses.replace(nothing, model=model, at=np.array([x]), slopes=still) for x in (0.0, 900.0)]
     found = [infer(data, m) for m in modes]

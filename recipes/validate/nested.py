@@ -62,7 +62,7 @@ def likelihood(problem: FitProblem, fit: Fit, found: Linearised) -> Callable[[np
     count = int(moving.sum())
     model, faults = found.model, found.at[count:]
     coarse = problem.only(problem.trials, discretization=DiscretizationError(shift=tuple(problem.shift)))
-    few = dataclasses.replace(model, priors=model.priors[count:], own=(), beliefs=0, released=())
+    few = dataclasses.replace(model, priors=model.priors[count:], own=(), stated=(), released=())
 
     def linear(points: np.ndarray) -> list[Linearised | None]:
         """By the measurement errors alone, at points of the other unknowns [B, K]."""

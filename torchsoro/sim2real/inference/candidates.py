@@ -71,14 +71,14 @@ def model_of(problem: Likelihood, effects: Effects) -> Model:
         for k in range(len(priors), len(priors) + 3 * effect.local):
             priors.append(Prior(math.inf, low=low[k], high=high[k]))
     moving = [p for p, h in zip(priors, held, strict=True) if not h]
-    beliefs = int((~held[: len(problem.common)]).sum())
+    stated = tuple(one.name for (one, _), h in zip(problem.common, held, strict=False) if not h)
     faults = [Prior(d, freedom=FREEDOM, low=-FAR * d, high=FAR * d) for d in map(float, problem.observation.deviations)]
     return Model(
         effects=tuple(e.name for e in effects),
         priors=(*moving, *faults),
-        own=tuple(range(beliefs, len(moving))),
+        own=tuple(range(len(stated), len(moving))),
         simpler=simpler_of(effects),
-        beliefs=beliefs,
+        stated=stated,
         released=tuple(k - (len(held) - len(moving)) for k in released),
         forms=tuple(sorted(type(e).__name__ for e in effects)),
     )

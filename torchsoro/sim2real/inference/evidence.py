@@ -105,7 +105,7 @@ class Model:
         priors: Of the unknowns: beliefs, effects, measurement errors [K].
         own: Numbers of the unknowns that belong to the effects.
         simpler: Names of which this one is an extension, as a tether is of a mass, or a pair of its members.
-        beliefs: Number of the first unknowns, which are beliefs over their tolerances.
+        stated: Names of the first unknowns, which are beliefs over their tolerances.
         released: Numbers of the unknowns of effects that are beliefs without their tolerances.
         forms: Classes of the effects: a name may have several, whose numbers mean something else.
     """
@@ -114,7 +114,7 @@ class Model:
     priors: tuple[Prior, ...]
     own: tuple[int, ...] = ()
     simpler: tuple[str, ...] = ()
-    beliefs: int = 0
+    stated: tuple[str, ...] = ()
     released: tuple[int, ...] = ()
     forms: tuple[str, ...] = ()
 
@@ -122,6 +122,11 @@ class Model:
     def name(self) -> str:
         """Of the effects."""
         return " + ".join(sorted(self.effects)) or "nothing"
+
+    @property
+    def beliefs(self) -> int:
+        """Number of the beliefs."""
+        return len(self.stated)
 
     @property
     def simulated(self) -> list[int]:

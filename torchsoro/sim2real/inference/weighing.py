@@ -29,6 +29,9 @@ improbable whatever the twin errs by. An extension has a number more, by which i
 what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
 are compared in the same way.
 
+Nothing with a stated number that is off by more than is credible is not nothing: its probability is that of the
+number's name.
+
 Where size decides and both leave no more than the twin may err, evidence is as good a judge as size, since it knows how
 that error varies. A name whose ln evidence is higher by D, adjusted, is at least 1 - exp(-D) times as probable as the
 first.
@@ -226,6 +229,13 @@ class Weighing:
         return ln_strained(self.groups[name][0].near.model, at, range(len(at)))
 
     @cached_property
+    def another(self) -> str | None:
+        """Name of the stated number that is another one where nothing is missing: off by more than is credible."""
+        at = told(self.data, self.null).at[: self.null.near.model.beliefs]
+        off = np.abs(at) if len(at) else np.zeros(1)
+        return self.null.near.model.stated[int(off.argmax())] if off.max() > BELIEVED else None
+
+    @cached_property
     def best(self) -> Posterior:
         """The most probable of all."""
         return max((*map(self._one_of, self._looks_at_effects), self.null), key=lambda p: p.ln_evidence)
@@ -338,6 +348,9 @@ class Weighing:
             probabilities |= {name: missing * p for name, p in normalised(rest).items()}
         if groups:
             probabilities |= self._bounded({name: probabilities[name] for name in groups}, ln_p, ln_prior, left)
+        if self.another in groups:
+            probabilities[self.another] += probabilities[NOTHING]
+            probabilities[NOTHING] = 0.0
         found = [
             Candidate(
                 modes=tuple(modes),
