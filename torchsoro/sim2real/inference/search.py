@@ -127,7 +127,8 @@ def search(
     # A second effect would take up what chance in touching leaves.
     if best and unexplained():
         left = best[0].chi2 - best[0].samples
-        pairs = _pairs(problem, effects, running(problem, best), report)
+        singles = [f for f in running(problem, best) if f.effects[0] in effects]  # no rugged one
+        pairs = _pairs(problem, effects, singles, report) if singles else []
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
     ends = distinct([*best, *sorted(completed, key=lambda f: f.chi2)], ENDS)
     ends = running(problem, ends)
@@ -306,7 +307,6 @@ def _pairs(
     """
     count = len(problem.common)
     first = {effect: effect.probe_points(problem.twin)[0][0] for effect in effects}
-    first = {f.effects[0]: f.point[count:] for f in singles if f.effects[0] not in first} | first  # a rugged one
     begun: list[tuple[np.ndarray, dict[Hypothesis, np.ndarray]]] = []
     for k, one in enumerate(singles):
         known = {one.name, *(s.name for s in singles[:k])}
@@ -321,7 +321,7 @@ def _pairs(
     # Of a leading effect by itself at first, one start is that of its pair: each is simulated once.
     distinct_tasks: dict[tuple[tuple[Hypothesis, ...], bytes], Task] = {}
     for stated, own in begun:
-        both = tuple(effect for effect in first if effect in own)
+        both = tuple(effect for effect in effects if effect in own)
         point = np.concatenate([stated, *(own[effect] for effect in both)])
         distinct_tasks.setdefault((both, point.tobytes()), (both, point))
     tasks = list(distinct_tasks.values())

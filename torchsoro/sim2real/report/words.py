@@ -51,7 +51,7 @@ QUANTITIES = {
     "offset_second_m": "offset along the second axis across the body",
     "mass_kg": "mass",
     "load_inertia.share": "share of the load that is a mass",
-    "stiffness_n_m": "stiffness of the spring",
+    "stiffness_n_m": "stiffness",
     "damping_n_s_m": "coefficient of the damper",
     "pull_x": "pull along x",
     "pull_y": "pull along y",
