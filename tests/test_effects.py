@@ -10,13 +10,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchsoro.sim2real.hypotheses.body_effects import LoadInertia, TautTether
+from torchsoro.sim2real.hypotheses.body_effects import LOSS, TUBE, HangingTether, LoadInertia, TautTether
 from torchsoro.sim2real.hypotheses.outer_effects import InitialPose
 from torchsoro.sim2real.hypotheses.supply_effects import OrificeLeak, PressureLag, ThrottledLoss
 from torchsoro.sim2real.report.explanation import _limits
 from torchsoro.sim2real.twin.twin import Twin
 from torchsoro.simulation.actuation import Waveform
-from torchsoro.simulation.loads import Force
+from torchsoro.simulation.loads import Chain, Force
 
 
 def supplied(made, pressure):
@@ -144,3 +144,39 @@ def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
 def test_a_share_of_the_pressure_that_is_lost_lies_between_nothing_and_all_of_it(effect, made):
     twin, scenario = supplied(made, [0.0, 1e4])
     assert _limits(effect, "fraction", scenario, twin) == (0.0, 1.0)
+
+
+def test_a_tube_between_level_ends_hangs_half_its_weight_on_the_body_and_a_taut_one_is_as_stiff_as_it_is(made):
+    twin, record = made
+    scenario = twin.scenario(record(None).trials[0])
+    down = scenario.gravity.reshape(-1, 3)[0]
+    level = np.cross(down.numpy() / down.norm().item(), [1.0, 0.3, 0.2])
+    level *= 0.08 / np.linalg.norm(level)
+    tether = HangingTether()
+    slack = tether.reported(np.array([0.005, *level, 0.1, 0.0]), scenario, twin)
+    assert slack["mass_kg"][0] == pytest.approx(0.0025, rel=1e-4)
+    assert slack["tube_length_m"][0] == pytest.approx(0.088)
+    taut = tether.reported(np.array([0.005, *level, -0.2, 1.0]), scenario, twin)
+    assert taut["stiffness_n_m"][0] == pytest.approx(0.005 * TUBE * np.e, rel=0.01)
+    values = torch.tensor([[0.005, *level, 0.1, 1.0, *twin.setup.origin]], dtype=torch.float64)
+    (chain,) = [load for load in tether(scenario, values, twin).loads if isinstance(load, Chain)]
+    assert float(chain.length) == pytest.approx(0.088)
+    assert float(chain.stiffness) == pytest.approx(0.005 * TUBE * np.e)
+    assert float(chain.damping) == LOSS
+
+
+def test_tubes_are_thought_of_on_all_sides_and_places_of_the_body(made):
+    twin, _ = made
+    u = np.random.default_rng(3).uniform(size=(2000, 9))
+    points = HangingTether().spread(twin, u)
+    scales = np.array([q.scale for q in HangingTether().quantities])
+    mass, support = points[:, 0] * scales[0], points[:, 1:4] * scales[1:4]
+    own = twin.setup.density * float(twin.volumes.sum())
+    assert 0.005 * own <= mass.min() < 0.006 * own
+    assert 0.28 * own < mass.max() <= 0.3 * own
+    span = np.linalg.norm(support, axis=1)
+    assert 0.04 <= span.min() < span.max() <= 0.12
+    np.testing.assert_allclose((support / span[:, None]).mean(0), 0, atol=0.05)
+    place = points[:, 6:] * np.array(twin.setup.size) / 10
+    low, high = np.array(twin.setup.origin), np.array(twin.setup.origin) + np.array(twin.setup.size)
+    assert bool(((place >= low - 1e-12) & (place <= high + 1e-12)).all())

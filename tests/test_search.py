@@ -226,3 +226,44 @@ def test_chance_in_a_short_step_does_not_change_derivatives():
         by_chance = dataclasses.replace(after, r=after.r + 1.0)
         assert np.array_equal(search.columns(begin, by_chance), begin.columns) is alike
         np.testing.assert_allclose(search.columns(begin, after), begin.columns, atol=1e-9)
+
+
+def test_a_rugged_effect_is_searched_from_the_best_of_many_points_and_gone_on_with_from_distinct_ends(monkeypatch):
+    class Tube:
+        name, quantities, local = "tube", ("length",), False
+
+        def spread(self, twin: object, u: np.ndarray) -> np.ndarray:
+            return 10 * u
+
+    class Valleys:
+        common = (("modulus", 0.1),)
+        twin = None
+
+        def fit(self, tasks: list[Any], *, rounds: int, **_: Any) -> list[Any]:
+            """Each goes on by one, and is the better the nearer to seven; what begins below 5.9 breaks down."""
+            seen.append((rounds, [float(x[1]) for _, x in tasks]))
+            ends = [(e, np.array([x[0], x[1] + 1])) for e, x in tasks]
+            return [None if x[1] < 6.9 else fit(e, x, abs(float(x[1]) - 7.5)) for e, x in ends]
+
+    seen: list[tuple[int, list[float]]] = []
+    looked: list[np.ndarray] = []
+
+    def look(problem: Any, started: Any, errors: np.ndarray) -> list[Any]:
+        looked.extend(x for _, x in started)
+        return [(abs(float(x[1]) - 6.0), e, x) for e, x in started]
+
+    monkeypatch.setattr(search, "looked_at", look)
+    nothing = fit((), np.array([0.3]), 500.0)
+    problem: Any = Valleys()
+    tube: Any = Tube()
+    found = search._from_many(problem, tube, nothing, 8, lambda line: None)
+    assert len(looked) == 8 * search.LOOKS
+    assert {float(x[0]) for x in looked} == {0.3}  # what is stated as nothing has it
+    (first, begun), *later = seen
+    assert first == search.TRIED
+    assert max(abs(x - 6.0) for x in begun) <= sorted(abs(float(x[1]) - 6.0) for x in looked)[8]
+    for (most, tasks), (_, kept) in zip(later, search.RUGGED, strict=False):
+        assert most > first
+        assert 0 < len(tasks) == len(set(tasks)) <= kept
+    assert [f.chi2 for f in found] == sorted(f.chi2 for f in found)
+    assert found[0].chi2 < 0.6
