@@ -13,7 +13,7 @@ from torchsoro.simulation.loads import Chain, load_amount
 
 STABLE = 0.5  # radians that a bead between two links turns by in a step; 2 is the limit without damping
 ROUNDS = 200  # of Newton's method, at most
-STILL = 1e-6  # of a chain's weight: forces left on its beads at rest
+STILL = 1e-6  # forces left on beads at rest, of their weight; without any, of that share of what doubles the length
 
 
 def chain_numbers(
@@ -104,7 +104,7 @@ def at_rest(support: Tensor, rest: Tensor, stiffness: Tensor, weight: Tensor) ->
         along = links / safe[..., None]
         pull = (stiffness[:, None] * taut * (span - rest[:, None]))[..., None] * along
         force = weight[:, None] + pull[:, 1:] - pull[:, :-1]
-        if bool((force.flatten(1).norm(dim=1) <= STILL * n * heavy).all()):
+        if bool((force.flatten(1).norm(dim=1) <= STILL * n * (heavy + STILL * stiffness * rest)).all()):
             break
         outer = along[..., :, None] * along[..., None, :]
         eye = torch.eye(3, dtype=x.dtype, device=x.device)
