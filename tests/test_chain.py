@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,3 +151,20 @@ def test_what_a_chain_cannot_be_is_refused():
     assert not isinstance(updated.formulation, Total)
     with pytest.raises(ValueError, match="Chain"):
         updated(body, duration=STEP, loads=[hung(lattice, body)])
+
+
+def test_a_tube_swings_on_cuda_as_on_a_cpu(cuda: torch.device):
+    lattice, body = bar()
+    body = replace(
+        body, **{name: getattr(body, name).float() for name in ("position", "mass", "volume", "bulk", "shear")}
+    )
+    start = whole(lattice, velocity=(0.1, -0.2, 0.05))
+    start = replace(start, displacement=start.displacement.float(), velocity=start.velocity.float())
+    chain = hung(lattice, body, support=vector(0.05, 0.03, 0.02), length=0.062, mass=0.003, stiffness=40.0, damping=0.3)
+    settings = {"gravity": DOWN, "loads": [chain], "start": start, "divergence": "mark", "record": "probes"}
+    places = lattice.particles[[0, -1]]
+    here, there = (
+        run(lattice, body, 600, engine, probes=places, **settings).position for engine in ({}, {"device": str(cuda)})
+    )
+    assert float((here[-1] - here[0]).norm(dim=-1).min()) > 5e-3
+    torch.testing.assert_close(there, here, rtol=0, atol=1e-5)
