@@ -20,7 +20,7 @@ from torchsoro.simulation.simulator import Simulator
 
 G = 9.81
 DOWN = (0.0, 0.0, -G)
-N = layout.BEADS
+N = layout.CHAIN_BEADS
 ENGINES = [{}, {"lanes": False}]
 
 

@@ -31,7 +31,7 @@ def chain_numbers(
         ValueError: for a number that is negative or not finite or requires a gradient, or a support or a length of zero
             where there is mass.
     """
-    like, links = gravity, layout.BEADS + 1
+    like, links = gravity, layout.CHAIN_BEADS + 1
     names = "length", "mass", "stiffness", "damping"
     given = [chain.support, *(getattr(chain, name) for name in names)]
     if torch.is_grad_enabled() and any(isinstance(t, Tensor) and t.requires_grad for t in given):
@@ -46,7 +46,7 @@ def chain_numbers(
     if bool((there & ~((length > 0) & (stiffness > 0))).any()):
         raise ValueError("length, stiffness of a Chain: zero beside a mass, wanted more")
     rest, link = length / links, torch.where(there, stiffness * links, 0.0)
-    bead = mass / layout.BEADS
+    bead = mass / layout.CHAIN_BEADS
     lightness = torch.where(there, 1 / torch.where(there, bead, 1.0), 0.0)
     beads = at_rest(support.double(), rest.double(), link.double(), (bead.unsqueeze(-1) * gravity).double()).to(like)
     scalars = torch.stack([rest, link, 2 * damping * (link * bead).sqrt(), lightness], -1)
@@ -65,15 +65,15 @@ def pull_at_rest(support: Tensor, length: Tensor, mass: Tensor, stiffness: Tenso
         stiffness: When taut [B] N/m.
         gravity: [B, 3] m/s2.
     """
-    links = layout.BEADS + 1
+    links = layout.CHAIN_BEADS + 1
     rest, link = length / links, stiffness * links
-    first = at_rest(support, rest, link, (mass / layout.BEADS).unsqueeze(-1) * gravity)[:, 0]
+    first = at_rest(support, rest, link, (mass / layout.CHAIN_BEADS).unsqueeze(-1) * gravity)[:, 0]
     span = first.norm(dim=-1)
     return (link * (span - rest).clamp(min=0) / span.clamp(min=1e-12)).unsqueeze(-1) * first
 
 
 def at_rest(support: Tensor, rest: Tensor, stiffness: Tensor, weight: Tensor) -> Tensor:
-    """Beads [B, BEADS, 3] m in equilibrium between the origin and a support, by damped Newton steps.
+    """Beads [B, CHAIN_BEADS, 3] m in equilibrium between the origin and a support, by damped Newton steps.
 
     Args:
         support: [B, 3] m.
@@ -81,7 +81,7 @@ def at_rest(support: Tensor, rest: Tensor, stiffness: Tensor, weight: Tensor) ->
         stiffness: Of a link [B] N/m.
         weight: Of a bead [B, 3] N.
     """
-    count, n = len(support), layout.BEADS
+    count, n = len(support), layout.CHAIN_BEADS
     s = (torch.arange(1, n + 1, dtype=support.dtype) / (n + 1)).to(support.device)[:, None]
     heavy = weight.norm(dim=-1).clamp(min=1e-30)
     down = weight / heavy[:, None]

@@ -12,8 +12,8 @@ from torchsoro.simulation.kernels.lane_walls import mean_of
 from torchsoro.simulation.kernels.lanes import law, load, part, store
 from torchsoro.simulation.kernels.laws_lanes import laws
 from torchsoro.simulation.kernels.layout import (
-    BEADS,
     CHAIN,
+    CHAIN_BEADS,
     CHAIN_DAMPING,
     CHAIN_LIGHTNESS,
     CHAIN_REST,
@@ -23,7 +23,7 @@ from torchsoro.simulation.kernels.layout import (
 )
 
 link = laws.link
-PLACES, SPEEDS, END = 0, 48 * BEADS, 96 * BEADS  # of a chain's state, where each begins
+PLACES, SPEEDS, END = 0, 48 * CHAIN_BEADS, 96 * CHAIN_BEADS  # of a chain's state, where each begins
 
 
 @law
@@ -60,7 +60,7 @@ def chains_forward(mesh, case, work, g, state, t):
         before = vector(work.beads, at + END, 16)
         if t == 0:
             before = end
-            for k in range(3 * BEADS):
+            for k in range(3 * CHAIN_BEADS):
                 store(work.beads, at + PLACES + 16 * k, load(case.chains, one + 16 * (CHAIN_START + k)))
         rate = (end[0] - before[0]) / case.dt, (end[1] - before[1]) / case.dt, (end[2] - before[2]) / case.dt
         fixed, still = vector(case.chains, one, 16), (zero, zero, zero)
@@ -72,9 +72,9 @@ def chains_forward(mesh, case, work, g, state, t):
             x, v = vector(work.beads, at + PLACES, 16), vector(work.beads, at + SPEEDS, 16)
             f = pull_of(case, one, place, x, rate, v)
             p0, p1, p2 = p0 + f[0], p1 + f[1], p2 + f[2]
-            for bead in range(BEADS):
+            for bead in range(CHAIN_BEADS):
                 y, w = fixed, still
-                if bead + 1 < BEADS:
+                if bead + 1 < CHAIN_BEADS:
                     y = vector(work.beads, at + PLACES + 48 * (bead + 1), 16)
                     w = vector(work.beads, at + SPEEDS + 48 * (bead + 1), 16)
                 h = pull_of(case, one, x, y, v, w)

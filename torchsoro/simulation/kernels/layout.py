@@ -126,7 +126,7 @@ NUMBERS, COEFFICIENT, ELEMENT, PLANE_NUMBERS, NODES, CHAMBER_NUMBERS, SHARE, ARE
 QUADRATIC, TIE_SHARE, TIE_STIFFNESS, NODE_SHARE, WALL_NUMBERS, WALL_WEIGHTS, TILE_AXES, CHAINS = range(60, 68)
 PRESSURE, GRAVITY, FORCE = range(68, 71)
 VOLUMES, PUSHED, SEEN = range(71, 74)
-PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION, BEADS_AT = range(74, 81)
+PARTIALS, SWEPT, PADS, TENSION, NORMALS, REPULSION, BEADS = range(74, 81)
 FORCES, SURFACES, VOLUME_BAR, JACOBIANS = range(81, 85)
 COEFFICIENT_BAR, ELEMENT_BAR, PRESSURE_BAR, GRAVITY_BAR, FORCE_BAR, PLANE_BAR, NODES_BAR, CHAMBER_BAR = range(85, 93)
 SOFTENING_BAR, QUADRATIC_BAR, TIES_BAR = range(93, 96)
@@ -134,10 +134,10 @@ HEAD = 96
 
 # A hanging chain: beads; its numbers: fixed end, rest length, stiffness and damping of a link, one over the mass of a
 # bead, where beads are at first; and its state: places of beads, their velocities, where the end on the body was.
-BEADS = 4
+CHAIN_BEADS = 4
 CHAIN_REST, CHAIN_STIFFNESS, CHAIN_DAMPING, CHAIN_LIGHTNESS, CHAIN_START = 3, 4, 5, 6, 7
-CHAIN = CHAIN_START + 3 * BEADS
-CHAIN_STATE = 6 * BEADS + 3
+CHAIN = CHAIN_START + 3 * CHAIN_BEADS
+CHAIN_STATE = 6 * CHAIN_BEADS + 3
 
 # A point of a hollow chamber's wall: its lowest node, chamber and axis; place (three), area, and then of each of its 27
 # nodes the weight and two slopes; what it hands to its nodes at most: five vectors. Number by number, so that threads

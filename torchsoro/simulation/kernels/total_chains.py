@@ -7,8 +7,8 @@ from torchsoro.simulation.kernels.laws_taichi import laws
 from torchsoro.simulation.kernels.layout import (
     BATCH,
     BEADS,
-    BEADS_AT,
     CHAIN,
+    CHAIN_BEADS,
     CHAIN_DAMPING,
     CHAIN_LIGHTNESS,
     CHAIN_REST,
@@ -24,7 +24,7 @@ from torchsoro.simulation.kernels.layout import (
 )
 from torchsoro.simulation.kernels.tensor import load_vector, store_vector
 
-PLACES, SPEEDS, END = 0, 3 * BEADS, 6 * BEADS  # of a chain's state, where each begins
+PLACES, SPEEDS, END = 0, 3 * CHAIN_BEADS, 6 * CHAIN_BEADS  # of a chain's state, where each begins
 
 
 @ti.func
@@ -39,15 +39,15 @@ def pull_of(block: ti.template(), one, p, q, u, v):
 @ti.func
 def chain_pass(block: ti.template(), tie, t):
     """Add to the tension of a tie what its chain pulls, over substep t; its mean displacement is known."""
-    head, fixed, beads = ti.static(block.head, block.fixed, block.scratch)
-    one, at = head[CHAINS] + CHAIN * tie, head[BEADS_AT] + CHAIN_STATE * tie
+    head, fixed, beads = ti.static((block.head, block.fixed, block.scratch))
+    one, at = head[CHAINS] + CHAIN * tie, head[BEADS] + CHAIN_STATE * tie
     whole = fixed[STEP_SIZE]
     dt = whole / head[CHAIN_STEPS]
     end = load_vector(block.pad, block.base + TOTALS, 1)
     before = load_vector(beads, at + END, 1)
     if t == 0:
         before = end
-        for k in range(3 * BEADS):
+        for k in range(3 * CHAIN_BEADS):
             beads[at + PLACES + k] = fixed[one + CHAIN_START + k]
     rate, pull = (end - before) / whole, end * 0
     weight = load_vector(block.supply, head[GRAVITY] + (t * head[BATCH] + tie // head[TIES]) * 3, 1)
@@ -56,9 +56,9 @@ def chain_pass(block: ti.template(), tie, t):
         x, v = load_vector(beads, at + PLACES, 1), load_vector(beads, at + SPEEDS, 1)
         f = pull_of(block, one, place, x, rate, v)
         pull += f
-        for bead in range(BEADS):
+        for bead in range(CHAIN_BEADS):
             y, w = load_vector(fixed, one, 1), end * 0
-            if bead + 1 < BEADS:
+            if bead + 1 < CHAIN_BEADS:
                 y = load_vector(beads, at + PLACES + 3 * (bead + 1), 1)
                 w = load_vector(beads, at + SPEEDS + 3 * (bead + 1), 1)
             h = pull_of(block, one, x, y, v, w)
