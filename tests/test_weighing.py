@@ -9,6 +9,7 @@ import pytest
 from swings import EXACT, draws, recorded, weighed
 
 from torchsoro.sim2real.inference.conclusion import conclude
+from torchsoro.sim2real.inference.decision import TOLERANCE
 from torchsoro.sim2real.inference.evidence import (
     Discrepancy,
     Linearised,
@@ -16,7 +17,7 @@ from torchsoro.sim2real.inference.evidence import (
     TwinError,
     infer,
 )
-from torchsoro.sim2real.inference.least_squares import ln_evidence_within
+from torchsoro.sim2real.inference.least_squares import ln_evidence_within, told
 from torchsoro.sim2real.inference.priors import Prior
 from torchsoro.sim2real.inference.remaining_error import by_spread
 from torchsoro.sim2real.inference.weighing import adjustment
@@ -159,3 +160,18 @@ def test_nothing_has_the_evidence_of_all_its_modes_as_names_have():
     odds = [p["nothing"] / p["drag"] for p in (one, both)]
     gained = found[1].none.ln_evidence - found[0].none.ln_evidence
     assert odds[1] / odds[0] == pytest.approx(1 + np.exp(gained), rel=1e-6)
+
+
+@pytest.mark.parametrize(("off", "another"), [(1.2, None), (2.0, "drag")])
+def test_nothing_with_a_stated_number_that_is_not_credible_counts_as_that_number(off, another):
+    data, nothing, drag = recorded(0.0, 1, effect=0.2)
+    model = Model(effects=(), priors=(Prior(TOLERANCE),), stated=("drag",))
+    # A tolerance in which the effect is so many of them; the recording tells it to a hundredth.
+    slopes = tuple(J * 0.2 / off for J in drag.slopes)
+    found = weighed(data, dataclasses.replace(nothing, model=model, at=np.zeros(1), slopes=slopes), drag)
+    assert float(told(data, found.null).at[0]) == pytest.approx(off, rel=0.05)
+    assert found.another == another
+    probabilities, (candidate,) = found.candidates()
+    assert candidate.probability == probabilities["drag"]
+    assert sum(probabilities.values()) == pytest.approx(1)
+    assert (probabilities["nothing"] == 0) == (another is not None)
