@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchsoro.simulation.kernels.lane_chains import chains_forward
 from torchsoro.simulation.kernels.lane_nodes import advance
 from torchsoro.simulation.kernels.lane_points import (
     ATTACHED,
@@ -253,9 +252,7 @@ def march(mesh, case, work, rank, threads, begin, steps, ring, history_ring, sto
                 work.collapsed[8 * rank] = min(work.collapsed[8 * rank], t)
         if rank == 0 and case.tie_stiffness.size:
             for g in range(case.groups):
-                ties_forward(mesh, case, work, g, now + g * 6 * mesh.component)
-                if case.chain_steps:
-                    chains_forward(mesh, case, work, g, now + g * 6 * mesh.component, t)
+                ties_forward(mesh, case, work, g, now + g * 6 * mesh.component, t)
         for g in range(rank, case.groups, threads):
             if work.contact.actives[g] > 0:
                 contact_forward(mesh, work.contact, work.states, g, now + g * 6 * mesh.component)

@@ -6,7 +6,8 @@ the volume is one third of the sum of x . dA. Where lanes are cells, a wall poin
 
 from __future__ import annotations
 
-from torchsoro.simulation.kernels.lane_contact import dot
+from torchsoro.simulation.kernels.lane_chains import chain_forward
+from torchsoro.simulation.kernels.lane_contact import dot, store_vector
 from torchsoro.simulation.kernels.lane_nodes import pressure_of
 from torchsoro.simulation.kernels.lanes import law, load, part, store, total
 
@@ -121,13 +122,17 @@ def mean_of(mesh, case, shares, field, at):
 
 
 @part
-def ties_forward(mesh, case, work, g, state):
-    """Force that each spring to the mean displacement of some nodes takes."""
+def ties_forward(mesh, case, work, g, state, t):
+    """Force that each spring to the mean displacement of some nodes takes, and each chain there, in substep t."""
     ties = case.tie_stiffness.size // (16 * case.groups)
     for tie in range(g * ties, (g + 1) * ties):
-        for c in range(3):
-            mean = mean_of(mesh, case, tie * mesh.component, work.states, state + c * mesh.component)
-            store(work.tension, 16 * (3 * tie + c), load(case.tie_stiffness, 16 * tie) * mean)
+        stiffness, shares = load(case.tie_stiffness, 16 * tie), tie * mesh.component
+        m0 = mean_of(mesh, case, shares, work.states, state)
+        m1 = mean_of(mesh, case, shares, work.states, state + mesh.component)
+        m2 = mean_of(mesh, case, shares, work.states, state + 2 * mesh.component)
+        store_vector(work.tension, 48 * tie, 16, (stiffness * m0, stiffness * m1, stiffness * m2))
+        if case.chain_steps:
+            chain_forward(mesh, case, work, g, tie, (m0, m1, m2), t)
 
 
 @part
