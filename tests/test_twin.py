@@ -304,15 +304,24 @@ def test_speed_of_an_initial_motion_is_that_of_the_fastest_corner(trial):
     assert told["speed_m_s"][0] == pytest.approx(math.hypot(0.3, 2.0 * math.hypot(length, width) / 2))
 
 
-def test_a_soft_half_lacks_the_fraction_that_is_told(trial):
+@pytest.mark.parametrize("boundary", [-0.2, 0.0, 0.1])
+def test_a_soft_part_lacks_the_fraction_that_is_told_up_to_its_boundary(trial, boundary):
     twin = Twin(trial.setup, edge=EDGE)
-    effect, scenario = next(e for e in library() if type(e).__name__ == "SoftHalf"), twin.scenario(trial)
-    values = np.array([0.0, 0.5, 0.0])
+    effect, scenario = next(e for e in library() if type(e).__name__ == "SoftPart"), twin.scenario(trial)
+    values = np.array([0.0, 0.5, 0.0, boundary])
     modulus = effect(scenario, torch.from_numpy(values)[None], twin).youngs_modulus[0].numpy()
     side = (twin.positions.numpy() - trial.setup.center)[:, 1] / trial.setup.size[1]
-    ratio = modulus[side < -0.2].mean() / modulus[side > 0.2].mean()
-    assert 1 - ratio == pytest.approx(effect.reported(values, scenario, twin)["fraction"][0], rel=0.03)
-    assert effect.place(values, twin)[1] == pytest.approx(trial.setup.origin[1] + 0.25 * trial.setup.size[1])
+    gained = np.log(modulus / twin.scenario(trial).youngs_modulus[0].numpy())
+    # A seventh of the body off the boundary, where the smooth step has nearly ended.
+    assert gained[side < boundary - 0.15] == pytest.approx(-0.25, rel=0.1)
+    assert gained[side > boundary + 0.15] == pytest.approx(0.25, rel=0.1)
+    lost = effect.reported(values, scenario, twin)["fraction"][0]
+    assert lost == pytest.approx(1 - np.exp(-0.5))
+    middle = trial.setup.origin[1] + (0.5 + boundary) / 2 * trial.setup.size[1]
+    assert effect.place(values, twin)[1] == pytest.approx(middle)
+    # The stiffer side's name for the same: the soft part is the other one.
+    other = trial.setup.origin[1] + (1.5 + boundary) / 2 * trial.setup.size[1]
+    assert effect.place(values * [1, -1, 1, 1], twin)[1] == pytest.approx(other)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])

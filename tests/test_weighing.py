@@ -125,6 +125,22 @@ def test_the_adjustment_of_a_twin_that_errs_along_a_response_grows_with_the_squa
     assert kappa(0.1, share=0.1) > kappa(0.1)
 
 
+def test_errors_of_several_kinds_add_up_as_one_kind_of_their_variance_does():
+    data, nothing, drag = recorded(0.0, 21)
+    size = np.full_like(data.amplitudes[0], 0.02)
+    along = [tuple(error * J[..., 0] for J in drag.slopes) for error in (0.1, -0.1, 0.2)]
+
+    def kappa(draws, kinds):
+        twin = TwinError(amplitude=size, draws=tuple(draws), kinds=kinds)
+        return adjustment(data, infer(data, dataclasses.replace(nothing, numerics=twin)), drag.slopes)
+
+    one = kappa(along[:1], ())
+    assert kappa(along[:2], (0, 0)) == pytest.approx(one, rel=1e-9)
+    assert kappa(along[:2], (0, 1)) - 1 == pytest.approx(2 * (one - 1), rel=1e-9)
+    assert kappa(along, (0, 0, 1)) - 1 == pytest.approx((1 + 4) * (one - 1), rel=1e-9)
+    assert kappa(along, ()) - 1 == pytest.approx((1 + 1 + 4) / 3 * (one - 1), rel=1e-9)
+
+
 def test_a_mode_that_was_found_twice_counts_once():
     data, nothing, drag = recorded(0.0, 11, effect=0.3)
     once, twice = weighed(data, nothing, drag), weighed(data, nothing, drag, drag)

@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 
 from torchsoro.command_line import options, program
-from torchsoro.sim2real.hypotheses.body_effects import Modulus, SoftHalf, Tether
+from torchsoro.sim2real.hypotheses.body_effects import Modulus, SoftPart, Tether
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.supply_effects import AirStiffness
 from torchsoro.sim2real.inference.discretization import as_simulated
@@ -54,7 +54,7 @@ def _tether(truth: dict[str, Any]) -> tuple[Hypothesis, list[float], float]:
 def _soft_side(truth: dict[str, Any]) -> tuple[Hypothesis, list[float], float]:
     """A softer half for y > 0: ln E by a step, and half of it everywhere."""
     lost = math.log(1 - truth["parameters"]["fraction"])
-    return SoftHalf(), [0.0, lost, 0.0], lost / 2
+    return SoftPart(), [0.0, lost, 0.0, 0.0], lost / 2
 
 
 def _air(truth: dict[str, Any]) -> tuple[Hypothesis, list[float], float]:

@@ -20,7 +20,7 @@ from torchsoro.simulation.material import Prony
 TUBE = 3000.0  # 1/s2, stiffness of a taut tube over its mass: waves of 5 m/s in one of 0.1 m
 MOVED = 4e-3  # m, to both sides, over which the stiffness of a hanging tube is told
 LOSS = 0.5  # of critical damping, in a link of a tube
-HALF_WIDTH = 0.1  # half the width of what lies between two halves of a body that was cast in two, over its size
+HALF_WIDTH = 0.1  # half the width of what lies between two parts of a body that was cast in two, over its size
 
 
 class Modulus(Hypothesis):
@@ -121,45 +121,56 @@ class SoftSide(Hypothesis):
     nonnegative = frozenset({"fraction"})
     quantities = tuple(Quantity(f"slope_{axis}", "over the body", 0.2, -10.0, 10.0) for axis in "xyz")
     starts, joint = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), True
-    # Of ln E over the body that a soft half lacks which moves nearly the same, and its middle off the body's.
-    contrast, off = 2 / 3, 0.27
+    contrast = 2 / 3  # of ln E over the body, that a soft half lacks which moves nearly the same
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
-        """What ln E gains over the body, and the fraction that a soft half lacks."""
-        lost = 1 - math.exp(-self.contrast * float(np.abs(values).max()))
+        """What ln E gains over the body, and the fraction that a soft half lacks that moves nearly the same."""
+        lost = 1 - math.exp(-self.contrast * float(np.abs(values[:3]).max()))
         return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
 
     def place(self, values: np.ndarray, twin: Twin) -> np.ndarray | None:
         """Middle of the soft half."""
         most = int(np.abs(values[:3]).argmax())
         middle = np.array(twin.setup.center)
-        middle[most] -= np.sign(values[most]) * self.off * twin.setup.size[most]
+        middle[most] -= self.middle_off(float(np.sign(values[most])), values) * twin.setup.size[most]
         return middle
+
+    def middle_off(self, side: float, values: np.ndarray) -> float:
+        """How far the middle of the soft half lies off the body's, over its size, towards its side, -1 or 1."""
+        return 0.27 * side
 
     def varies(self, values: np.ndarray) -> float:
         """At the stiffest corner."""
         return 0.5 * float(np.abs(values[:3]).sum())
 
-    def profile(self, xi: Tensor) -> Tensor:
-        """What ln E gains by each quantity, from -1/2 to 1/2, where xi does so over the body's box."""
+    def profile(self, xi: Tensor, values: Tensor) -> Tensor:
+        """What ln E gains by each component [..., N, 3], from -1/2 to 1/2, where xi [N, 3] does so over the body."""
         return xi
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:
-        """E exp(a . profile(xi))."""
+        """E exp(a . profile(xi)), a the first three quantities."""
         low, size = (torch.tensor(v, dtype=torch.float64) for v in (twin.setup.origin, twin.setup.size))
-        gained = values @ self.profile((twin.positions - low) / size - 0.5).T
+        gained = (self.profile((twin.positions - low) / size - 0.5, values) * values[:, None, :3]).sum(-1)
         return scenario.replace(youngs_modulus=scenario.youngs_modulus * gained.exp())
 
 
-class SoftHalf(SoftSide):
-    """Young's modulus is lower on one half of the body, along x, y and z."""
+class SoftPart(SoftSide):
+    """Young's modulus is lower in one part of the body, up to a plane across x, y or z."""
 
-    quantities = tuple(Quantity(f"contrast_{axis}", "between halves", 0.2, -10.0, 10.0) for axis in "xyz")
-    contrast, off = 1.0, 0.25
+    quantities = (
+        *(Quantity(f"contrast_{axis}", "between parts", 0.2, -10.0, 10.0) for axis in "xyz"),
+        Quantity("boundary", "of the body", 0.05, -8.0, 8.0),  # off the middle
+    )
+    starts = tuple((*direction, 0.0) for direction in SoftSide.starts)
+    contrast = 1.0
 
-    def profile(self, xi: Tensor) -> Tensor:
-        """A smooth step in the middle."""
-        return torch.tanh(xi / HALF_WIDTH) / 2
+    def middle_off(self, side: float, values: np.ndarray) -> float:
+        """Halfway between the boundary and the end."""
+        return 0.25 * side - float(values[3]) / 2
+
+    def profile(self, xi: Tensor, values: Tensor) -> Tensor:
+        """A smooth step at the boundary."""
+        return torch.tanh((xi - values[:, 3, None, None]) / HALF_WIDTH) / 2
 
 
 class PrintOffset(Hypothesis):

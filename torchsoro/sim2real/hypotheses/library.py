@@ -10,7 +10,7 @@ from torchsoro.sim2real.hypotheses.body_effects import (
     Modulus,
     PrintOffset,
     Softening,
-    SoftHalf,
+    SoftPart,
     SoftSide,
     Stiffening,
     TautTether,
@@ -44,7 +44,7 @@ from torchsoro.sim2real.hypotheses.supply_effects import (
 def library() -> tuple[Hypothesis, ...]:
     """All effects that can be named."""
     kinds = (
-        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftHalf, PrintOffset, Density),
+        *(Viscoelastic, Modulus, Stiffening, Softening, SoftSide, SoftPart, PrintOffset, Density),
         *(AttachedMass, Tether, TautTether, HangingTether, LoadInertia, FluidDrag),
         *(PressureLag, PressureGain, ThrottledLoss, Leak, OrificeLeak, AirStiffness, AirTwice),
         *(

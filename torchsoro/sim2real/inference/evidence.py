@@ -61,6 +61,8 @@ class TwinError:
         amplitude: Standard deviation by axis and marker [A, M] m.
         time: Correlation time [s].
         draws: Errors as they may be, as far as beliefs and measurement errors do not take them up.
+        kinds: Of each draw a number: draws of one kind are of one distribution, and errors of all kinds add up. All are
+            of one kind if empty.
         modes: Of each trial, in proportion to the draws, errors that move all markers together, each times an unknown
             of unit variance [T, M, A, R] m; none if empty.
     """
@@ -68,6 +70,7 @@ class TwinError:
     amplitude: np.ndarray
     time: float = CORRELATION
     draws: tuple[Motions, ...] = ()
+    kinds: tuple[int, ...] = ()
     modes: Motions = ()
 
     @property

@@ -17,7 +17,8 @@ where planes are is stated. Beside that line, their mean at no shift predicts be
 
 to which that of other cells is added, which are as good. The whole difference to larger cells, the error of the finer
 ones at order one, is a direction in which these may be off. It is no measure of how far where one of them is as wide as
-a wall; where walls have two or more, the standard deviation by which searches are weighted counts beside chance.
+a wall: then it is one more draw. Where walls have two or more, it adds to chance, as other cells do, and the standard
+deviation by which searches are weighted counts beside them.
 
 In both, only that counts which beliefs and measurement errors cannot take up.
 """
@@ -116,8 +117,13 @@ def by_spread(
     apart = [cleared(data, near, other) for other in others]
     process = _process(data, [*draws, *apart], [*modes, *apart])
     together = tuple(np.stack(same, -1) for same in zip(*modes, *whole, *apart, strict=True))
+    beside = [*whole, *apart]
     numerics = dataclasses.replace(
-        process, amplitude=np.hypot(process.amplitude, known), draws=(*draws, *whole, *apart), modes=together
+        process,
+        amplitude=np.hypot(process.amplitude, known),
+        draws=(*draws, *beside),
+        kinds=(*[0] * count, *range(1, 1 + len(beside))) if np.any(known) else (),
+        modes=together,
     )
     return dataclasses.replace(near, residuals=mean, numerics=numerics)
 

@@ -6,9 +6,9 @@ independent, while errors of contact move the whole body: sums over samples are 
 the change D by an effect, draws d of the twin's error tell by how much (magnitude adjustment of a composite
 likelihood: Ribatet, Cooley and Davison 2012),
 
-    kappa = 1 + mean_d (D' C^-1 d)^2 / (D' C^-1 D),
+    kappa = 1 + sum_k mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
-C without what it has of d, and the likelihood is taken to the power of 1 / kappa. The draws count in full, whatever
+the mean over draws d of one kind k, C without what it has of d, and the likelihood is taken to the power of 1 / kappa. The draws count in full, whatever
 share c of its price the residual shows: an error along the change is taken up by the effect, and not left.
 
 Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
@@ -386,7 +386,8 @@ def adjustment(data: Data, found: Posterior, changes: Motions) -> float:
         # What a draw is worth to an effect is seen where it is none of the errors that are known.
         product = total(products(data, numerics.without(k), found.discrepancy, columns)).product
         gained.append(product[:n, n] ** 2 / np.maximum(np.diag(product)[:n], 1e-300))
-    return 1.0 + float(np.mean(gained))
+    kinds = np.array(numerics.kinds or (0,) * len(gained))
+    return 1.0 + float(sum(np.mean(np.array(gained)[kinds == kind]) for kind in np.unique(kinds)))
 
 
 def normalised(ln_p: dict[str, float]) -> dict[str, float]:

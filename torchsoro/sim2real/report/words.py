@@ -40,13 +40,14 @@ QUANTITIES = {
     "stiffening.coefficient": "stiffening coefficient",
     "depth": "largest loss of stress",
     "ln_range": "strain measure (I1 - 3) over which the loss grows",
-    "soft_side.fraction": "modulus that the soft half lacks",
+    "soft_side.fraction": "modulus that the soft part lacks",
     "slope_x": "rise of ln E across the body along x",
     "slope_y": "rise of ln E across the body along y",
     "slope_z": "rise of ln E across the body along z",
-    "contrast_x": "rise of ln E from one half to the other along x",
-    "contrast_y": "rise of ln E from one half to the other along y",
-    "contrast_z": "rise of ln E from one half to the other along z",
+    "boundary": "where the softer part ends, off the middle",
+    "contrast_x": "rise of ln E from one part to the other along x",
+    "contrast_y": "rise of ln E from one part to the other along y",
+    "contrast_z": "rise of ln E from one part to the other along z",
     "offset_first_m": "offset along the first axis across the body",
     "offset_second_m": "offset along the second axis across the body",
     "mass_kg": "mass",
@@ -119,7 +120,8 @@ _UNITS = {
     "kg/m3": ((math.inf, 1.0, "kg/m³"),),
     "1": ((math.inf, 1.0, ""),),
     "over the body": ((math.inf, 1.0, ""),),
-    "between halves": ((math.inf, 1.0, ""),),
+    "between parts": ((math.inf, 1.0, ""),),
+    "of the body": ((math.inf, 100.0, "% of the body"),),
 }
 
 
