@@ -159,7 +159,9 @@ class Curved(GaussNewton):
     weight = np.array([0.5, 2.0, 1.0])
     A, B, noise = (np.random.default_rng(3).normal(size=n) for n in ((40, 2), (40, 3), 40))
 
-    def linearise(self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, known: Any = None) -> Any:
+    def linearise(
+        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, before: Any = None, known: Any = None
+    ) -> Any:
         yield at, len(moving), known
         r = self.A @ (np.array([1.5, -1.0]) - at - self.bent * at**2) + 0.5 * self.noise
         errors = np.linalg.solve(self.B.T @ self.B + np.diag(self.weight**2), self.B.T @ r)
@@ -216,6 +218,32 @@ def test_derivatives_of_an_earlier_point_are_kept_as_long_as_they_lead(step):
     # A point that has been simulated comes with its motions.
     assert all((known is not None) == bool(n) for _, n, known in asked[1:])
     assert all(known is None or known[0] is at for at, _, known in asked)
+
+
+class Crude(Curved):
+    """The same, whose derivatives bend the wrong way until a point nearby has told how long steps may be."""
+
+    def linearise(
+        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, before: Any = None, known: Any = None
+    ) -> Any:
+        found, eager = yield from super().linearise(at, errors, moving, before, known)
+        if before is not None:
+            return found, eager
+        return dataclasses.replace(found, columns=-found.columns, crude=True), eager
+
+
+@pytest.mark.parametrize("eager", [False, True])
+def test_a_search_does_not_end_by_derivatives_that_long_steps_spoilt(eager):
+    likelihood = searched().likelihood
+    best = led(searched(bent=0.1).search(np.zeros(2), np.zeros(3), 20, settle=True))[1]
+    search = Crude(likelihood, ())
+    for name, value in {"bent": 0.1, "eager": eager}.items():
+        object.__setattr__(search, name, value)
+    asked, found = led(search.search(np.zeros(2), np.zeros(3), 20, settle=True))
+    np.testing.assert_allclose(found.at, best.at, atol=0.1)
+    # It looks again where it began, and simulates nothing there twice.
+    (start, _, _), _, (again, count, known), *_ = asked
+    assert again is start and count and known is not None
 
 
 def test_chance_in_a_short_step_does_not_change_derivatives():

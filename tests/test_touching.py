@@ -66,6 +66,11 @@ def test_a_body_that_meets_no_plane_is_differentiated_closely(on_a_floor):
     free = [dataclasses.replace(t, setup=dataclasses.replace(t.setup, planes=())) for t in on_a_floor.trials]
     problem = known(on_a_floor.only(free), 1.0)
     assert (problem.step, problem.looks) == (STEP, 1)
+    # What moves the body by many times the noise has a step that is shorter by as much.
+    for rms, share in ((0.3, 1.0), (20.0, 1 / 20)):
+        assert np.abs(problem.steps((), np.zeros(1), rms * np.ones((7, 1)))) == pytest.approx(share * STEP)
+    loud = known(on_a_floor, 10 * CALM * on_a_floor.noise)
+    assert np.abs(loud.steps((), np.zeros(1), 20.0 * np.ones((7, 1)))) == pytest.approx(loud.step)
 
 
 def test_changes_by_larger_cells_are_differentiated_as_these_touch(on_a_floor):

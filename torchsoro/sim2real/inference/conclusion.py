@@ -1,6 +1,7 @@
 """What can be concluded from probabilities: the smallest set of candidates with most of them.
 
-Probabilities are of what is missing, whether it matters or not. In the set, what changes the motion by less than
+Probabilities are of what is missing, whether it matters or not, and that of an effect that is too weak to be seen is
+told beside that of nothing. In the set, what changes the motion by less than
 matters goes by its name where nothing is not credible beside it and trials left out are predicted better with it; else
 it counts as nothing. So does what the second of two effects adds to the first. Where something is missing, and the
 first of the set predicts trials left out surely worse than nothing does, no name of the set is it.
@@ -14,9 +15,9 @@ from dataclasses import dataclass, field
 from functools import cache
 from statistics import NormalDist
 
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, compared
-from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN, Candidate, Weighing, apart
+from torchsoro.sim2real.inference.weighing import LN_NOT_SEEN, NOTHING, UNKNOWN, UNSEEN, Candidate, Weighing, apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -27,7 +28,8 @@ class Conclusion:
         kind: "explained", "cannot_distinguish", "nothing_missing", "cannot_tell" or "unknown_physics".
         chosen: Names in the credible set.
         credible: That set, most probable first, with what is no effect.
-        probabilities: Posterior, of nothing, of what is unknown, and of each name, whether it matters or not.
+        probabilities: Posterior, of nothing, of what is too weak to be seen, of what is unknown, and of each name,
+            whether it matters or not.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
         left: What that one leaves of the recordings, its beliefs within tolerances, see :func:`remainder` [m].
@@ -97,6 +99,9 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
     if NOTHING not in chosen and predictive[0] < -NormalDist().inv_cdf(CREDIBLE) * predictive[1]:
         told[UNKNOWN] += sum(told.pop(name, 0.0) for name in chosen if name != UNKNOWN)
         chosen = [UNKNOWN]
+    # Without an effect that is seen there is none, or it is too weak.
+    none = (1 - MISSING) / math.exp(LN_NOT_SEEN)
+    told |= {NOTHING: none * told[NOTHING], UNSEEN: (1 - none) * told[NOTHING]}
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"
     elif chosen == [NOTHING]:

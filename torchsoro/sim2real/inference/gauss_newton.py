@@ -21,6 +21,7 @@ LONGEST_MOVE = 1.5  # of a place in a step, in tenths of the body's size
 DAMPING = 1e-2  # of the first step (Levenberg and Marquardt), times the diagonal of the normal matrix
 DAMPING_LIMITS = (1e-4, 10.0)  # least damping of a step; a search ends that would need more than the most
 LITTLE = (0.5, 1e-3)  # gain in chi-squared, and its share, below which a search has converged
+CRUDE = 3.0  # times as long as wanted are steps of difference quotients that are not to be trusted
 LEADS = 0.5  # of the gain that a step promises, which derivatives of an earlier point have to lead to
 
 
@@ -68,6 +69,7 @@ class Point:
         J: Its derivatives by the measurement errors, with their sign changed [N, L].
         columns: The same by the unknowns [N, K].
         motions: Of each trial.
+        crude: Whether derivatives were taken with much longer steps than they ask for.
     """
 
     chi2: float
@@ -77,6 +79,7 @@ class Point:
     J: np.ndarray
     columns: np.ndarray
     motions: list[MarkerTrajectory]
+    crude: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +139,7 @@ class GaussNewton:
         current, eager = yield from self.linearise(at, errors, moving)
         if current is None:
             return None
-        fresh = True  # whether the derivatives were simulated at this point
+        fresh = not current.crude  # whether the derivatives were simulated at this point, and well
         for _ in range(rounds):
             step = self.step(current, damping)
             # A step that rounding swallows leads nowhere, too: nothing could be learnt from it of the derivatives.
@@ -150,13 +153,14 @@ class GaussNewton:
             else:
                 complete = eager
                 asked = moving if eager else moving[:0]
-                ahead, eager = yield from self.linearise(current.at + step, current.errors, asked)
+                ahead, eager = yield from self.linearise(current.at + step, current.errors, asked, current)
                 gained = 0.0 if ahead is None else current.chi2 - ahead.chi2
                 if ahead is not None and gained > 0:
                     if not complete:
                         ahead = dataclasses.replace(ahead, columns=self.columns(current, ahead))
                     converged = fresh and _little(gained, ahead.chi2)
-                    current, damping, fresh = ahead, max(damping / 5, DAMPING_LIMITS[0]), complete
+                    current, damping = ahead, max(damping / 5, DAMPING_LIMITS[0])
+                    fresh = complete and not ahead.crude
                     if converged:
                         break
                 elif fresh:
@@ -166,23 +170,35 @@ class GaussNewton:
                     continue
                 leads = fresh or gained > LEADS * promised
             if not leads:
-                again, eager = yield from self.linearise(current.at, current.errors, moving, current.motions)
+                again, eager = yield from self.linearise(current.at, current.errors, moving, current, current.motions)
                 if again is None:
                     break
                 current, fresh = again, True
         if settle and not fresh:
-            again, _ = yield from self.linearise(current.at, current.errors, moving, current.motions)
+            again, _ = yield from self.linearise(current.at, current.errors, moving, current, current.motions)
             current = again or current
         return current
 
     def linearise(
-        self, at: np.ndarray, errors: np.ndarray, moving: np.ndarray, known: list[MarkerTrajectory] | None = None
+        self,
+        at: np.ndarray,
+        errors: np.ndarray,
+        moving: np.ndarray,
+        before: Point | None = None,
+        known: list[MarkerTrajectory] | None = None,
     ) -> Linearisation:
         """A point with its derivatives by the unknowns ``moving``, None if its simulation breaks down.
 
         Beside it whether the next may have derivatives, too, as where there is room for them.
+
+        Args:
+            at: Where.
+            errors: Measurement errors to begin with.
+            moving: Numbers of the unknowns.
+            before: A point nearby, whose derivatives tell how long steps may be.
+            known: Motions there.
         """
-        steps = self.likelihood.steps(self.effects, at)
+        steps = self.likelihood.steps(self.effects, at, None if before is None else before.columns)
         answer = yield Asked(self.effects, np.concatenate([at[None], at + np.eye(len(at))[moving] * steps]), known)
         return self._point(at, errors, moving, steps, answer.motions), answer.eager
 
@@ -195,14 +211,16 @@ class GaussNewton:
             return None
         base = [m.alone(0) for m in motions]
         chi2, errors, r, J = likelihood.measure(base, errors)
-        columns = np.zeros((len(r), len(at)))
+        columns, crude = np.zeros((len(r), len(at))), False
         if len(moving):
             beside = likelihood.residual(motions, errors)[:, 1:]
             columns[:, moving] = (r[:, None] - beside) / steps[moving]
+            wanted = np.abs(likelihood.steps(self.effects, at, columns))
+            crude = bool((np.abs(steps) > CRUDE * wanted)[moving].any())
         chi2 += float((likelihood.prior_residual(at, self.held)[0] ** 2).sum())
         if not (math.isfinite(chi2) and np.isfinite(columns).all()):
             return None
-        return Point(chi2=chi2, at=at, errors=errors, r=r, J=J, columns=columns, motions=base)
+        return Point(chi2=chi2, at=at, errors=errors, r=r, J=J, columns=columns, motions=base, crude=crude)
 
     def step(self, point: Point, damping: float) -> np.ndarray:
         """One Gauss-Newton step in the unknowns, with the measurement errors eliminated, within bounds."""

@@ -302,10 +302,22 @@ class Likelihood:
                 high += [10 * o / z + 10 for o, z in zip(s.origin, s.size, strict=True)]
         return np.array(low), np.array(high)
 
-    def steps(self, effects: Effects, at: np.ndarray) -> np.ndarray:
-        """Of the unknowns at a point [K], in scales, for difference quotients: to the side where there is room."""
+    def steps(self, effects: Effects, at: np.ndarray, columns: np.ndarray | None = None) -> np.ndarray:
+        """Of the unknowns at a point [K], in scales, for difference quotients: to the side where there is room.
+
+        What one unknown bends, another one explains where the two move the body nearly alike, as a modulus and a softer
+        end do. So what changes the motion by more than the noise has steps that are shorter by as much.
+
+        Args:
+            effects: That are simulated, beside what is fitted always.
+            at: The point.
+            columns: Derivatives of the whitened residual near it [N, K], where they are known.
+        """
         low, high = self.bounds(effects)
-        up, down = np.minimum(self.step, high - at), np.minimum(self.step, at - low)
+        longest = np.full(len(at), self.step)
+        if columns is not None and self.step <= STEP:
+            longest /= np.maximum(np.sqrt((columns**2).mean(0)), 1.0)
+        up, down = np.minimum(longest, high - at), np.minimum(longest, at - low)
         return np.where(up >= down, up, -down)
 
     def vary(self, scenario: Scenario, effects: Effects, points: np.ndarray) -> Scenario:

@@ -3,7 +3,9 @@
 An effect changes the motion by a c, where c is its response as far as beliefs and measurement errors cannot imitate it,
 of information I = c' C^-1 c. It comes to have more than the credible probability where
 
-    a^2 I / (2 kappa) = ln(credible / (1 - credible)) + ln(names + 1).
+    a^2 I / (2 kappa) = ln(credible / (1 - credible)) + ln(names + 1) + ln(unseen / seen),
+
+the last two its prior odds, see :mod:`torchsoro.sim2real.inference.weighing`.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, products
 from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.state_space import total
+from torchsoro.sim2real.inference.weighing import LN_NOT_SEEN, LN_SEEN
 
 FACTORS = (2.0, 4.0, 8.0, 16.0)  # by which an experiment or a twin may be made better
 
@@ -50,7 +53,7 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
     seen = information > 0
     if not seen.any():
         return math.inf
-    needed = 2 * kappa * (math.log(CREDIBLE / (1 - CREDIBLE)) + math.log(names + 1))
+    needed = 2 * kappa * (math.log(CREDIBLE / (1 - CREDIBLE)) + math.log(names + 1) + LN_NOT_SEEN - LN_SEEN)
     # What the twin may err by is not told, however well it is seen.
     return max(float(np.median(size[seen] * np.sqrt(needed / information[seen]))), near.numerics.size)
 

@@ -8,8 +8,9 @@ likelihood: Ribatet, Cooley and Davison 2012),
 
     kappa = 1 + sum_k mean_d (D' C^-1 d)^2 / (D' C^-1 D),
 
-the mean over draws d of one kind k, C without what it has of d, and the likelihood is taken to the power of 1 / kappa. The draws count in full, whatever
-share c of its price the residual shows: an error along the change is taken up by the effect, and not left.
+the mean over draws d of one kind k, C without what it has of d, and the likelihood is taken to the power of 1 / kappa.
+The draws count in full, whatever share c of its price the residual shows: an error along the change is taken up by the
+effect, and not left.
 
 Where the most probable model leaves a discrepancy that matters, none is right, and what separates evidences is mostly
 how well that discrepancy happens to fit its covariance. Then its size decides: N independent numbers whose variance is
@@ -28,6 +29,9 @@ probable as the first, but for how much less it strains beliefs: that a stated n
 improbable whatever the twin errs by. An extension has a number more, by which it fits the twin's error as well: beside
 what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
 are compared in the same way.
+
+How strong an effect is that is missing is not known before, so that it is as likely too weak to be seen as not. What is
+too weak predicts what nothing predicts, and is told beside it, whatever its name.
 
 Nothing with a stated number that is off by more than is credible is not nothing: its probability is that of the
 number's name.
@@ -53,7 +57,8 @@ from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_with
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
 
-NOTHING, UNKNOWN = "nothing", "unknown"
+NOTHING, UNSEEN, UNKNOWN = "nothing", "unseen", "unknown"
+LN_SEEN, LN_NOT_SEEN = math.log(MISSING / 2), math.log(1 - MISSING / 2)  # before: what is missing is seen or not
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
 CLOSE = 0.2  # of a tolerance, of a noticeable change, or of a tenth of the body, below which they are, too
 
@@ -246,9 +251,9 @@ class Weighing:
         return remainder(self.data, self.bounded)
 
     def _ln_prior(self, model: Model) -> float:
-        """Of a name; a model without effects stands for what has none."""
+        """Of a name whose effect is seen; a model without effects stands for what has none."""
         pair = math.log(self.names) if len(model.effects) > 1 else 0.0
-        return math.log(MISSING / (self.names + 1)) - pair
+        return LN_SEEN - math.log(self.names + 1) - pair
 
     def _bounded(
         self,
@@ -304,7 +309,7 @@ class Weighing:
         if not small or not numerics.size:
             return probabilities
         count = numerics.count
-        ln_nothing = math.log(1 - MISSING) + ln_evidence_within(self.data, self.null.near, numerics.size, count)
+        ln_nothing = LN_NOT_SEEN + ln_evidence_within(self.data, self.null.near, numerics.size, count)
         ln_odds = {NOTHING: 0.0}
         for name, share in small.items():
             near = self.groups[name][0].near
@@ -324,7 +329,7 @@ class Weighing:
         ln_prior = {name: self._ln_prior(modes[0].near.model) for name, modes in groups.items()}
         ln_p = {name: ln_prior[name] + _summed(modes) for name, modes in groups.items()}
         # Without a discrepancy that matters nothing is missing, with one something is that has no name.
-        ln_p[NOTHING] = math.log(1 - MISSING) + float(np.logaddexp.reduce([p.none.ln_evidence for p in nulls]))
+        ln_p[NOTHING] = LN_NOT_SEEN + float(np.logaddexp.reduce([p.none.ln_evidence for p in nulls]))
         ln_p[UNKNOWN] = self._ln_prior(self.null.near.model) + float(
             np.logaddexp.reduce([p.some.ln_evidence for p in nulls])
         )

@@ -8,7 +8,7 @@ from torchsoro.sim2real.inference.decision import MATTERS
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.next_experiment import advice
 from torchsoro.sim2real.inference.verdict import Candidate
-from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN
+from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN, UNSEEN
 from torchsoro.sim2real.report import words
 from torchsoro.sim2real.report.explanation import Explanation, effect_rows
 
@@ -91,7 +91,8 @@ def lead(e: Explanation) -> str:
 
 def told(name: str) -> str:
     """A candidate's name in words."""
-    return {NOTHING: "nothing", UNKNOWN: "none of the known effects"}.get(name) or words.effect_words(name)
+    others = {NOTHING: "nothing", UNSEEN: "an effect too weak to be seen", UNKNOWN: "none of the known effects"}
+    return others.get(name) or words.effect_words(name)
 
 
 def _probable(e: Explanation) -> str:
@@ -104,8 +105,8 @@ def _probable(e: Explanation) -> str:
 
 def _little(e: Explanation) -> Candidate | None:
     """What does not matter, but is more probable than that nothing is missing; None where nothing is."""
-    first = next(iter(e.verdict.ranking), None)  # the most probable one
-    return first if first and first.probability > e.verdict.conclusion.probabilities[NOTHING] else None
+    first, p = next(iter(e.verdict.ranking), None), e.verdict.conclusion.probabilities  # the most probable one
+    return first if first and first.probability > p[NOTHING] + p[UNSEEN] else None
 
 
 def _visible(e: Explanation) -> str:
