@@ -256,6 +256,20 @@ def test_an_effect_that_leaves_more_than_a_fifth_of_the_difference_is_not_told()
     assert (found.kind, found.chosen) == ("unknown_physics", ())
 
 
+@pytest.mark.parametrize("by_chance", [False, True])
+def test_what_an_effect_leaves_is_no_discrepancy_where_chance_is_the_more_probable_reason(by_chance):
+    data, nothing, drag = recorded(0.05, 4, effect=0.3)
+    found = infer(data, drag)
+    assert found.matters
+    shift = 10.0 if by_chance else -10.0
+    mode = dataclasses.replace(found.none.mode, ln_evidence=found.some.ln_evidence - found.none.ln_occam + shift)
+    found = dataclasses.replace(found, none=dataclasses.replace(found.none, mode=mode))
+    told_of = conclude(Weighing(data=data, nothing=(infer(data, nothing),), effects=(found,), names=10), limit=0.0)
+    (candidate,) = told_of.candidates
+    assert candidate.left > max(UNEXPLAINED * told_of.left, data.noise)
+    assert told_of.kind == ("explained" if by_chance else "unknown_physics")
+
+
 def test_an_effect_that_leaves_no_more_than_the_twin_may_err_is_told():
     data, nothing, drag = recorded(0.3, 15, effect=0.6)
     (candidate,) = conclude(weighed(data, nothing, drag), limit=0.0).candidates
@@ -437,7 +451,7 @@ def test_an_extension_of_what_moves_less_than_the_twin_may_err_is_told_as_nothin
     near = SimpleNamespace(
         numerics=SimpleNamespace(size=9e-6), model=SimpleNamespace(simpler=("lag",), effects=("leak",))
     )
-    common = {"best": SimpleNamespace(near=near), "left": 0.0, "credible": True, "ln_evidence": 0.0}
+    common = {"best": SimpleNamespace(near=near, matters=False), "left": 0.0, "credible": True, "ln_evidence": 0.0}
     leak = SimpleNamespace(name="leak", size=14e-6, probability=0.9, **common)
     lag = SimpleNamespace(name="lag", size=simple, probability=0.01, **common)
     names = {"leak": leak, "lag": lag}

@@ -100,7 +100,7 @@ class Softening(Hypothesis):
 class Density(Hypothesis):
     """The solid is heavier or lighter than believed."""
 
-    name, affected_quantity, model_form_deviation = "density", "density", 0.2
+    name, affected_quantity, model_form_deviation = "density", "density", 0.1
     ratios = frozenset({"factor"})
     quantities = (Quantity("ln_factor", "1", 0.1, -7.0, 10.0),)
     starts = ((1.0,), (-1.0,), (3.0,), (-3.0,))

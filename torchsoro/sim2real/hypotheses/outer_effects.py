@@ -131,7 +131,7 @@ def _planes(scenario: Scenario, change: Callable[[Plane], Mapping[str, Tensor | 
 class GravityTilt(Hypothesis):
     """The body stands at an angle: gravity is turned about two axes."""
 
-    name, affected_quantity, model_form_deviation = "gravity_tilt", "direction of gravity", 0.2
+    name, affected_quantity, model_form_deviation = "gravity_tilt", "direction of gravity", 0.1
     nonnegative = frozenset({"angle_rad"})
     quantities = (Quantity("about_first", "rad", 0.03, -20.0, 20.0), Quantity("about_second", "rad", 0.03, -20.0, 20.0))
     starts, joint = ((1.0, 0.0), (0.0, 1.0)), True

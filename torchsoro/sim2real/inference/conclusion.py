@@ -150,7 +150,8 @@ def _meaning(
     """What a candidate counts as, and what its probability is told of.
 
     What does not matter counts as nothing, also as one of two. Its probability is told all the same, unless the twin
-    may err by as much. What leaves much, more than noise and than the twin may err, is not missing.
+    may err by as much. What leaves much, more than noise and than the twin may err, and more probably than not by more
+    than chance, is not missing.
 
     Args:
         c: The candidate.
@@ -176,7 +177,7 @@ def _meaning(
     pair = len(model.effects) > 1
     adds = pair and all(sure(d) and apart(c.best, d.best) > own and foretells(c, d) for d in plain)
     called = c.name if adds else name
-    unexplained = c.left > max(UNEXPLAINED * left, noise, error, own)
+    unexplained = c.best.matters and c.left > max(UNEXPLAINED * left, noise, error, own)
     if c.size < max(least, own):
         # An extension that adds nothing to what moves the body by less than the twin may err is no more than that.
         seen = min(c.size, names[called].size) >= own
