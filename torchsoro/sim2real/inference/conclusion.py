@@ -17,7 +17,7 @@ from statistics import NormalDist
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, compared
-from torchsoro.sim2real.inference.weighing import LN_NOT_SEEN, NOTHING, UNKNOWN, UNSEEN, Candidate, Weighing, apart
+from torchsoro.sim2real.inference.weighing import NOTHING, SEEN, UNKNOWN, UNSEEN, Candidate, Weighing, apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -100,7 +100,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         told[UNKNOWN] += sum(told.pop(name, 0.0) for name in chosen if name != UNKNOWN)
         chosen = [UNKNOWN]
     # Without an effect that is seen there is none, or it is too weak.
-    none = (1 - MISSING) / math.exp(LN_NOT_SEEN)
+    none = (1 - MISSING) / (1 - SEEN)
     told |= {NOTHING: none * told[NOTHING], UNSEEN: (1 - none) * told[NOTHING]}
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"

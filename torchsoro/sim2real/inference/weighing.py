@@ -30,8 +30,8 @@ improbable whatever the twin errs by. An extension has a number more, by which i
 what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
 are compared in the same way.
 
-How strong an effect is that is missing is not known before, so that it is as likely too weak to be seen as not. What is
-too weak predicts what nothing predicts, and is told beside it, whatever its name.
+An effect that is missing may be too weak to be seen: by the prior of strengths, a quarter is less than one noticeable
+change. It predicts what nothing predicts, and is told beside that, whatever its name.
 
 Nothing with a stated number that is off by more than is credible is not nothing: its probability is that of the
 number's name.
@@ -50,15 +50,17 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 
 import numpy as np
+from scipy.stats import t
 
-from torchsoro.sim2real.inference.decision import BELIEVED, MISSING
+from torchsoro.sim2real.inference.decision import BELIEVED, FREEDOM, MISSING, STRENGTH
 from torchsoro.sim2real.inference.evidence import Model, Posterior, adjusted, ln_strained, mode_of, products
 from torchsoro.sim2real.inference.least_squares import closest, ln_evidence_within, told
 from torchsoro.sim2real.inference.observed import Data, Motions, independent, size_of
 from torchsoro.sim2real.inference.state_space import total
 
 NOTHING, UNSEEN, UNKNOWN = "nothing", "unseen", "unknown"
-LN_SEEN, LN_NOT_SEEN = math.log(MISSING / 2), math.log(1 - MISSING / 2)  # before: what is missing is seen or not
+SEEN = MISSING * 2 * float(t.sf(1 / STRENGTH, FREEDOM))  # prior probability that something is missing that is seen
+LN_SEEN, LN_NOT_SEEN = math.log(SEEN), math.log(1 - SEEN)
 SAME = 3.0  # standard deviations apart, below which two ends of searches are one mode
 CLOSE = 0.2  # of a tolerance, of a noticeable change, or of a tenth of the body, below which they are, too
 
