@@ -150,8 +150,8 @@ def _meaning(
     """What a candidate counts as, and what its probability is told of.
 
     What does not matter counts as nothing, also as one of two. Its probability is told all the same, unless the twin
-    may err by as much. What leaves much, more than noise and than the twin may err, and more probably than not by more
-    than chance, is not missing.
+    may err by as much. What leaves much, more than noise and than the twin may err, is not missing where evidence is
+    for a discrepancy.
 
     Args:
         c: The candidate.

@@ -305,8 +305,9 @@ class Likelihood:
     def steps(self, effects: Effects, at: np.ndarray, columns: np.ndarray | None = None) -> np.ndarray:
         """Of the unknowns at a point [K], in scales, for difference quotients: to the side where there is room.
 
-        What one unknown bends, another one explains where the two move the body nearly alike, as a modulus and a softer
-        end do. So what changes the motion by more than the noise has steps that are shorter by as much.
+        Unknowns that move the body nearly alike, as a modulus and a softer end do, differ by little in their
+        derivatives, which the curvature over a step must not hide. So an unknown that changes the motion by more than
+        the noise has a step that is shorter in proportion.
 
         Args:
             effects: That are simulated, beside what is fitted always.
