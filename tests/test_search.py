@@ -12,7 +12,7 @@ import pytest
 
 from torchsoro.sim2real.inference import search
 from torchsoro.sim2real.inference.gauss_newton import GaussNewton, Point
-from torchsoro.sim2real.inference.search import ENDS_PAIR, FINER_ROUNDS, PROMISING
+from torchsoro.sim2real.inference.search import ENDS_PAIR, FINER_ROUNDS, PROMISING, alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,3 +295,10 @@ def test_a_rugged_effect_is_searched_from_the_best_of_many_points_and_gone_on_wi
         assert 0 < len(tasks) == len(set(tasks)) <= kept
     assert [f.chi2 for f in found] == sorted(f.chi2 for f in found)
     assert found[0].chi2 < 0.6
+
+
+def test_a_second_effect_is_tried_beside_single_ones_only():
+    modulus, side, tube = object(), object(), object()
+    fits: list[Any] = [SimpleNamespace(effects=e) for e in ((modulus, side), (side,), (tube,))]
+    known: list[Any] = [modulus, side]
+    assert alone(fits, known) == fits[1:2]

@@ -127,7 +127,7 @@ def search(
     # A second effect would take up what chance in touching leaves.
     if best and unexplained():
         left = best[0].chi2 - best[0].samples
-        singles = [f for f in running(problem, best) if f.effects[0] in effects]  # no rugged one
+        singles = alone(running(problem, best), effects)
         pairs = _pairs(problem, effects, singles, report) if singles else []
         best = _best([*best, *(f for f in pairs if f.chi2 - f.samples < TWICE * left)])
     ends = distinct([*best, *sorted(completed, key=lambda f: f.chi2)], ENDS)
@@ -253,6 +253,11 @@ def running(problem: FitProblem, ends: Iterable[Fit]) -> list[Fit]:
     """Ends of searches with an effect that may be the most probable, best first."""
     order = sorted((f for f in ends if f.effects), key=lambda fit: fit.chi2)
     return [f for k, f in enumerate(order) if k < AHEAD or near_best(f, order[0], problem.chance)]
+
+
+def alone(fits: Iterable[Fit], effects: Sequence[Hypothesis]) -> list[Fit]:
+    """Fits of one of the effects by itself, beside which a second one may be, unlike beside a modulus and a side."""
+    return [f for f in fits if len(f.effects) == 1 and f.effects[0] in effects]
 
 
 def near_best(fit: Fit, best: Fit, chance: float = 0.0) -> bool:
