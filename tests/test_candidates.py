@@ -76,6 +76,16 @@ def test_nothing_is_named_in_a_bar_that_is_as_believed(weighed):
     assert found.probabilities["nothing"] + found.probabilities["unseen"] > 0.95 and found.credible == ("nothing",)
 
 
+def test_a_fit_that_is_made_over_for_another_effect_is_linearised_as_one_of_that(weighed):
+    problem, (_, fit), _ = weighed["density"]
+    assert fit.columns is fit.end.columns
+    point = np.concatenate([fit.point[:1], np.ones(1), 5 * np.ones(3)])
+    mass = dataclasses.replace(fit, effects=(effect("attached_mass"),), point=point)
+    assert mass.columns is None
+    (model,) = near(problem, [mass])
+    assert model is not None and model.slopes[0].shape[-1] == len(model.at) == 5 + len(fit.errors)
+
+
 def test_trials_that_are_only_predicted_change_no_evidence(weighed):
     problem, _, weighing = weighed["density"]
     trial = dataclasses.replace(problem.trials[0], name="other")

@@ -117,7 +117,7 @@ def near(
     finer = problem.finer_twin
     bare = problem.discretization if finer is None else DiscretizationError(shift=tuple(problem.shift))
     coarse = problem.only(problem.trials, discretization=bare)
-    steps = [problem.steps(f.effects, f.point, f.end.columns) for f in fits]
+    steps = [problem.steps(f.effects, f.point, f.columns) for f in fits]
     asked = [
         (f.effects, np.concatenate([f.point[None], f.point + np.diag(h)])) for f, h in zip(fits, steps, strict=True)
     ]

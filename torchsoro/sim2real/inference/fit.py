@@ -62,6 +62,11 @@ class Fit:
         """Of the effects."""
         return " + ".join(e.name for e in self.effects) or "nothing"
 
+    @property
+    def columns(self) -> np.ndarray | None:
+        """Derivatives of the whitened residual by the unknowns [N, K]; None where these are not those of the search."""
+        return self.end.columns if len(self.end.at) == len(self.point) else None
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FitProblem(Likelihood):
