@@ -124,7 +124,7 @@ class SoftSide(Hypothesis):
     contrast = 2 / 3  # of ln E over the body, that a soft half lacks which moves nearly the same
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:
-        """What ln E gains over the body, and the fraction that a soft half lacks that moves nearly the same."""
+        """What ln E gains over the body, and the fraction of E that the soft part lacks, or one that moves it alike."""
         lost = 1 - math.exp(-self.contrast * float(np.abs(values[:3]).max()))
         return {**super().reported(values, scenario, twin), "fraction": (lost, "1")}
 

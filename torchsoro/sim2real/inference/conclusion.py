@@ -1,10 +1,10 @@
 """What can be concluded from probabilities: the smallest set of candidates with most of them.
 
 Probabilities are of what is missing, whether it matters or not, and that of an effect that is too weak to be seen is
-told beside that of nothing. In the set, what changes the motion by less than
-matters goes by its name where nothing is not credible beside it and trials left out are predicted better with it; else
-it counts as nothing. So does what the second of two effects adds to the first. Where something is missing, and the
-first of the set predicts trials left out surely worse than nothing does, no name of the set is it.
+told beside that of nothing. In the set, what changes the motion by less than matters goes by its name where nothing is
+not credible beside it and trials left out are predicted better with it; else it counts as nothing. So does what the
+second of two effects adds to the first. Where something is missing, and the first of the set predicts trials left out
+surely worse than nothing does, no name of the set is it.
 """
 
 from __future__ import annotations
