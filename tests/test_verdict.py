@@ -13,12 +13,14 @@ from ringing import effect
 from torchsoro.sim2real.hypotheses.body_effects import Modulus
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.hypotheses.supply_effects import PressureGain, ThrottledLoss
+from torchsoro.sim2real.inference import verdict
+from torchsoro.sim2real.inference.candidates import weigh
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.heldout import predict, predictions
+from torchsoro.sim2real.inference.heldout import Predictions, predict, predictions
 from torchsoro.sim2real.inference.search import AHEAD, ENDS, FARTHER, distinct, running
 from torchsoro.sim2real.inference.starts import likely, unconstrained
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
-from torchsoro.sim2real.inference.verdict import _as_pairs, _as_simpler, weighed
+from torchsoro.sim2real.inference.verdict import _as_pairs, _as_simpler, _halfway, weighed
 from torchsoro.sim2real.report import sentences
 from torchsoro.sim2real.report.explanation import Explanation, as_json
 from torchsoro.sim2real.report.sentences import evidence, verdict_sentence
@@ -162,6 +164,32 @@ def test_drag_is_named_with_its_number_and_its_probability(dragged):
     answer = as_json(explanation(found), {})
     assert answer["verdict"] == "explained"
     assert answer["probabilities"]["drag"] == answer["effects"][0]["confidence"] == found.chosen[0].probability
+
+
+def test_what_breaks_down_where_it_is_most_probable_explains_nothing(dragged, monkeypatch):
+    problem, effects, null_model, ends = dragged
+
+    def broken_with_drag(problem, fit, *args):
+        found = predictions(problem, fit, *args)
+        return Predictions(before=(), after=(), left_out={}) if "drag" in fit.name else found
+
+    monkeypatch.setattr(verdict, "predictions", broken_with_drag)
+    said = []
+    found = weighed(problem, effects, null_model, ends, report=said.append)
+    assert "drag" not in {c.name for c in found.ranking}
+    assert len(found.before) == len(problem.trials)
+    assert "drag: breaks down where it is most probable" in said
+
+
+def test_a_mode_that_breaks_down_is_approached_halfway(dragged):
+    problem, _, null_model, (drag, tilt, *_) = dragged
+    known = weigh(problem, [null_model, drag, tilt])
+    far = [p for _, p in known[1:]]
+    ends = [dataclasses.replace(fit, point=fit.point + 2.0, errors=fit.errors + 0.2) for fit, _ in known[1:]]
+    (found,) = _halfway(known, far, ends, [known[2]])  # the second was simulated
+    assert found.name == "drag"
+    assert found.point == pytest.approx(drag.point + 1.0)
+    assert found.errors == pytest.approx(drag.errors + 0.1)
 
 
 def test_trials_that_are_only_predicted_change_no_verdict(made, dragged):

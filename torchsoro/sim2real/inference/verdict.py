@@ -30,7 +30,7 @@ from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction, predictions
 from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.least_squares import told
-from torchsoro.sim2real.inference.observed import Data
+from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.search import search
 from torchsoro.sim2real.inference.starts import unconstrained
 from torchsoro.sim2real.inference.weighing import Weighing, adjustment
@@ -177,17 +177,40 @@ def weighed(
             break
         ends = [leading if p is best else at_mode(problem, _fit_of(known, p), told(data, p)) for p in far]
         again = weigh(problem, ends, closely=True, moved=moved)
+        if not problem.rough and (back := _halfway(known, far, ends, again)):
+            again += weigh(problem, back, closely=True)
         sound = {p.near.model.name for _, p in again}
-        if not problem.rough:  # what breaks down there stays as it was
+        if not problem.rough:  # what breaks down there, too, stays as it was
             known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]
         elif k == 0:  # evidence with errors that were told otherwise is no measure
             known = [one for one in known if one[1].near.model.name not in sound]
         known += again
         weighing = weighing_of(problem, [p for _, p in known], names)
     changes = (tells or isolability(problem, effects)).changes
+    while True:
+        verdict = _concluded(problem, known, weighing, changes, report)
+        folds = _folds(verdict, data, weighing.kappa) if not heldout else ()
+        ahead = predictions(problem, verdict.best, heldout, folds)
+        if ahead.before or not verdict.chosen:
+            return dataclasses.replace(verdict, before=ahead.before, after=ahead.after, heldout=ahead.left_out)
+        broken = verdict.chosen[0].name
+        report(f"{broken}: breaks down where it is most probable")
+        known = [one for one in known if one[1].near.model.name != broken]
+        weighing = weighing_of(problem, [p for _, p in known], names)
+
+
+def _concluded(
+    problem: FitProblem,
+    known: Sequence[tuple[Fit, Posterior]],
+    weighing: Weighing,
+    changes: Motions,
+    report: Callable[[str], None],
+) -> Verdict:
+    """The verdict that follows from what was weighed, without what it predicts."""
+    data = weighing.data
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
     kappa = weighing.kappa if weighing.groups else adjustment(data, weighing.null, changes)
-    asked = data, weighing.null, changes, kappa, names
+    asked = data, weighing.null, changes, kappa, weighing.names
     found = conclude(weighing, visible.limit(*asked), visible.remedies(*asked))
     ranking = [
         Candidate(
@@ -203,7 +226,7 @@ def weighed(
     by_name = {c.name: c for c in ranking}
     for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1]):
         report(f"{name}: probability {probability:.3g}" + (f", {tell(by_name[name].fit)}" if name in by_name else ""))
-    verdict = Verdict(
+    return Verdict(
         kind=found.kind,
         problem=problem,
         null_model=at_mode(problem, _fit_of(known, found.nothing), told(data, found.nothing)),
@@ -211,8 +234,6 @@ def weighed(
         chosen=tuple(by_name[name] for name in found.chosen) if found.kind in NAMED else (),
         conclusion=found,
     )
-    ahead = predictions(problem, verdict.best, heldout, _folds(verdict, data, weighing.kappa) if not heldout else ())
-    return dataclasses.replace(verdict, before=ahead.before, after=ahead.after, heldout=ahead.left_out)
 
 
 def _as_beliefs(problem: FitProblem, null_model: Fit, ends: Sequence[Fit]) -> list[Fit]:
@@ -293,6 +314,21 @@ def _looked_at_again(weighing: Weighing, behind: float, before: int) -> list[Pos
 def _fit_of(known: Sequence[tuple[Fit, Posterior]], found: Posterior) -> Fit:
     """The fit near which a model was linearised."""
     return next(fit for fit, p in known if p.near is found.near)
+
+
+def _halfway(
+    known: Sequence[tuple[Fit, Posterior]],
+    far: Sequence[Posterior],
+    ends: Sequence[Fit],
+    again: Sequence[tuple[Fit, Posterior]],
+) -> list[Fit]:
+    """Of modes whose simulation breaks down, the middle between them and where they were linearised."""
+    sound = {p.near.model.name for _, p in again}
+    lost = [(_fit_of(known, p), end) for p, end in zip(far, ends, strict=True) if p.near.model.name not in sound]
+    return [
+        dataclasses.replace(end, point=(fit.point + end.point) / 2, errors=(fit.errors + end.errors) / 2)
+        for fit, end in lost
+    ]
 
 
 def _moved(data: Data, found: Posterior, kappa: float) -> bool:
