@@ -191,6 +191,10 @@ def test_a_mass_on_the_side_of_a_hanging_bar_is_looked_for_there(made):
     (row,) = effect_rows(fit, 1.0, problem)
     off = np.abs(np.array(row["location_m"]) - (0.05, 0.01, 0.02))
     assert (off < 2 * np.array(row["location_within_m"])).all() and max(row["location_within_m"]) < 0.02
+    # What is not known is still within the body.
+    (row,) = effect_rows(dataclasses.replace(fit, covariances=(np.eye(4),)), 1.0, problem)
+    place, size = np.array(row["location_m"]), np.array(twin.setup.size)
+    assert row["location_within_m"] == pytest.approx(np.maximum(place, size - place))
 
 
 def test_a_fit_without_a_trial_is_near_what_the_other_trials_give(made):
