@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,9 +57,10 @@ def without_normals(planes: Tensor) -> Tensor:
     return torch.cat([planes[..., :first], planes[..., first + 3 :]], -1)
 
 
-def ways(*names: str):
-    """Parametrise a test by ``way``: what :func:`simulator` takes for each of these names."""
-    return pytest.mark.parametrize("way", [WAYS[name] for name in names], ids=names)
+def ways(*names: str, slow: Sequence[str] = ()):
+    """Parametrise a test by ``way``: what :func:`simulator` takes for each of these names; some run with ``--slow``."""
+    marked = [pytest.param(WAYS[n], id=n, marks=[pytest.mark.slow] if n in slow else []) for n in names]
+    return pytest.mark.parametrize("way", marked)
 
 
 def vector(*values: float) -> Tensor:

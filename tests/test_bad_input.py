@@ -225,6 +225,7 @@ def check_outcome(ended: Ended, folder: Path, written: set[str]) -> None:
         assert STARTED in ended.said and there <= written, ended
 
 
+@pytest.mark.slow
 @hypothesis.settings(max_examples=40)
 @hypothesis.given(recipe=st.sampled_from(["walker", "climber"]), words=flags(DESIGN, WIDTHS))
 def test_drawn_settings_start_a_run_or_are_refused_without_a_file(recipe, words, recipes, tmp_path_factory):

@@ -62,6 +62,7 @@ def test_floor_of_the_papers_walker_is_its_state_there_and_back():
 # The naive step ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_naive_step_falls_freely_and_keeps_its_momentum():
     domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())
@@ -89,6 +90,7 @@ def test_naive_step_falls_freely_and_keeps_its_momentum():
     assert not torch.allclose(stepper.velocity, noise, atol=0.01)
 
 
+@pytest.mark.slow
 def test_naive_step_is_the_simulators():
     domain = timing.walker(512)
     body = fill(domain, torch.full((domain.count,), 0.9), solid=Solid())

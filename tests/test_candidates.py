@@ -179,6 +179,7 @@ def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_
     assert one.numerics.amplitude == pytest.approx(other.numerics.amplitude, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_what_was_simulated_for_chance_is_not_simulated_again_to_look_closely(on_a_plane):
     error = on_a_plane.discretization.replace(chance=2 * CALM * on_a_plane.noise)
     problem = on_a_plane.only(on_a_plane.trials, discretization=error)
@@ -196,6 +197,7 @@ def test_what_was_simulated_for_chance_is_not_simulated_again_to_look_closely(on
     assert np.array_equal(again.numerics.amplitude, anew.numerics.amplitude)
 
 
+@pytest.mark.slow
 def test_chance_is_that_at_what_leads_where_it_is_more_than_as_stated(on_a_plane):
     problem = on_a_plane
     (fit,) = problem.fit([((), None)], rounds=0)
@@ -310,6 +312,7 @@ def test_what_is_known_is_not_simulated_again(sliding):
             assert one.sound.shape == other.sound.shape
 
 
+@pytest.mark.slow
 def test_a_fit_whose_derivatives_are_those_of_larger_cells_ends_where_one_by_the_finer_twin_does(sliding):
     fits = [p.fit([((), None)], rounds=8)[0] for p in (sliding.finely(), sliding.by(sliding.fine))]
     mixed, fine = (f for f in fits if f is not None)
@@ -317,6 +320,7 @@ def test_a_fit_whose_derivatives_are_those_of_larger_cells_ends_where_one_by_the
     assert mixed.chi2 < 1.02 * fine.chi2  # which is rough
 
 
+@pytest.mark.slow
 def test_cells_that_are_as_good_count_where_bodies_touch(on_a_plane):
     known = measure(on_a_plane.experiment, on_a_plane.twin, on_a_plane.fine)
     assert set(known.between) == {t.name for t in on_a_plane.trials}

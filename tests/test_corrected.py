@@ -45,6 +45,7 @@ def test_each_effect_is_corrected_where_it_is(made):
     assert all(np.array_equal(a.position, b.position) for a, b in zip(found, bare, strict=True))
 
 
+@pytest.mark.slow
 def test_correction_at_the_effect_recovers_drag_of_a_finer_twin_within_3_percent(made):
     """Recordings by a finer twin, of a body that is so different that the twin's error is another than believed."""
     twin, record = made

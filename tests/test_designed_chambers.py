@@ -101,6 +101,7 @@ def test_a_resumed_run_keeps_the_chambers_to_the_bit(tmp_path):
         optimize(walker(dataclasses.replace(cut, iterations=6, resume=True)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("among", [{}, {"scenarios": 3, "fresh": True, "dt": "auto"}])
 def test_chambers_may_settle_on_the_way_and_the_body_goes_on(tmp_path, among):
     how: dict[str, Any] = {"iterations": 6, "chamber_until": 3, "chamber_rate": 0.3, "chamber_volume": "fixed", **among}

@@ -60,6 +60,7 @@ def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_
     assert torch.equal(found[1], scenario.pressure.pressure)
 
 
+@pytest.mark.slow
 @given(part=st.floats(0.05, 1.0), share=st.floats(0.05, 0.8))
 def test_a_throttle_and_a_hole_are_the_same_in_a_trial_at_a_lower_pressure(made, part, share):
     highest = 2e4

@@ -238,6 +238,7 @@ def test_a_verdict_names_the_effect_or_nothing(made):
     assert judge(FitProblem(record(None), twin), effects, **quiet).kind == "nothing_missing"
 
 
+@pytest.mark.slow
 def test_a_wrong_frequency_is_found_over_many_swings(made):
     """A modulus so wrong that simulation and recording are out of phase long before the end."""
     twin, record = made
@@ -417,6 +418,7 @@ def test_the_recipe_writes_its_answer(made, tmp_path, monkeypatch):
         read_model(model)
 
 
+@pytest.mark.slow
 def test_measurement_errors_stay_within_10_deviations_where_no_effect_explains(made):
     """A wind that is none of the effects at hand: what is left is priced, and measurement errors stay believable."""
     twin, record = made
@@ -433,6 +435,7 @@ def test_measurement_errors_stay_within_10_deviations_where_no_effect_explains(m
     assert not told.problem.discretization.mean.any()
 
 
+@pytest.mark.slow
 def test_two_effects_are_found_where_one_does_not_do(made):
     """A bar that is drawn by a fluid and let go with a velocity: neither alone explains it."""
     twin, record = made

@@ -154,6 +154,7 @@ def test_closed_hollow_is_reported() -> None:
     assert len(report.enclosed_voids) == 1 and 40 < report.enclosed_voids[0] < 110
 
 
+@pytest.mark.slow
 def test_rough_fields_give_closed_surfaces() -> None:
     """Noise is the hardest input for an iso-surface: still one closed body."""
     domain = walker(12)

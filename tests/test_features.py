@@ -49,6 +49,7 @@ def thickness(field: DesignField) -> float:
     return (ends[1] - ends[0]) * H if len(ends) == 2 else 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("feature", [2.5 * H, *(pytest.param(n * H, marks=pytest.mark.slow) for n in (4, 6))])
 def test_of_plates_those_that_are_left_when_eroded_are_as_thick_as_asked(feature):
     eta = threshold_of(8 * H, feature)
@@ -167,6 +168,7 @@ def test_variants_grow_apart_once_the_projection_is_sharp(monkeypatch):
     assert torch.equal(half[0], sharp[0])
 
 
+@pytest.mark.slow
 def test_a_run_tells_how_far_its_variants_go(recipes, tmp_path):
     result = recipes["walker"].main(dataclasses.replace(TINY, out=tmp_path / "run", **{**FEATURED, "clip": 3.0}))
     rows = np.genfromtxt(tmp_path / "run" / "metrics.csv", delimiter=",", names=True)

@@ -61,6 +61,7 @@ def test_recorded_times_and_strain_rates_match_file_names(checks):
         assert checks._speed(test)[1] > 20 * rate  # not an even rate of shear
 
 
+@pytest.mark.slow
 @recordings
 def test_viscous_law_halves_prediction_error_at_held_out_rates(checks):
     base = folder(checks, "viscoelastic-shear-and-tension")

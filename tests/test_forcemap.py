@@ -76,6 +76,7 @@ def test_a_planted_force_is_found(made, patch, force):
     assert found.share > 0.8 and found.simulated > 0.8
 
 
+@pytest.mark.slow
 def test_a_force_is_found_by_some_of_many_rows(made, monkeypatch):
     problem = made(2, (0.0, 0.0, 0.05), rows=1300)
     seen = []

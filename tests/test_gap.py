@@ -67,6 +67,7 @@ def test_hidden_effects_are_in_the_recording_and_not_in_the_setup(hide):
     assert all(t.simulated is None for t in hide("nothing", simulated=False)[0].trials)
 
 
+@pytest.mark.slow
 def test_twin_of_a_walker_stays_within_5_mm_of_its_plane(hide):
     found, _ = hide("nothing")
     twin = Twin(found.setup, edge=0.01, walls=1)

@@ -49,7 +49,9 @@ def test_yeoh_constants_recovered_from_one_stress_stretch_curve(mode):
     assert found.largest == pytest.approx(float(exact.invariant.max()))
 
 
-@pytest.mark.parametrize("mode", ["uniaxial", "equibiaxial", "shear"])
+@pytest.mark.parametrize(
+    "mode", [*(pytest.param(m, marks=pytest.mark.slow) for m in ("uniaxial", "equibiaxial")), "shear"]
+)
 def test_coverage_of_yeoh_intervals_matches_confidence_level(mode):
     mu, count, exact = TRUE.shear, 40, experiment(mode, 1.0, back=False)
     wanted = {"shear": mu, "a": 0.02, "b": 0.003, "C20": 0.02 * mu / 4, "C30": 0.003 * mu / 6}
@@ -65,6 +67,7 @@ def test_coverage_of_yeoh_intervals_matches_confidence_level(mode):
     assert (share > LEVEL - 3 * math.sqrt(LEVEL * (1 - LEVEL) / count)).all(), share
 
 
+@pytest.mark.slow
 def test_coverage_of_maxwell_element_intervals_matches_confidence_level():
     exact = [experiment("shear", rate, prony=PRONY) for rate in (0.02, 0.1, 1.0)]
     wanted = {"shear": TRUE.shear, "a": 0.02, "b": 0.003, "g1": 0.8, "tau1": 20.0, "g2": 0.5, "tau2": 1.0}

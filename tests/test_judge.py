@@ -331,6 +331,7 @@ def test_a_case_is_written_as_soon_as_its_motions_are_there(judge, tmp_path, mon
     assert lines[-1] == "b done"
 
 
+@pytest.mark.slow
 def test_a_thrown_block_comes_to_rest_and_a_crawler_lifts_off_its_plate(judge):
     t = np.linspace(0, 0.5, 101)
     block = judge.believed.believed_motion("block", 0, judge.world.World(), 0.5)(t)

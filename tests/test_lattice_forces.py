@@ -88,6 +88,7 @@ def test_slopes_with_all_that_a_body_may_have_agree_with_central_differences_to_
         assert float((by * way).sum()) == pytest.approx(float(up - down) / 2e-5, rel=1e-6), name
 
 
+@pytest.mark.slow
 def test_forces_that_begin_later_are_the_same_in_both_engines_and_few_rows_on_a_gpu():
     p = completed(problem(formulation="total", lattice=hollow(), batch=2, lanes=False), starts=True)
     inputs = Inputs(**{f.name: p.tensors[f.name] for f in fields(Inputs) if f.name in p.tensors})
@@ -114,7 +115,8 @@ def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(name, stick):
     assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), name)
 
 
-@pytest.mark.parametrize("elements", [*(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1)), 5])
+@pytest.mark.slow
+@pytest.mark.parametrize("elements", [0, 1, 5])
 def test_gradcheck_of_the_kernels_of_a_gpu_with_other_numbers_of_maxwell_elements(elements):
     p = problem(formulation="total", elements=elements, lanes=False)
     assert check(p, "state", "coefficients", *(["prony"] if elements else []))
@@ -183,6 +185,7 @@ def test_both_engines_give_the_same_motion_and_gradients(lattice, whole, dtype, 
         assert value <= 2 * max(float((one[name] - o[name]).norm() / one[name].norm()) for o in others), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lattice", [uneven(), hollow()], ids=["uneven", "whole"])
 def test_kernels_for_any_load_move_a_body_like_its_own(lattice, monkeypatch):
     p = problem(formulation="total", lattice=lattice, steps=5, samples=(), lanes=False)
@@ -191,6 +194,7 @@ def test_kernels_for_any_load_move_a_body_like_its_own(lattice, monkeypatch):
     assert float((p.run()[0] - own).abs().max()) <= 1e-14 * float(own.abs().max())
 
 
+@pytest.mark.slow
 def test_both_engines_agree_on_walls_of_more_points_than_a_tile_has_room_for():
     axes = (Axis.uniform(5.0, 1.0, 3), Axis.uniform(3.0, 0.5, 18), Axis.uniform(3.0, 0.5, 18))
     states = []

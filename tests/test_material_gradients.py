@@ -268,7 +268,7 @@ def test_gradient_equals_the_central_difference(name, way):
 
 
 @pytest.mark.parametrize("name", ZERO)
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])
 def test_gradient_at_exactly_zero_equals_the_one_sided_difference(name, way):
     numbers = {**NUMBERS, name: torch.zeros_like(NUMBERS[name])}
     if name.endswith("stiffening"):

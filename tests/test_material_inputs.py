@@ -202,6 +202,7 @@ def contents(draw):
     return made.encode(draw(st.sampled_from(["utf-8", "utf-8-sig", "utf-16", "latin-1"])), "replace")
 
 
+@pytest.mark.slow
 @settings(max_examples=120)
 @given(content=contents(), options=options)
 def test_drawn_inputs_end_in_a_result_or_in_a_message(tmp_path_factory, content, options):

@@ -48,6 +48,7 @@ def sweeps(path: Path, prony: Prony, permanent: float = 1.0) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_prony_series_recovered_within_3_percent_from_sweep_file(modules, tmp_path):
     recipe = modules["material"]
     truth = Prony.paper(3)
@@ -114,6 +115,7 @@ def test_prony_series_recovered_within_2_percent_from_creep_compliance(modules, 
         recipe.main(dataclasses.replace(options, equilibrium=1e5))
 
 
+@pytest.mark.slow
 def test_simulated_transmissibility_peak_within_6_percent_of_closed_form(modules):
     shaker = modules["shaker"]
     solid = Solid(youngs_modulus=1.2e7, poisson_ratio=0.4, density=1200.0)

@@ -160,6 +160,7 @@ def delivered(tmp_path_factory) -> tuple[Path, dict[str, float]]:
     return path, found
 
 
+@pytest.mark.slow
 def test_a_delivered_run_holds_both_densities_and_tells_both_travels(delivered):
     path, found = delivered
     settings = tiny(path, min_wall=1.5 * 0.035 / 8)

@@ -272,7 +272,7 @@ def test_gradients_by_what_acts_on_nodes_are_those_of_differences(name):
         assert float(by[k]) == pytest.approx(sum(parts) / (12 * step), rel=1e-6)
 
 
-@pytest.mark.parametrize("engine", [{}, {"lanes": False}, {"device": "cpu"}])
+@pytest.mark.parametrize("engine", [{}, {"lanes": False}, pytest.param({"device": "cpu"}, marks=pytest.mark.slow)])
 def test_a_simulation_that_diverges_is_marked_and_leaves_the_others_as_they_are(engine):
     lattice, body = bar()
     wild = torch.stack([vector(0.1, 0.0, 0.0), vector(0.1, 0.0, 3e4)]).unsqueeze(1).expand(2, lattice.nodes, 3).clone()

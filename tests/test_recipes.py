@@ -166,6 +166,7 @@ def command(settings: Settings) -> list[str]:
     return [sys.executable, str(RECIPES / "walker.py"), *flags]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_run_killed_within_an_iteration_resumes_to_the_same_numbers(recipes, straight, tmp_path):
     path = tmp_path / "run"
@@ -428,6 +429,7 @@ def test_a_design_is_better_within_the_limit_then_if_it_goes_farther_and_before_
     assert not better(0.9, 0.01, beyond, soft) and better(0.9, 0.01, beyond, hard)
 
 
+@pytest.mark.slow
 def test_without_a_design_within_the_limit_the_one_with_the_least_loss_is_delivered(recipes, tmp_path):
     settings = tiny(tmp_path / "run", c_max=1e-6, iterations=7, upright=20.0)  # the last sinks a little
     result = recipes["walker"].main(settings)

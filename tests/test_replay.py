@@ -34,6 +34,7 @@ def play(replay: ModuleType, robot: Path | str, out: Path, **changes: Any) -> di
     return replay.main(replay.Options(robot=str(robot), out=out, **options))
 
 
+@pytest.mark.slow
 def test_with_void_and_for_as_long_a_robot_does_what_it_did_in_its_run(replay, straight, tmp_path, capsys):
     path, result = straight
     found = play(replay, path, tmp_path / "out", void=True)

@@ -200,7 +200,12 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
 
 
 @pytest.mark.parametrize(
-    "kind", ["nothing_missing", "cannot_tell", "unknown_physics", "cannot_distinguish", "explained"]
+    "kind",
+    [
+        *(pytest.param(k, marks=pytest.mark.slow) for k in ("nothing_missing", "cannot_tell", "cannot_distinguish")),
+        "unknown_physics",
+        "explained",
+    ],
 )
 def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, shown, kind, tmp_path):
     problem, fit = dragged

@@ -74,6 +74,7 @@ def test_a_field_meets_a_density_of_its_own_and_the_archived_walker_on_a_coarse_
     assert float(found[robot.design].mean()) == pytest.approx(0.509, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_run_begins_with_an_archived_design_and_is_resumed_without_it(recipes, tmp_path, monkeypatch):
     result = recipes["walker"].main(tiny(tmp_path / "run", **FROM, scenarios=2, shape_every=1, seconds=1e-9))
     robot = walker(tiny(tmp_path))
@@ -100,6 +101,7 @@ def test_what_cannot_be_started_from_is_refused_before_a_folder_is_made(recipes,
         assert not (tmp_path / name).exists()
 
 
+@pytest.mark.slow
 def test_results_are_there_where_no_movie_can_be_made(recipes, tmp_path, monkeypatch, capsys):
     def none() -> str:
         raise RuntimeError("No ffmpeg exe could be found")
@@ -116,6 +118,7 @@ def test_results_are_there_where_no_movie_can_be_made(recipes, tmp_path, monkeyp
     assert "walker.mp4 is left out: import of imageio_ffmpeg halted" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_finished_robot_is_compared_on_another_lattice(tmp_path, recipes):
     recipes["walker"].main(tiny(tmp_path / "run", iterations=1))
     how = {"count": 2, "device": "cpu", "particles": (16, 16, 16), "void": False}

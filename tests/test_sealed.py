@@ -22,6 +22,7 @@ def half(case: Path, folder: Path) -> Path:
     return copy
 
 
+@pytest.mark.slow
 def test_density_of_a_sealed_case_is_found_among_three_effects(tmp_path):
     copy = half(BATCH / "cases" / "case-111", tmp_path / "case")
     for trial in sorted((copy / "trials").iterdir())[1:]:  # one is enough to tell these three apart

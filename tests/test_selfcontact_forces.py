@@ -78,7 +78,7 @@ def watched(sim: Simulator, body: Body, steps: int, **more) -> Trajectory:
 # ------------------------------------------------------------------------------------------------------------- physics
 
 
-@ENGINES
+@pytest.mark.parametrize("lanes", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["lanes", "taichi"])
 def test_limbs_that_close_do_not_pass_through_each_other(lanes):
     body = fork()
     apart, through = (watched(touching(on=on, lanes=lanes), body, 200) for on in (True, False))
@@ -178,7 +178,9 @@ def test_void_repels_nothing_and_the_weaker_part_sets_the_force():
 # ------------------------------------------------------------------------------------------------------- the gradient
 
 
-@pytest.mark.parametrize(("lanes", "batch"), [(True, 1), (True, 3), (True, 16), (True, 18), (False, 2)])
+@pytest.mark.parametrize(
+    ("lanes", "batch"), [*((True, n) for n in (1, 3, 16, 18)), pytest.param(False, 2, marks=pytest.mark.slow)]
+)
 def test_gradients_are_those_of_central_differences(lanes, batch):
     g = torch.Generator().manual_seed(batch)
     body, sim = fork(), touching(lanes=lanes)

@@ -286,8 +286,8 @@ class Rollout:
 GENTLE, LIVELY = {"pulse": 100.0}, {"pulse": 5e3, "adhesion": 1e5}
 
 
-@pytest.mark.parametrize(("kind", "step"), [(GENTLE, 2e-3), (LIVELY, 1e-4)])
-@ways("apic", "flip", "total")
+@pytest.mark.parametrize(("kind", "step"), [(GENTLE, 2e-3), pytest.param(LIVELY, 1e-4, marks=pytest.mark.slow)])
+@ways("apic", "flip", "total", slow=["flip"])
 def test_gradient_through_2000_steps_of_smooth_contact(way, kind, step):
     # The light nodes around a face's rim come and go; a shorter step straddles no such event.
     step *= 5e-3 if way == WAYS["total"] else 1
@@ -298,7 +298,7 @@ def test_gradient_through_2000_steps_of_smooth_contact(way, kind, step):
     assert error < 1e-6
 
 
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])
 def test_gradient_across_contact_events_is_finite(way):
     # As the block bounces, contact comes and goes at every node: the travel jumps there, and a difference over a
     # longer step, which straddles such jumps, is not held to any bound.
@@ -313,7 +313,7 @@ def test_gradient_across_contact_events_is_finite(way):
         assert math.isfinite(differences)
 
 
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])
 def test_float32_gradient_agrees_with_float64_within_1_percent(way):
     slopes, vectors = [], []
     for dtype in (torch.float64, torch.float32):

@@ -108,7 +108,8 @@ def test_moduli_and_times_recovered_within_1_percent_from_noiseless_sweep_and_re
     assert found.equilibrium == pytest.approx(1e5, rel=1e-3)
 
 
-@pytest.mark.parametrize("noise", [pytest.param(0.01, marks=pytest.mark.slow), 0.05])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.01, 0.05])
 def test_table_s1_moduli_within_5_percent_and_intervals_cover_truth_at_1_and_5_percent_noise(noise):
     truth = np.array([TABLE_S1.equilibrium, *TABLE_S1.moduli])
     off, half, held = [], [], []
@@ -327,6 +328,7 @@ def test_zero_loss_creep_equilibrium_single_point_and_invalid_spectra_are_refuse
 
 
 # ---------------------------------------------------------------------------------------------------- measured curves
+@pytest.mark.slow
 def test_error_norm_on_published_master_curve_below_pyvisco_with_half_its_terms():
     data = master_curve(
         "dma-nrel-polymer/freq_user_master.csv", 2, 1e6, temperature=-5.0, deformation="tension"

@@ -46,6 +46,7 @@ def test_gradient_is_zero_across_a_flat_body():
     torch.testing.assert_close(found, gradient.unsqueeze(1).expand_as(found), rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_velocity_gradient_is_differentiable_by_place_velocity_and_grid():
     given = [t.requires_grad_() for t in (scattered(12, batch=1) / 2, randn(1, 12, 3), randn(1, 3, seed=1))]
     assert torch.autograd.gradcheck(lambda x, v, o: velocity_gradient(x, v, origin=o, cell=1.2), given)

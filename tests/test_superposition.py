@@ -52,7 +52,8 @@ def spread(values):
 # ------------------------------------------------------------------------------------------------- known shift factors
 
 
-@pytest.mark.parametrize("reference", [pytest.param(20.0, marks=pytest.mark.slow), 17.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [20.0, 17.0])
 def test_horizontal_shift_factors_match_wlf_within_standard_errors(reference):
     truth = LAW.at(reference).log_a(TEMPERATURES)
     off, steps, quality = [], [], []
@@ -82,6 +83,7 @@ def test_shift_factor_errors_grow_with_distance_from_reference_and_with_noise():
     assert np.abs(quiet.log_a - LAW.at(6.0).log_a(TEMPERATURES)).max() < 0.02
 
 
+@pytest.mark.slow
 def test_vertical_shift_factors_recovered_within_standard_errors():
     truth = np.log10((TEMPERATURES + 273.15) / 293.15)  # an ideal rubber, upside down: b_T = T / Tr
     off_a, off_b = [], []

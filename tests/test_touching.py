@@ -80,6 +80,7 @@ def test_changes_by_larger_cells_are_differentiated_as_these_touch(on_a_floor):
     assert loud.by(loud.fine).step == STEP  # by itself it touches calmly
 
 
+@pytest.mark.slow
 def test_the_chance_of_both_twins_is_measured(on_a_floor):
     found = measure(on_a_floor.experiment, on_a_floor.twin, on_a_floor.fine)
     for twin, chance in ((on_a_floor.twin, found.chance_in_use), (on_a_floor.fine, found.chance)):

@@ -76,6 +76,7 @@ def off(folder):
     return np.sqrt(((course - same) ** 2).mean(0))[1:] / moved
 
 
+@pytest.mark.slow
 def test_loaded_cantilever_matches_the_twin_within_10_percent(updated, tmp_path):
     folder, other = experiment(tmp_path / "one", LOADED), experiment(tmp_path / "other", LOADED)
     assert updated.main(updated.Options(experiments=(folder, other), transfer="flip")) == 1
