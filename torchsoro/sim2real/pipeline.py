@@ -167,9 +167,10 @@ def _explained(inputs: Inputs, options: Options, progress: Progress, begin: floa
     simulated = {p.trial for p in before}
     everything = [t for t in (*trials, *kept) if t.name in simulated]
     if not everything:
-        what = ", ".join(c.name for c in verdict.chosen) or verdict.kind
+        # An effect that breaks down is left out, so that it is the fit without one.
         raise ValueError(
-            f"experiment: by what was found ({what}) no trial can be simulated, wanted --effects without it"
+            "experiment: no trial can be simulated with the modulus, pressure and friction that fit best without an "
+            "effect, wanted a setup that bears these"
         )
     if len(everything) < len(trials) + len(kept):
         progress.note("Trials that cannot be simulated with what was found are not shown.")

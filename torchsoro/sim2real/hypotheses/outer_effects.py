@@ -37,7 +37,7 @@ class Sliding(Hypothesis):
     name, affected_quantity = "friction", "friction of the planes"
     ratios = frozenset({"coefficient"})
     quantities = (Quantity("inverse_coefficient", "1", 0.1, 0.0, 500.0),)
-    # Close together where a soft body begins to slide: a little farther apart, its way is another one.
+    # Closely spaced near the onset of sliding, where the motion depends steeply on the coefficient.
     starts = ((7.0,), (8.5,), (10.0,), (12.5,), (16.0,), (20.0,), (28.0,), (40.0,), (80.0,))
 
     def reported(self, values: np.ndarray, scenario: Scenario, twin: Twin) -> dict[str, tuple[float, str]]:

@@ -178,7 +178,7 @@ def weighed(
         ends = [leading if p is best else at_mode(problem, _fit_of(known, p), told(data, p)) for p in far]
         again = weigh(problem, ends, closely=True, moved=moved)
         if not problem.rough and (back := _halfway(known, far, ends, again)):
-            again += weigh(problem, back, closely=True)
+            again += weigh(problem, back)
         sound = {p.near.model.name for _, p in again}
         if not problem.rough:  # what breaks down there, too, stays as it was
             known = [one for one in known if one[1] not in far or one[1].near.model.name not in sound]

@@ -100,7 +100,7 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
     Intervals come from the covariance of the fit, widened by the model-form standard deviation, through the slopes of
     the reported quantities. Of a quantity that is the exponential of an unknown the interval is symmetric in its
     logarithm; any other holds the middle 90 % of a normal distribution, or of its part that is
-    possible. A place is within the body.
+    possible. That of a place does not reach beyond the body.
 
     Args:
         fit: Of one effect or several.
@@ -108,7 +108,7 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
         problem: That was fitted.
     """
     wide, rows = float(norm.ppf((1 + LEVEL) / 2)), []
-    low_end, size = np.array(problem.twin.setup.origin), np.array(problem.twin.setup.size)
+    origin, size = (np.array(v) for v in (problem.twin.setup.origin, problem.twin.setup.size))
     # What is relative to the modulus is to that which was found.
     found = sum(float(v[0]) for e, v in zip(fit.effects, fit.values, strict=True) if isinstance(e, Modulus))
     stiffer = math.exp(fit.ln_factors.get(STATED[Modulus], 0.0) + found)
@@ -135,8 +135,8 @@ def effect_rows(fit: Fit, weight: float, problem: FitProblem) -> list[dict[str, 
             parameters[name] = {"value": value, "low": low, "high": high, "unit": unit}
         place = effect.place(values, problem.twin)
         within = wide * np.sqrt(np.diag(covariance)[count:] + (PLACE_DEVIATION * size[: 3 * effect.local]) ** 2)
-        if place is not None and len(within):  # no farther than to the other end of the body
-            within = np.minimum(within, np.maximum(place - low_end, low_end + size - place))
+        if effect.local and place is not None:  # no farther than to the other end of the body
+            within = np.minimum(within, np.maximum(place - origin, origin + size - place))
         rows.append(
             {
                 "name": effect.name,
