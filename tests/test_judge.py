@@ -6,9 +6,11 @@ import ast
 import csv
 import json
 import math
+import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -59,7 +61,7 @@ def elastic_energy(mesh, x):
 def test_the_judge_imports_nothing_of_the_package():
     allowed = (
         {path.stem for path in JUDGE.glob("*.py")}
-        | {"numpy", "numba", "scipy", "tqdm", "tyro"}
+        | {"numpy", "numba", "scipy", "taichi", "tqdm", "tyro"}
         | sys.stdlib_module_names
     )
     for path in JUDGE.glob("*.py"):
@@ -272,7 +274,7 @@ def test_a_batch_of_some_bodies_holds_only_these_and_what_makes_sense_for_them(j
 def test_cases_of_some_bodies_are_made_by_themselves(judge, tmp_path, monkeypatch):
     made = []
     monkeypatch.setattr(judge.seal, "_simulate", lambda job: "as believed")
-    monkeypatch.setattr(judge.seal, "_motions", lambda job: [])
+    monkeypatch.setattr(judge.seal, "needed", lambda job: [])
     monkeypatch.setattr(judge.seal, "_work", lambda job: made.append(job[0].specimen) or "made")
     settings = {"effects": 6, "nulls": 6, "pairs": 0, "outside": 0, "processes": 1, "bodies": ("bar", "post", "pad")}
     assert judge.seal.seal(out=tmp_path, seed=3, only=("bar",), **settings) == ""
@@ -285,42 +287,44 @@ def test_cases_of_some_bodies_are_made_by_themselves(judge, tmp_path, monkeypatc
 def test_a_motion_is_simulated_once_though_a_body_does_not_bear_it(judge, tmp_path, monkeypatch, broken):
     simulated = []
 
-    def simulate(*given):
-        simulated.append(given)
-        if broken:
-            raise judge.march.Broken("inside out")
-        return np.ones((2, 2, 3))
+    class Marched:
+        def run(self, *given):
+            simulated.append(self)
+            if broken:
+                raise judge.march.Broken("inside out")
+            return np.ones((2, 2, 3))
 
-    monkeypatch.setattr(judge.seal, "_simulated", simulate)
+    monkeypatch.setattr(judge.motions.Motion, "begun", lambda self: (Marched(), (), ()))
     bar = judge.specimens.SPECIMENS["bar"]()
     errors = judge.camera.draw_errors(bar, np.random.default_rng(0))
+    world = judge.world.World()
     for number, times in ((0, 1), (0, 1), (1, 2)):
+        motion = judge.motions.Motion(body="bar", number=number, world=world, errors=errors, finer=1.0, kept=tmp_path)
         if broken:
             with pytest.raises(judge.march.Broken):
-                judge.seal._motion(bar, number, judge.world.World(), errors, 1.0, tmp_path)
+                motion.markers()
         else:
-            found = judge.seal._motion(bar, number, judge.world.World(), errors, 1.0, tmp_path)
-            np.testing.assert_array_equal(found, np.ones((2, 2, 3)))
+            np.testing.assert_array_equal(motion.markers(), np.ones((2, 2, 3)))
         assert len(simulated) == times
     (plan,) = judge.seal.plans(1, 0, 0, 0, np.random.default_rng(0), ("bar",))
-    monkeypatch.setattr(judge.seal, "MOTIONS", "motions")
-    jobs = judge.seal._motions((plan, [0], tmp_path, 1.0))
-    assert len(jobs) == 2 * len(bar.trials) and len({path for path, *_ in jobs}) == len(jobs)
-    for motion in jobs:
+    first = judge.motions.needed((plan, [0], tmp_path, 1.0))
+    assert len(first) == 2 * len(bar.trials) and len({motion.path for motion in first}) == len(first)
+    for motion in first:
         judge.seal._one(motion)
     # Another draw follows one that is broken.
-    assert len(judge.seal._motions((plan, [0], tmp_path, 1.0))) == (2 if broken else 1) * len(jobs)
+    assert len(judge.motions.needed((plan, [0], tmp_path, 1.0))) == (2 if broken else 1) * len(first)
 
 
 def test_a_case_is_written_as_soon_as_its_motions_are_there(judge, tmp_path, monkeypatch):
-    def motions(job):
+    def needed(job):
         # Of the second case a draw turns out broken.
         draws = 2 if job[0] == "b" and (tmp_path / "b0-1").exists() else 1
-        return [(tmp_path / f"{job[0]}{draw}-{k}",) for draw in range(draws) for k in range(2)]
+        paths = [tmp_path / f"{job[0]}{draw}-{k}" for draw in range(draws) for k in range(2)]
+        return [SimpleNamespace(path=path) for path in paths]
 
     monkeypatch.setattr(judge.seal, "_simulate", lambda name: f"{name} as believed")
-    monkeypatch.setattr(judge.seal, "_motions", motions)
-    monkeypatch.setattr(judge.seal, "_one", lambda motion: motion[0].touch() or motion[0].name)
+    monkeypatch.setattr(judge.seal, "needed", needed)
+    monkeypatch.setattr(judge.seal, "_one", lambda motion: motion.path.touch() or motion.path.name)
     monkeypatch.setattr(judge.seal, "_work", lambda job: f"{job[0]} done")
     (tmp_path / "c0-0").touch()
     (tmp_path / "c0-1").touch()
@@ -329,6 +333,47 @@ def test_a_case_is_written_as_soon_as_its_motions_are_there(judge, tmp_path, mon
     assert lines[2:5] == ["a0-0, 1 of 4", "a0-1, 2 of 4", "a done"]
     assert sorted(lines[5:-1]) == ["b0-0, 3 of 4", "b0-1, 4 of 4", "b1-0, 6 of 6", "b1-1, 5 of 6"]
     assert lines[-1] == "b done"
+
+
+FLEET = """
+import numpy as np, fleet
+from dataclasses import replace
+from effects import LIBRARY
+from march import March, case_of
+from specimens import SPECIMENS, mesh_for
+from world import World
+
+fleet.start(gpu=False)
+for name, finer, last in (("crawler", 0.35, 0.03), ("post", 0.5, 0.12)):
+    specimen, mesh, rng, every = SPECIMENS[name](), mesh_for(name, finer), np.random.default_rng(3), World()
+    worlds = [every]
+    for effect in dict.fromkeys(specimen.effects):
+        world, _ = LIBRARY[effect](every, specimen, rng)
+        if fleet.able(world):
+            worlds, every = [*worlds, LIBRARY[effect](World(), specimen, rng)[0]], world
+    worlds = [*worlds, every, replace(every, gent=0.05, heat=0.3, adhesion=500.0, modulus=0.01)]
+    trial, points = specimen.trials[1], mesh.interpolation(np.array([m["at"] for m in specimen.setup["marker"]]))
+    case, t = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure), np.arange(0, last, 1e-3)
+    marches = [March(case, world) for world in worlds]
+    together = fleet.Fleet(marches, [t] * len(worlds), [points] * len(worlds)).run()
+    for world, found in zip(worlds, together):
+        try:
+            alone = March(case, world).run(t, *points)
+        except RuntimeError:
+            alone = np.zeros(0)
+        assert alone.size or world.modulus == 0.01
+        print(name, len(alone), np.abs(alone - found).max() if alone.size else found.size)
+"""
+
+
+@pytest.mark.slow
+def test_many_trials_at_once_are_each_what_it_is_alone():
+    # By itself: Taichi's numbers are of single precision elsewhere.
+    ran = subprocess.run([sys.executable, "-c", FLEET], cwd=JUDGE, capture_output=True, text=True, timeout=600)
+    assert ran.returncode == 0, ran.stderr
+    lines = [line.split() for line in ran.stdout.splitlines() if line.startswith(("crawler", "post"))]
+    assert len(lines) > 15 and all(float(apart) < 1e-12 for *_, apart in lines)
+    assert any(count == "0" for _, count, _ in lines)
 
 
 @pytest.mark.slow

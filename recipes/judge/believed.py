@@ -8,11 +8,14 @@ import os
 from pathlib import Path
 
 import numpy as np
-from lobatto import Floats
+from lobatto import Floats, Ints
 from march import March, case_of
 from scipy.interpolate import CubicSpline
 from specimens import SPECIMENS, mesh_for
 from world import World
+
+Begun = tuple[March, Floats, tuple[Ints, Floats]]
+"""A march, its instants [T] s, and nodes and shape functions [P, 27] of what is recorded of it."""
 
 
 @functools.cache
@@ -26,21 +29,32 @@ def believed_motion(name: str, number: int, world: World, finer: float, kept: Pa
         finer: Divides the elements' edge.
         kept: Folder of motions that processes share; each is simulated once.
     """
-    specimen = SPECIMENS[name]()
-    trial = specimen.trials[number]
-    t = np.arange(0, 1.02 * specimen.setup["duration"] + 0.01, 1e-3)
-    path = None
-    if kept is not None:
-        path = kept / f"{name}-{number}-{finer:g}-{hashlib.sha256(repr(world).encode()).hexdigest()[:16]}.npy"
-        if path.exists():
-            return CubicSpline(t, np.load(path, allow_pickle=False))
-    mesh = mesh_for(name, finer)
-    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
-    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-    moved = March(case, world).run(t, *mesh.interpolation(points))
+    path = None if kept is None else expected_path(name, number, world, finer, kept)
+    if path is not None and path.exists():
+        return CubicSpline(_times(name), np.load(path, allow_pickle=False))
+    march, t, points = expected(name, number, world, finer)
+    moved = march.run(t, *points)
     if path is not None:
         keep(path, moved)
     return CubicSpline(t, moved)
+
+
+def expected(name: str, number: int, world: World, finer: float) -> Begun:
+    """The march of such a motion, its instants [T] s, and what :meth:`March.run` takes of the stated markers."""
+    specimen, mesh = SPECIMENS[name](), mesh_for(name, finer)
+    trial = specimen.trials[number]
+    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
+    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
+    return March(case, world), _times(name), mesh.interpolation(points)
+
+
+def expected_path(name: str, number: int, world: World, finer: float, kept: Path) -> Path:
+    """Where such a motion is kept."""
+    return kept / f"{name}-{number}-{finer:g}-{hashlib.sha256(repr(world).encode()).hexdigest()[:16]}.npy"
+
+
+def _times(name: str) -> Floats:
+    return np.arange(0, 1.02 * SPECIMENS[name]().setup["duration"] + 0.01, 1e-3)
 
 
 def keep(path: Path, motion: Floats) -> None:

@@ -23,18 +23,18 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import tyro
-from believed import believed_motion, keep
-from camera import DECOYS, Errors, decoy, draw_errors, film, instants
-from effects import LIBRARY, OUTSIDE, Effect, own_world
-from experiment import Trial
+from believed import believed_motion
+from camera import DECOYS, film, instants
+from effects import LIBRARY, OUTSIDE
 from lobatto import Floats
-from march import Broken, March, case_of
+from march import Broken
+from motions import MOTIONS, Job, Motion, Plan, by_gpu, draws, motions_of, needed
 from specimens import FORMER, SPECIMENS, Specimen, mesh_for
 from visible import detectability
 from world import Line, World
@@ -42,30 +42,6 @@ from world import Line, World
 Body = Literal["bar", "finger", "pad", "slider", "post", "crawler", "block", "robot"]
 BATCHES = ("calibration", "test", "smoke")
 BELIEVED = "sealed/believed"  # folder of motions as believed, which cases share
-MOTIONS = "sealed/motions"  # of motions of cases that are not made yet
-DRAWS = 60  # of a case, until a body bears what was drawn
-
-Job = tuple["Plan", list[int], Path, float]
-"""A case to be made: its plan, its seed, the folder of the batch, and what divides the elements' edge."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What a case is to be.
-
-    Attributes:
-        name: Of its folder.
-        kind: "effect", "null", "decoy", "pair" or "outside".
-        specimen: Its body.
-        effects: Names to draw.
-        decoy: Kind of decoy, or "".
-    """
-
-    name: str
-    kind: str
-    specimen: str
-    effects: tuple[str, ...] = ()
-    decoy: str = ""
 
 
 def plans(
@@ -98,78 +74,6 @@ def plans(
     return [Plan(name=f"case-{n:03d}", **found[i]) for n, i in enumerate(order)]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Draw:
-    """What a case may be; the next one is taken where a body does not bear it.
-
-    Attributes:
-        errors: Of measurement.
-        bare: World without the effects.
-        world: With them.
-        effects: Drawn.
-    """
-
-    errors: Errors
-    bare: World
-    world: World
-    effects: tuple[Effect, ...]
-
-    @property
-    def worlds(self) -> tuple[World, ...]:
-        """That are simulated."""
-        return (self.world, self.bare) if self.effects else (self.world,)
-
-
-def draws(plan: Plan, specimen: Specimen, rng: np.random.Generator) -> Iterator[Draw]:
-    """What a case may be, one after the other."""
-    for _ in range(DRAWS):
-        errors = draw_errors(specimen, rng)
-        bare = world = own_world(specimen, rng)
-        drawn: list[Effect] = []
-        for name in plan.effects:
-            world, effect = {**LIBRARY, **OUTSIDE}[name](world, specimen, rng)
-            drawn.append(effect)
-        if plan.decoy:
-            errors = decoy(errors, plan.decoy, specimen, rng)
-        yield Draw(errors=errors, bare=bare, world=world, effects=tuple(drawn))
-
-
-def _path(specimen: Specimen, number: int, world: World, errors: Errors, finer: float, kept: Path) -> Path:
-    """Where a motion is kept."""
-    text = repr((specimen.name, number, world, errors, finer))
-    return kept / f"{hashlib.sha256(text.encode()).hexdigest()[:24]}.npy"
-
-
-def _motion(specimen: Specimen, number: int, world: World, errors: Errors, finer: float, kept: Path) -> Floats:
-    """Markers of a trial, where they are and where they are said to be; simulated once.
-
-    Raises:
-        Broken: if the body does not bear it.
-    """
-    path = _path(specimen, number, world, errors, finer, kept)
-    if not path.exists():
-        try:
-            found = _simulated(specimen, specimen.trials[number], number, world, errors, finer)
-        except Broken:
-            found = np.zeros(0)
-        keep(path, found)
-    found = np.load(path, allow_pickle=False)
-    if not found.size:
-        raise Broken(f"{specimen.name}, trial {specimen.trials[number].name}")
-    return found
-
-
-def _simulated(specimen: Specimen, trial: Trial, number: int, world: World, errors: Errors, finer: float) -> Floats:
-    mesh = mesh_for(specimen.name, finer)
-    duration = specimen.setup["duration"]
-    tables = {**specimen.setup, **trial.tables}
-    times = {"started": number * duration, "lasting": len(specimen.trials) * duration}
-    case = case_of(tables, mesh, trial.pressure, **times)
-    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-    nodes, shapes = mesh.interpolation(np.concatenate([points + np.asarray(errors.places), points]))
-    return March(case, world).run(instants(specimen, errors, trial.name)[1], nodes, shapes)
-
-
 def unsure(specimen: Specimen, times: dict[int, Floats], finer: float, kept: Path) -> list[list[Floats]]:
     """What each trial changes by if the modulus is 5 % higher, and, with a chamber, the pressure 3 %."""
     plain, *others = _expected(specimen)
@@ -196,12 +100,11 @@ def make(plan: Plan, seed: list[int], out: Path, finer: float = 1.0) -> dict[str
     rng = np.random.default_rng(seed)
     specimen = SPECIMENS[plan.specimen]()
     started = time.perf_counter()
-    number = range(len(specimen.trials))
     for draw in draws(plan, specimen, rng):
         errors, bare, drawn = draw.errors, draw.bare, draw.effects
         try:
-            motions = [[_motion(specimen, i, w, errors, finer, out / MOTIONS) for i in number] for w in draw.worlds]
-            runs, plain = motions[0], motions[-1]
+            moved = [[m.markers() for m in world] for world in motions_of(plan, draw, finer, out / MOTIONS)]
+            runs, plain = moved[0], moved[-1]
             break
         except Broken:
             continue
@@ -277,8 +180,8 @@ def _work(job: Job) -> str:
     part = target.with_suffix(".part")
     part.write_text(json.dumps(truth, indent=1))
     part.rename(target)
-    for path, *_ in _motions((plan, seed, out, finer)):
-        path.unlink(missing_ok=True)
+    for motion in needed(job):
+        motion.path.unlink(missing_ok=True)
     return f"{plan.name} done in {truth['seconds']:.0f} s"
 
 
@@ -288,27 +191,10 @@ def _simulate(job: tuple[str, int, World, float, Path]) -> str:
     return f"{name}: motion {number} as believed"
 
 
-def _motions(job: Job) -> list[tuple[Path, str, int, World, Errors, float]]:
-    """Motions of the draw that a case is as far as is known, and of those before it that are broken."""
-    plan, seed, out, finer = job
-    specimen, found = SPECIMENS[plan.specimen](), []
-    for draw in draws(plan, specimen, np.random.default_rng(seed)):
-        mine = []
-        for world in draw.worlds:
-            for i in range(len(specimen.trials)):
-                path = _path(specimen, i, world, draw.errors, finer, out / MOTIONS)
-                mine.append((path, plan.specimen, i, world, draw.errors, finer))
-        found += mine
-        if not any(path.exists() and not np.load(path, allow_pickle=False).size for path, *_ in mine):
-            break
-    return found
-
-
-def _one(motion: tuple[Path, str, int, World, Errors, float]) -> str:
-    path, name, number, world, errors, finer = motion
+def _one(motion: Motion) -> str:
     with contextlib.suppress(Broken):
-        _motion(SPECIMENS[name](), number, world, errors, finer, path.parent)
-    return f"{name}: motion {number}"
+        motion.markers()
+    return f"{motion.body}: motion {motion.number}"
 
 
 class _Here(Executor):
@@ -321,11 +207,11 @@ class _Here(Executor):
 
 
 def _made(
-    pool: Executor, processes: int, expected: Sequence[tuple[str, int, World, float, Path]], jobs: Sequence[Job]
+    pool: Executor, processes: int, believed: Sequence[tuple[str, int, World, float, Path]], jobs: Sequence[Job]
 ) -> Iterator[str]:
     """Make what is believed, all motions, and each case as soon as its own are there; tells what is done."""
-    todo: deque[tuple[int, Callable[..., str], Any]] = deque((-1, _simulate, one) for one in expected)
-    first = [[m for m in _motions(job) if not m[0].exists()] for job in jobs]
+    todo: deque[tuple[int, Callable[..., str], Any]] = deque((-1, _simulate, one) for one in believed)
+    first = [[m for m in needed(job) if not m.path.exists()] for job in jobs]
     todo += [(k, _one, m) for k, motions in enumerate(first) for m in motions]
     count, simulated, every = [len(motions) for motions in first], 0, sum(map(len, first))
     todo.extendleft((k, _work, jobs[k]) for k, motions in enumerate(first) if not motions)
@@ -344,7 +230,7 @@ def _made(
             count[k] -= 1
             if not count[k]:
                 # A draw that turns out broken is followed by another.
-                more = [m for m in _motions(jobs[k]) if not m[0].exists()]
+                more = [m for m in needed(jobs[k]) if not m.path.exists()]
                 count[k], every = len(more), every + len(more)
                 todo.extendleft([(k, _one, m) for m in more] or [(k, _work, jobs[k])])
 
@@ -391,6 +277,7 @@ def seal(
     seed_from_os: bool = False,
     only: tuple[Body, ...] = (),
     processes: int = 2,
+    gpu: bool = False,
     finer: float = 1.0,
     finish: bool = False,
 ) -> str:
@@ -409,6 +296,8 @@ def seal(
         only: Make the cases of these bodies now and leave the others to a later call, on another machine for
             instance, to which ``sealed/seed.json`` is copied: a case hangs on the seed and its number alone.
         processes: That work side by side.
+        gpu: Make motions on a GPU first, hundreds at once; processes make the others. They are the same to rounding,
+            and, where a body meets a plane, to what rounding grows to.
         finer: Divides the elements' edge; below 1 for a quick look.
         finish: Make no more cases, write the truth of those that are there.
 
@@ -439,12 +328,14 @@ def seal(
     # What lasts longest is begun first, so that no process is left alone with it.
     slow = sorted({job[0].specimen for job in jobs}, key=lambda name: -_lasting(name, finer))
     jobs.sort(key=lambda job: slow.index(job[0].specimen))
-    expected = [
+    believed = [
         (name, i, world, finer, out / BELIEVED)
         for name in slow for i in range(len(SPECIMENS[name]().trials)) for world in _expected(SPECIMENS[name]())
     ]  # fmt: skip
+    for line in by_gpu(believed, jobs) if gpu else ():
+        print(line, flush=True)
     with _Here() if processes == 1 else ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        for line in _made(pool, processes, expected, jobs):
+        for line in _made(pool, processes, believed, jobs):
             print(line, flush=True)
     if left:
         print(f"{left} cases of other bodies are left to be made; the truth is sealed when all are there")
