@@ -29,7 +29,7 @@ _real = ti.f64
 
 def start(*, gpu: bool) -> None:
     """Prepare Taichi, once in a process."""
-    options = {"device_memory_fraction": 0.5} if gpu else {"cpu_max_num_threads": 1}
+    options = {"device_memory_GB": 8} if gpu else {"cpu_max_num_threads": 1}
     ti.init(arch=ti.cuda if gpu else ti.cpu, default_fp=_real, log_level=ti.WARN, **options)
 
 
