@@ -29,8 +29,8 @@ torch.set_num_threads(1)  # the tensors are small: threads cost more than they g
 RECIPES = Path(__file__).parents[1] / "recipes"
 sys.path += [str(RECIPES), str(RECIPES / "validate"), str(RECIPES / "baselines")]
 
-hypothesis.settings.register_profile("torchsoro", max_examples=25, deadline=None, derandomize=True, database=None)
-hypothesis.settings.load_profile("torchsoro")
+hypothesis.settings.register_profile("slow", max_examples=25, deadline=None, derandomize=True, database=None)
+hypothesis.settings.register_profile("quick", hypothesis.settings.get_profile("slow"), max_examples=8)
 
 
 def _whole(config: pytest.Config) -> bool:
@@ -40,7 +40,8 @@ def _whole(config: pytest.Config) -> bool:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Judge the coverage of the whole suite only, not that of a chosen file or test."""
+    """Draw more examples with ``--slow``; judge the coverage of the whole suite only, not that of some of it."""
+    hypothesis.settings.load_profile("slow" if config.option.slow else "quick")
     coverage = config.pluginmanager.get_plugin("_cov")
     if coverage is not None and not _whole(config):
         coverage.options.cov_fail_under = 0

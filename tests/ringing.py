@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def bar(folder: Path):
     found, loud = two_trials(folder)
     twin = Twin(found.setup, edge=EDGE, across=2)
 
-    def record(name: str | None, values=(), by: Twin = twin, **change) -> Experiment:
+    def simulated(name: str | None, values=(), by: Twin = twin, **change) -> Experiment:
         rng, trials = np.random.default_rng(1), []
         for k, trial in enumerate((found.trials[0], loud)):
             trial = dataclasses.replace(trial, setup=dataclasses.replace(trial.setup, **change))
@@ -69,6 +70,11 @@ def bar(folder: Path):
             place[7, 0] = np.nan
             trials.append(dataclasses.replace(trial, recording=Recording(time=trial.recording.time, position=place)))
         return dataclasses.replace(found, trials=tuple(trials))
+
+    own = functools.cache(simulated)
+
+    def record(name: str | None, values=(), **how) -> Experiment:
+        return simulated(name, values, **how) if how else own(name, values)
 
     return twin, record
 
