@@ -234,7 +234,6 @@ def test_drawn_settings_start_a_run_or_are_refused_without_a_file(recipe, words,
     check_outcome(ended, folder, set())
 
 
-@hypothesis.settings(max_examples=30)
 @hypothesis.given(words=flags(["cycles", "settle", "frames", "device", "void"], {"void": 0}))
 def test_drawn_options_replay_a_robot_or_are_refused_without_a_file(words, recipes, finished, tmp_path_factory):
     folder = tmp_path_factory.mktemp("drawn")
@@ -242,7 +241,6 @@ def test_drawn_options_replay_a_robot_or_are_refused_without_a_file(words, recip
     check_outcome(ended, folder, set())
 
 
-@hypothesis.settings(max_examples=20)
 @hypothesis.given(words=flags(["only", "iterations", "device"], {"only": 2, "iterations": 2}))
 def test_drawn_options_compare_a_robot_or_are_refused_without_a_file(words, recipes, finished, tmp_path_factory):
     folder = tmp_path_factory.mktemp("drawn")

@@ -108,13 +108,20 @@ def test_times_of_a_film_at_another_speed_are_told_with_the_factor(swinging, rat
     assert f"times are {words} than seconds" in found
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1e2, "mbar"), (1e3, "kPa"), (1e5, "bar")])
-def test_a_pressure_in_another_unit_is_told_by_name(tmp_path, factor, unit):
-    twin, trial = made(tmp_path, SETUP.replace("duration = 0.5", "duration = 0.5\ngravity = [0, 0, 0]", 1) + CHAMBER,
-                       pressure=4e3)  # fmt: skip
+@pytest.fixture(scope="module")
+def inflated(tmp_path_factory) -> tuple[Twin, Trial]:
+    setup = SETUP.replace("duration = 0.5", "duration = 0.5\ngravity = [0, 0, 0]", 1) + CHAMBER
+    return made(tmp_path_factory.mktemp("inflated"), setup, pressure=4e3)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(1, ""), (1e2, "mbar"), (1e3, "kPa"), (1e5, "bar")])
+def test_a_pressure_in_another_unit_is_told_by_name(inflated, factor, unit):
+    twin, trial = inflated
     assert trial.pressure is not None
     wrong = Waveform(time=trial.pressure.time, pressure=trial.pressure.pressure / factor)
-    assert not told(twin, trial)
+    if not unit:
+        assert not told(twin, trial)
+        return
     (found,) = told(twin, dataclasses.replace(trial, pressure=wrong))
     assert f"the pressure is in {unit}" in found and "in Pa in pressure.csv" in found
 

@@ -119,10 +119,18 @@ def test_a_model_without_a_finer_twin_has_the_error_that_its_problem_states(weig
     assert not model.numerics.draws
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def on_a_plane(made):
     twin, record = made
     return FitProblem(onto_a_floor(record(None)), twin, fine=Twin(twin.setup, edge=0.6 * twin.edge, across=5))
+
+
+@pytest.fixture(scope="module")
+def lying(on_a_plane):
+    """Its fit without an effect, at the setup as stated."""
+    (fit,) = on_a_plane.fit([((), None)], rounds=0)
+    assert fit is not None
+    return fit
 
 
 def test_a_body_that_meets_a_plane_is_searched_by_the_finer_twin_however_noisy_its_recording(on_a_plane):
@@ -143,11 +151,9 @@ def with_planes_moved(problem, fit):
     return motions
 
 
-def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(on_a_plane):
-    problem = on_a_plane
+def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are_moved(on_a_plane, lying):
+    problem, fit = on_a_plane, lying
     assert problem.rough  # as long as nobody has moved its planes
-    fit = problem.fit([((), None)], rounds=0)[0]
-    assert fit is not None
     (model,) = near(problem, [fit], closely=True)
     assert model is not None
     motions = with_planes_moved(problem, fit)
@@ -158,6 +164,7 @@ def test_what_leads_of_a_body_on_a_plane_is_told_by_finer_twins_whose_planes_are
     assert len(model.numerics.draws) == len(GAPS) + 1  # and that of the cells
 
 
+@pytest.mark.slow
 def test_where_chance_is_small_planes_are_moved_at_the_setup_as_stated_alone(on_a_plane, monkeypatch):
     monkeypatch.setattr(likelihood, "SECANT", likelihood.STEP)  # the same difference quotients for both
     problem = on_a_plane
@@ -238,7 +245,7 @@ def test_a_twin_between_two_has_cells_between_theirs(weighed):
     assert problem.twin.count < middle.count < problem.fine.count
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def sliding(made):
     """A bar that slides on a floor whose coefficient of friction is 5 % above what is stated."""
     twin, record = made
@@ -261,7 +268,7 @@ def test_a_coefficient_of_friction_within_its_tolerance_is_a_belief(sliding):
     assert model_of(sliding, (friction,)).released == (1,)  # beside the modulus; the belief is held
 
 
-@pytest.mark.parametrize("named", [False, True])
+@pytest.mark.parametrize("named", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_friction_that_differs_from_trial_to_trial_is_an_error_of_the_twin(sliding, named):
     """Whether friction is a belief or an effect, beside which the belief is held."""
     effects = tuple(e for e in library() if named and isinstance(e, Friction))
@@ -336,12 +343,11 @@ def test_cells_that_are_as_good_count_where_bodies_touch(on_a_plane):
     assert other.numerics.size > one.numerics.size
 
 
-def test_the_difference_to_larger_cells_counts_where_walls_are_two_of_these_wide(on_a_plane):
+def test_the_difference_to_larger_cells_counts_where_walls_are_two_of_these_wide(on_a_plane, lying):
     known = measure(on_a_plane.experiment, on_a_plane.twin, on_a_plane.fine)
-    (fit,) = on_a_plane.fit([((), None)], rounds=0)
-    assert fit is not None
     (one,), (other,) = (
-        near(on_a_plane.only(on_a_plane.trials, discretization=known.replace(walls=w)), [fit]) for w in ((1, 2), (2, 4))
+        near(on_a_plane.only(on_a_plane.trials, discretization=known.replace(walls=w)), [lying])
+        for w in ((1, 2), (2, 4))
     )
     assert one is not None
     assert other is not None

@@ -22,6 +22,7 @@ G = 9.81
 DOWN = (0.0, 0.0, -G)
 N = layout.CHAIN_BEADS
 ENGINES = [{}, {"lanes": False}]
+one_at_once = pytest.mark.parametrize("engine", [{}, pytest.param({"lanes": False}, marks=pytest.mark.slow)])
 
 
 def hung(lattice, body, **changes) -> Chain:
@@ -57,7 +58,7 @@ def test_a_long_chain_hangs_in_a_catenary():
     assert float(-along[2]) == pytest.approx(0.01 * N / 2, rel=1e-4)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@one_at_once
 def test_a_rigid_body_bobs_on_a_light_chain(engine):
     lattice, body = bar()
     mass = float(body.mass.sum())
@@ -81,7 +82,7 @@ def test_a_slack_chain_does_not_push_and_catches():
     assert float(fallen.max()) == pytest.approx(slack + deepest + math.sqrt(deepest**2 + 2 * deepest * slack), rel=0.02)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@one_at_once
 def test_heavy_beads_swing_with_the_body(engine):
     # A taut row of beads under the support, with the body as its last mass: linear, so that its modes are known.
     lattice, body = bar()

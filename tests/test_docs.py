@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import re
@@ -131,8 +133,16 @@ def options_of(script: str) -> str:
     return "\n".join(p.read_text(encoding="utf-8") for p in [path, *beside, *more])
 
 
+@cache
+def flags_of(command: str) -> set[str]:
+    """Flags in the help of a command."""
+    with contextlib.redirect_stdout(io.StringIO()) as told, pytest.raises(SystemExit):
+        cli.main([command, "--help"])
+    return set(re.findall(r"--[\w-]+", told.getvalue()))
+
+
 @pytest.mark.parametrize("name", NAMES)
-def test_every_command_is_a_recipe_that_knows_its_flags(name, capsys, monkeypatch):
+def test_every_command_is_a_recipe_that_knows_its_flags(name, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["torchsoro"])
     for words in commands(ROOT / name):
         flags = {re.sub(r"=.*", "", w) for w in words if w.startswith("--")}
@@ -141,9 +151,7 @@ def test_every_command_is_a_recipe_that_knows_its_flags(name, capsys, monkeypatc
             known = {"--help", "--version"}
             if command:
                 assert command in cli.summaries(), f"{name}: {' '.join(words)}"
-                with pytest.raises(SystemExit):
-                    cli.main([command, "--help"])
-                known |= set(re.findall(r"--[\w-]+", capsys.readouterr().out))
+                known |= flags_of(command)
             assert flags <= known, f"{name}: {' '.join(words)}: {flags - known}"
         else:
             assert (ROOT / words[1]).exists(), f"{name}: {words[1]}"

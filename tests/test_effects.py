@@ -19,17 +19,23 @@ from torchsoro.simulation.actuation import Waveform
 from torchsoro.simulation.loads import Chain, Force
 
 
-def supplied(made, pressure):
-    """A scenario whose supply is linear between pressures [S] Pa over its duration."""
+@pytest.fixture(scope="module")
+def bar(made):
+    """A twin and its scenario of the first trial."""
     twin, record = made
-    scenario = twin.scenario(record(None).trials[0])
+    return twin, twin.scenario(record(None).trials[0])
+
+
+def supplied(bar, pressure):
+    """A scenario whose supply is linear between pressures [S] Pa over its duration."""
+    twin, scenario = bar
     time = torch.linspace(0.0, scenario.duration, len(pressure), dtype=torch.float64)
     return twin, scenario.replace(pressure=Waveform(time=time, pressure=torch.tensor(pressure, dtype=torch.float64)))
 
 
 @given(share=st.floats(0.0, 0.9), pressure=st.floats(100.0, 1e5), sign=st.sampled_from((1.0, -1.0)))
-def test_an_orifice_takes_its_share_of_the_highest_steady_pressure_and_less_of_a_lower_one(made, share, pressure, sign):
-    twin, scenario = supplied(made, [sign * 0.25 * pressure, sign * pressure, sign * pressure])
+def test_an_orifice_takes_its_share_of_the_highest_steady_pressure_and_less_of_a_lower_one(bar, share, pressure, sign):
+    twin, scenario = supplied(bar, [sign * 0.25 * pressure, sign * pressure, sign * pressure])
     found = OrificeLeak()(scenario, torch.tensor([[share, 0.0]], dtype=torch.float64), twin).pressure.pressure[0, 0]
     assert float(found[-1]) == pytest.approx(sign * pressure * (1 - share), rel=1e-9)
     # q^2 + b q = 1/4 with b = a / sqrt(1 - a), q^2 being the pressure over the highest.
@@ -45,9 +51,9 @@ def test_an_orifice_takes_its_share_of_the_highest_steady_pressure_and_less_of_a
     part=st.floats(0.01, 1.0),
     sign=st.sampled_from((1.0, -1.0)),
 )
-def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_one(made, share, evenness, part, sign):
+def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_one(bar, share, evenness, part, sign):
     highest = 1e4
-    twin, scenario = supplied(made, [sign * part * highest, sign * highest, 0.0])
+    twin, scenario = supplied(bar, [sign * part * highest, sign * highest, 0.0])
     values = torch.tensor([[share, evenness], [0.0, evenness]], dtype=torch.float64)
     found = ThrottledLoss()(scenario, values, twin).pressure.pressure[:, 0]
     assert float(found[0, 1]) == pytest.approx(sign * highest * (1 - share), rel=1e-9)
@@ -62,9 +68,9 @@ def test_a_throttle_takes_its_share_of_the_highest_pressure_and_less_of_a_lower_
 
 @pytest.mark.slow
 @given(part=st.floats(0.05, 1.0), share=st.floats(0.05, 0.8))
-def test_a_throttle_and_a_hole_are_the_same_in_a_trial_at_a_lower_pressure(made, part, share):
+def test_a_throttle_and_a_hole_are_the_same_in_a_trial_at_a_lower_pressure(bar, part, share):
     highest = 2e4
-    twin, scenario = supplied(made, [part * highest] * 3)
+    twin, scenario = supplied(bar, [part * highest] * 3)
     twin = dataclasses.replace(twin, highest=highest)
     values = torch.tensor([[share, -1.0]], dtype=torch.float64)
     p = float(ThrottledLoss()(scenario, values, twin).pressure.pressure[0, 0, -1])
@@ -76,8 +82,8 @@ def test_a_throttle_and_a_hole_are_the_same_in_a_trial_at_a_lower_pressure(made,
     assert p <= (1 - share) * part * highest * (1 + 1e-12)
 
 
-def test_an_orifice_without_a_hole_is_a_lag(made):
-    twin, scenario = supplied(made, [0.0, 1e4, 1e4, 1e4])
+def test_an_orifice_without_a_hole_is_a_lag(bar):
+    twin, scenario = supplied(bar, [0.0, 1e4, 1e4, 1e4])
     values = torch.tensor([[0.0, 0.02]], dtype=torch.float64)
     leak, lag = OrificeLeak()(scenario, values, twin), PressureLag()(scenario, values[:, 1:], twin)
     # Implicit steps of half a millisecond are late by half of that: 1.25 % of the time constant.
@@ -86,9 +92,8 @@ def test_an_orifice_without_a_hole_is_a_lag(made):
     assert simple.name == "pressure_lag" and simple.values == [0.02] and not simple.ln_pressure
 
 
-def test_a_bend_deflects_the_free_end_and_keeps_cross_sections_plane_and_normal(made):
-    twin, record = made
-    scenario = twin.scenario(record(None).trials[0])
+def test_a_bend_deflects_the_free_end_and_keeps_cross_sections_plane_and_normal(bar):
+    twin, scenario = bar
     (axis, side), s = twin.faces[0], twin.setup
     first, second = (a for a in range(3) if a != axis)
     off = 1e-3
@@ -112,9 +117,8 @@ def test_only_a_body_that_is_clamped_at_one_face_is_let_go_from_a_bend(made):
     assert not InitialPose().applies(scenario, free)
 
 
-def test_a_taut_tube_pulls_each_variation_at_its_own_place(made):
-    twin, record = made
-    scenario = twin.scenario(record(None).trials[0])
+def test_a_taut_tube_pulls_each_variation_at_its_own_place(bar):
+    twin, scenario = bar
     places = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0], [0.0, 0.0, 0.0]]) * torch.tensor(twin.setup.size)
     places = places.double() + torch.tensor(twin.setup.origin, dtype=torch.float64)
     pulls = torch.tensor([[0.0, 0.03, 0.04], [0.02, 0.0, 0.0], [0.0, 0.0, -0.01]], dtype=torch.float64)
@@ -127,9 +131,8 @@ def test_a_taut_tube_pulls_each_variation_at_its_own_place(made):
     assert TautTether().reported(np.array([0.0, 0.03, 0.04]), scenario, twin)["pull_n"] == (pytest.approx(0.05), "N")
 
 
-def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
-    twin, record = made
-    scenario = twin.scenario(record(None).trials[0])
+def test_a_load_turns_into_a_mass_beside_a_taut_tube(bar):
+    twin, scenario = bar
     assert not LoadInertia().applies(scenario, twin)
     weight = Force(share=torch.eye(twin.nodes, dtype=torch.float64)[0], value=0.1 * scenario.gravity)
     pulled = TautTether()(scenario.plus(weight), torch.tensor([[0.01, 0.02, 0.0, 0.0, 0.0, 0.0]] * 2).double(), twin)
@@ -142,14 +145,13 @@ def test_a_load_turns_into_a_mass_beside_a_taut_tube(made):
 
 
 @pytest.mark.parametrize("effect", [ThrottledLoss(), OrificeLeak()])
-def test_a_share_of_the_pressure_that_is_lost_lies_between_nothing_and_all_of_it(effect, made):
-    twin, scenario = supplied(made, [0.0, 1e4])
+def test_a_share_of_the_pressure_that_is_lost_lies_between_nothing_and_all_of_it(effect, bar):
+    twin, scenario = supplied(bar, [0.0, 1e4])
     assert _limits(effect, "fraction", scenario, twin) == (0.0, 1.0)
 
 
-def test_a_tube_between_level_ends_hangs_half_its_weight_on_the_body_and_a_taut_one_is_as_stiff_as_it_is(made):
-    twin, record = made
-    scenario = twin.scenario(record(None).trials[0])
+def test_a_tube_between_level_ends_hangs_half_its_weight_on_the_body_and_a_taut_one_is_as_stiff_as_it_is(bar):
+    twin, scenario = bar
     down = scenario.gravity.reshape(-1, 3)[0]
     level = np.cross(down.numpy() / down.norm().item(), [1.0, 0.3, 0.2])
     level *= 0.08 / np.linalg.norm(level)

@@ -227,6 +227,7 @@ def test_prior_residual_is_small_within_the_tolerance_and_large_beyond(made):
     assert not problem.prior_residual(np.array([3.0]), np.array([True]))[0].any()
 
 
+@pytest.mark.slow
 def test_a_verdict_names_the_effect_or_nothing(made):
     twin, record = made
     effects = [effect(name) for name in ("modulus", "drag", "gravity_tilt")]

@@ -429,7 +429,9 @@ def mutations(draw) -> tuple[str, bytes]:
     return name, found[:cut]
 
 
-@hypothesis.settings(max_examples=150, suppress_health_check=list(hypothesis.HealthCheck))
+@hypothesis.settings(
+    max_examples=6 * hypothesis.settings.default.max_examples, suppress_health_check=list(hypothesis.HealthCheck)
+)
 @hypothesis.given(
     mutation=mutations(),
     options=st.fixed_dictionaries(

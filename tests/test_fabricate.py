@@ -39,7 +39,7 @@ def is_closed(part: Part) -> bool:
     return len(forward) == len(edges) and all((b, a) in forward for a, b in forward)
 
 
-@pytest.mark.parametrize("n", [12, 16, 24])
+@pytest.mark.parametrize("n", [12, 16, pytest.param(24, marks=pytest.mark.slow)])
 def test_solid_cube_with_cavity(n: int) -> None:
     """Volume, mass, outer size and the wall (one lattice layer on no design material is tested below)."""
     layers = {12: 1, 16: 2, 24: 1}[n]
@@ -59,7 +59,7 @@ def test_solid_cube_with_cavity(n: int) -> None:
     assert is_closed(part)
 
 
-@pytest.mark.parametrize("n", [12, 16, 40])
+@pytest.mark.parametrize("n", [12, 16, pytest.param(40, marks=pytest.mark.slow)])
 def test_wall_one_layer_thick_survives(n: int) -> None:
     """A bare chamber on one thick leg: the wall keeps its thickness of one spacing, coarse or fine."""
     h, outer = 0.036 / n, 2 * round(n / 4) * 0.036 / n

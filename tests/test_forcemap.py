@@ -61,7 +61,13 @@ def fitted(problem):
     return null_model
 
 
-@pytest.mark.parametrize(("patch", "force"), [(2, (0.0, 0.0, 0.05)), (1, (0.0, -0.1, 0.0)), (2, (0.5, 0.0, 0.0))])
+@pytest.mark.parametrize(
+    ("patch", "force"),
+    [
+        (2, (0.0, 0.0, 0.05)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((1, (0.0, -0.1, 0.0)), (2, (0.5, 0.0, 0.0)))),
+    ],
+)
 def test_a_planted_force_is_found(made, patch, force):
     problem = made(patch, force)
     found = force_map(problem, fitted(problem), count=COUNT)

@@ -443,7 +443,7 @@ def test_adjoint_of_the_contact_response_equals_central_differences(stick, frict
         torch.testing.assert_close(numeric, by[:, 1], rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("features", "shape"), [(0, 0), (1023, 1)])
+@pytest.mark.parametrize(("features", "shape"), [pytest.param(0, 0, marks=pytest.mark.slow), (1023, 1)])
 @pytest.mark.parametrize("march", [total.total_march, total_adjoint.total_march_adjoint], ids=["forward", "adjoint"])
 def test_marches_of_a_gpu_are_understood_by_taichi_without_one(march, features, shape, monkeypatch):
     """They are translated, though no code of a GPU is generated."""

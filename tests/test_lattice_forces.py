@@ -59,22 +59,20 @@ def filled(shape: layout.Shape) -> Lattice:
     )
 
 
-ENGINES = [pytest.param(True, id="lanes"), pytest.param(False, id="taichi")]
-engines = pytest.mark.parametrize("lanes", ENGINES)
-# Below both are compared to 1e-12: where the gradients of one are right, those of the other are.
-one_at_once = pytest.mark.parametrize("lanes", [ENGINES[0], pytest.param(False, id="taichi", marks=pytest.mark.slow)])
+# Below both engines are compared to 1e-12: where one is right, the other is.
+one_at_once = pytest.mark.parametrize(
+    "lanes", [pytest.param(True, id="lanes"), pytest.param(False, id="taichi", marks=pytest.mark.slow)]
+)
 
 
 @one_at_once
-@pytest.mark.parametrize("name", TENSORS)
-def test_gradcheck_by_every_tensor_with_open_knots_and_creases(name, lanes):
-    assert check(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes), name)
+def test_gradcheck_by_every_tensor_with_open_knots_and_creases(lanes):
+    assert check(problem(formulation="total", lattice=uneven(), batch=2, lanes=lanes), *TENSORS)
 
 
 @one_at_once
-@pytest.mark.parametrize("name", [*TENSORS, *MORE])
-def test_gradcheck_with_all_that_a_body_may_have(name, lanes):
-    assert check(completed(problem(formulation="total", lattice=hollow(), batch=2, lanes=lanes)), name)
+def test_gradcheck_with_all_that_a_body_may_have(lanes):
+    assert check(completed(problem(formulation="total", lattice=hollow(), batch=2, lanes=lanes)), *TENSORS, *MORE)
 
 
 def test_slopes_with_all_that_a_body_may_have_agree_with_central_differences_to_1e6():
@@ -110,9 +108,8 @@ def test_gradcheck_with_all_that_a_body_may_have_where_lanes_are_cells_or_bodies
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stick", [False, True])
-@pytest.mark.parametrize("name", TENSORS)
-def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(name, stick):
-    assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), name)
+def test_gradcheck_by_every_tensor_of_the_kernels_of_a_gpu(stick):
+    assert check(problem(formulation="total", stick=stick, batch=2, lanes=False), *TENSORS)
 
 
 @pytest.mark.slow
@@ -234,7 +231,7 @@ def test_cuda_agrees_with_the_same_kernels_on_a_cpu_and_with_itself_bit_by_bit(c
         assert float((a - b).norm()) <= 1e-12 * float(a.norm())
 
 
-@engines
+@one_at_once
 def test_forces_and_pressure_are_those_of_the_energy_and_the_volume_of_the_chamber(lanes):
     # One substep from a random state against the derivatives, by torch, of what is summed over all points at once.
     p = problem(formulation="total", lattice=wide(), steps=1, samples=(), elements=0, lanes=lanes)

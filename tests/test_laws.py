@@ -88,7 +88,9 @@ def by_taichi(name: str, given: np.ndarray, results: int) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize(("dtype", "within"), [(np.float32, 1e-5), (np.float64, 1e-12)])
+@pytest.mark.parametrize(
+    ("dtype", "within"), [pytest.param(np.float32, 1e-5, marks=pytest.mark.slow), (np.float64, 1e-12)]
+)
 @pytest.mark.parametrize("name", NAMES)
 def test_taichi_lanes_and_python_agree_on_a_law(name, dtype, within):
     given = arguments(name).astype(dtype)

@@ -203,7 +203,7 @@ def contents(draw):
 
 
 @pytest.mark.slow
-@settings(max_examples=120)
+@settings(max_examples=5 * settings.default.max_examples)
 @given(content=contents(), options=options)
 def test_drawn_inputs_end_in_a_result_or_in_a_message(tmp_path_factory, content, options):
     ended = run(tmp_path_factory.getbasetemp() / "drawn", content, *options)

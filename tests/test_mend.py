@@ -62,6 +62,7 @@ def test_a_thin_plate_gets_the_wanted_thickness():
     assert mended.report.mended.volume_mm3 == pytest.approx(84, rel=0.2)
 
 
+@pytest.mark.slow
 def test_a_plate_on_the_face_of_the_box_grows_into_the_box():
     domain = Domain(size=(14 * H,) * 3, particles=(14,) * 3)
     solid = torch.zeros(14, 14, 14)
@@ -82,7 +83,7 @@ def shell() -> tuple[Domain, torch.Tensor]:
     return domain, solid
 
 
-@pytest.mark.parametrize("port", [None, AirPort(diameter=3 * H)])
+@pytest.mark.parametrize("port", [pytest.param(None, marks=pytest.mark.slow), AirPort(diameter=3 * H)])
 def test_a_thin_shell_grows_outwards_and_keeps_its_cavity_and_its_port(port):
     domain, solid = shell()
     plain, mended = made(domain, solid, 2 * H, port)
@@ -103,6 +104,7 @@ def test_a_thin_shell_grows_outwards_and_keeps_its_cavity_and_its_port(port):
             assert hits[:, 0].min() == pytest.approx(10.0, abs=half)
 
 
+@pytest.mark.slow
 def test_a_neck_between_two_blocks_becomes_a_rod_of_the_wanted_diameter():
     domain = Domain(size=(20 * H, 12 * H, 12 * H), particles=(20, 12, 12))
     solid = torch.ones(20, 12, 12)

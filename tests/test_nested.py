@@ -29,6 +29,7 @@ def dragged(tmp_path_factory):
     return problem, fit, found
 
 
+@pytest.mark.slow
 def test_likelihood_at_the_best_point_is_that_of_the_linear_model(dragged):
     problem, fit, found = dragged
     data, count = data_of(problem), len(fit.point)

@@ -79,7 +79,6 @@ def refusal(folder: Path, recording: Recording) -> str:
 # Sound data ---------------------------------------------------------------------------------------------------------
 
 
-@hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(
     seed=st.integers(0, 10**6), rate=st.sampled_from([30.0, 100.0, 1000.0]), digits=st.sampled_from([3, 4, 6])
 )
@@ -109,7 +108,6 @@ def test_a_body_that_bounces_at_a_coarse_rate_gives_no_finding(folder):
     assert not findings(folder, Recording(time=time, position=drop(swing().position)))
 
 
-@hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10**6), turn=st.tuples(*[st.floats(-0.35, 0.35)] * 3))
 def test_a_body_that_begins_tilted_gives_no_finding(folder, seed, turn):
     middle = np.array([0.04, 0.01, 0.012])
@@ -124,7 +122,6 @@ def test_a_body_that_begins_tilted_gives_no_finding(folder, seed, turn):
 # The frame ----------------------------------------------------------------------------------------------------------
 
 
-@hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10**6), axis=st.integers(0, 2), shift=st.sampled_from([0.0, 0.3, -0.7]))
 def test_a_mirrored_axis_is_refused_by_name_whatever_the_origin(folder, seed, axis, shift):
     def mirror(x):
@@ -134,7 +131,6 @@ def test_a_mirrored_axis_is_refused_by_name_whatever_the_origin(folder, seed, ax
     assert f"{'xyz'[axis]} mirrored" in refusal(folder, changed(swing(seed), mirror))
 
 
-@hypothesis.settings(max_examples=15, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10**6), pair=st.sampled_from([(0, 1), (0, 2), (1, 2)]))
 def test_swapped_axes_are_refused_by_name(folder, seed, pair):
     order = [0, 1, 2]
@@ -170,7 +166,6 @@ def test_displacements_in_millimetres_added_to_places_in_metres_are_refused(fold
         write(folder, a=changed(swing(), lambda x: x[:1] + 1e3 * (x - x[:1])))
 
 
-@hypothesis.settings(max_examples=15, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10**6), pair=st.sampled_from([(0, 1), (0, 2), (1, 3), (2, 3)]))
 def test_columns_of_two_exchanged_markers_are_put_right_and_named(folder, seed, pair):
     right = write(folder, a=swing(seed))
@@ -238,7 +233,6 @@ def places(trial: Trial) -> np.ndarray:
 # Samples ------------------------------------------------------------------------------------------------------------
 
 
-@hypothesis.settings(max_examples=25, deadline=None)
 @hypothesis.given(
     seed=st.integers(0, 10**6), row=st.integers(2, 97), number=st.integers(0, 3), far=st.floats(0.03, 0.2)
 )
@@ -253,7 +247,6 @@ def test_a_jump_of_one_sample_counts_as_lost_and_is_named(folder, seed, row, num
     assert np.argwhere(lost).tolist() == [[row, number]]
 
 
-@hypothesis.settings(max_examples=15, deadline=None)
 @hypothesis.given(seed=st.integers(0, 10**6), first=st.integers(8, 40), lasts=st.integers(12, 60))
 def test_markers_that_change_places_for_a_while_are_put_back(folder, seed, first, lasts):
     def exchange(x):

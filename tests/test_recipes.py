@@ -143,7 +143,7 @@ def test_the_movie_plays_and_the_summary_is_a_page(straight):
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(recipes, straight, tmp_path):
-    recipes["walker"].main(tiny(tmp_path / "run", iterations=1))
+    loop.optimize(walker(tiny(tmp_path / "run", iterations=1)))
     again = recipes["walker"].main(tiny(tmp_path / "run", resume=True, picture_every=1, frames=2))
     assert_same_run(tmp_path / "run", straight[0])
     seconds = ("forward", "backward", "seconds")
@@ -369,7 +369,7 @@ class Overflowing(torch.autograd.Function):
         return math.inf * grads[0]
 
 
-@pytest.mark.parametrize("often, begin", [(1, 0.0), (99, 0.0), (99, 0.5)])
+@pytest.mark.parametrize("often, begin", [(1, 0.0), (99, 0.0), pytest.param(99, 0.5, marks=pytest.mark.slow)])
 def test_a_gradient_that_overflows_changes_no_design_and_ends_the_run_only_if_it_does_so_again_and_again(
     recipes, tmp_path, monkeypatch, often, begin
 ):
@@ -448,7 +448,7 @@ def test_without_a_design_within_the_limit_the_one_with_the_least_loss_is_delive
 
 
 def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
-    settings = tiny(tmp_path / "run", c_max=0.249)  # which every design but the first keeps
+    settings = tiny(tmp_path / "run", c_max=0.249, iterations=2, frames=2)  # which every design but the first keeps
     result = recipes["walker"].main(settings)
     with (tmp_path / "run" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))

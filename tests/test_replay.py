@@ -123,7 +123,6 @@ def test_an_unfinished_run_is_not_kept(replay, tmp_path):
 COMMITTED = sorted(path.parent for path in DESIGNS.glob("*/design.npz")) or [
     pytest.param(None, marks=pytest.mark.skip(reason="there are no designs in torchsoro/designs"))
 ]
-MENDED = ("robust", "turner", "two_chambers")  # whose walls are mended anew: up to a minute
 
 
 def named(folder: Any) -> str:
@@ -149,7 +148,7 @@ def test_an_archived_robot_is_small_and_within_its_limit(folder):
 
 @pytest.mark.parametrize(
     "folder",
-    [pytest.param(f, marks=pytest.mark.slow) if named(f) in MENDED else f for f in COMMITTED],
+    [f if named(f) in ("walker", "none") else pytest.param(f, marks=pytest.mark.slow) for f in COMMITTED],
     ids=named,
 )
 def test_an_archived_robot_can_be_printed(folder):

@@ -54,6 +54,14 @@ def shown(dragged):
     return trial, before, after, worst, body_motion(problem, fit, trial, after.clock, worst)
 
 
+@pytest.fixture(scope="module")
+def judged(dragged):
+    """What is said of them, and their fit without an effect."""
+    problem, fit = dragged
+    (null_model,) = problem.fit([((), None)], rounds=2)
+    return weighed(problem, [effect("drag")], null_model, [fit], report=lambda line: None), null_model
+
+
 def test_the_marked_moment_has_the_largest_distance_of_all_markers(shown):
     trial, before, after, worst, _ = shown
     apart = distances(trial, before.seen)
@@ -207,11 +215,10 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
         "explained",
     ],
 )
-def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, shown, kind, tmp_path):
-    problem, fit = dragged
+def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, judged, shown, kind, tmp_path):
+    problem, _ = dragged
     _, _, _, worst, body = shown
-    (null_model,) = problem.fit([((), None)], rounds=2)
-    found = weighed(problem, [effect("drag")], null_model, [fit], report=lambda line: None)
+    found, null_model = judged
     small = dataclasses.replace(found.chosen[0], size=0.012 * found.conclusion.motion)
     chosen = {"cannot_distinguish": 2 * found.chosen[:1], "explained": (small,)}.get(kind, ())
     named = bool(chosen)

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from problems import H, block, momenta, simulator, vector
 from tiny import TINY
@@ -24,7 +24,10 @@ from torchsoro.simulation.selfcontact import overlapping
 from torchsoro.simulation.stability import stable_step
 from torchsoro.simulation.threads import threads_here
 
-ENGINES = pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "taichi"])
+# That both engines agree is tested below.
+one_at_once = pytest.mark.parametrize(
+    "lanes", [pytest.param(True, id="lanes"), pytest.param(False, id="taichi", marks=pytest.mark.slow)]
+)
 DT = 8e-5  # s
 WEIGHTLESS = (0.0, 0.0, 0.0)
 
@@ -78,7 +81,7 @@ def watched(sim: Simulator, body: Body, steps: int, **more) -> Trajectory:
 # ------------------------------------------------------------------------------------------------------------- physics
 
 
-@pytest.mark.parametrize("lanes", [True, pytest.param(False, marks=pytest.mark.slow)], ids=["lanes", "taichi"])
+@one_at_once
 def test_limbs_that_close_do_not_pass_through_each_other(lanes):
     body = fork()
     apart, through = (watched(touching(on=on, lanes=lanes), body, 200) for on in (True, False))
@@ -105,7 +108,7 @@ def test_a_roof_that_falls_on_its_floor_comes_to_lie_on_it():
     assert 0.9 < float(nearest) < 1.5
 
 
-@ENGINES
+@one_at_once
 def test_pair_forces_keep_momentum_and_angular_momentum(lanes):
     body = dataclasses.replace(fork(), velocity=fork().velocity + vector(0.3, -0.2, 0.1))
     sims = [touching(on=on, lanes=lanes) for on in (True, False)]
@@ -118,7 +121,7 @@ def test_pair_forces_keep_momentum_and_angular_momentum(lanes):
         assert float((after - before).abs().max()) < 1e-12 * size
 
 
-@pytest.mark.parametrize("speed", [1.0, 6.0])
+@pytest.mark.parametrize("speed", [pytest.param(1.0, marks=pytest.mark.slow), 6.0])
 def test_elastic_blocks_bounce_and_keep_their_energy_at_the_largest_step(speed):
     body = blocks(speed)
     lattice = Lattice.around(body.position, 2 * H)
@@ -179,7 +182,11 @@ def test_void_repels_nothing_and_the_weaker_part_sets_the_force():
 
 
 @pytest.mark.parametrize(
-    ("lanes", "batch"), [*((True, n) for n in (1, 3, 16, 18)), pytest.param(False, 2, marks=pytest.mark.slow)]
+    ("lanes", "batch"),
+    [
+        *((True, n) for n in (1, 3, 16)),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((True, 18), (False, 2))),
+    ],
 )
 def test_gradients_are_those_of_central_differences(lanes, batch):
     g = torch.Generator().manual_seed(batch)
@@ -242,7 +249,7 @@ def test_the_gradient_of_a_design_holds_through_a_gait_in_which_limbs_meet():
 # ------------------------------------------------------------------------------------------------- the list of pairs
 
 
-@pytest.mark.parametrize("lanes", [True, False], ids=["lanes", "taichi"])
+@one_at_once
 def test_results_do_not_depend_on_when_pairs_are_listed(lanes, monkeypatch):
     body = fork()
     whole = watched(touching(lanes=lanes), body, 60)
@@ -296,7 +303,6 @@ def test_a_body_that_does_not_meet_itself_is_that_without_contact_to_the_bit():
     assert torch.equal(runs[0].position, runs[1].position)
 
 
-@settings(max_examples=30, deadline=None)
 @given(seed=st.integers(0, 10**6), width=st.floats(0.5, 8.0), shift=st.sampled_from([0.0, -20.0]))
 def test_the_cell_list_finds_what_a_search_over_all_pairs_finds(seed, width, shift):
     g = torch.Generator().manual_seed(seed)

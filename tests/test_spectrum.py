@@ -165,13 +165,13 @@ def test_relaxation_spectrum_recovered_from_creep_compliance():
     time = np.geomspace(1e-3, 1e3, 80)
     compliance = 1e-6 + ((1 - np.exp(-time[:, None] / retarded)) * compliances).sum(1)
     held = []
-    for seed in range(20):
+    for seed in range(6):
         noise = 1 + 0.01 * np.random.default_rng(seed).standard_normal(80)
         found = fit(creeping(time, compliance * noise), elements=3)
         known = (found.equilibrium_interval, *found.intervals)
         held.append([i.low <= t <= i.high for i, t in zip(known, truth, strict=True)])
         np.testing.assert_allclose([found.equilibrium, *found.moduli], truth, rtol=0.06)
-    assert np.mean(held) > 0.88
+    assert np.mean(held) > 0.88  # of 24 intervals at 95 %
     flowing = creeping(time, compliance + 1e-7 * time)
     assert fit(flowing, equilibrium=False).equilibrium == 0
     with pytest.raises(ValueError, match="as of a melt"):
@@ -179,7 +179,7 @@ def test_relaxation_spectrum_recovered_from_creep_compliance():
 
 
 # -------------------------------------------------------------------------------------------- what cannot be known
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 2))])
 def test_modulus_of_relaxation_time_below_data_window_is_unbounded(seed):
     found = fit(sweep(TABLE_S1, np.geomspace(1e-2, 1e4, 90), 0.02, seed))  # the two fastest lie beyond
     assert found.intervals[0].unknown.startswith("stands for all relaxation faster")
@@ -198,13 +198,13 @@ def test_intervals_cover_moduli_of_melt_with_one_relaxation_time_below_data_wind
         deformation="shear",
     )
     inside = []
-    for seed in range(8):
+    for seed in range(4):
         found = fit(sweep(truth, np.geomspace(1e-3, 1e3, 30), 0.02, seed), elements=4, equilibrium=False)
         assert found.intervals[0].unknown and not any(i.unknown for i in found.intervals[1:])
         for interval, modulus in zip(found.intervals[1:], truth.moduli[1:], strict=True):
             assert interval.high < 1.1 * interval.low
             inside.append(interval.low <= modulus <= interval.high)
-    assert sum(inside) >= 21  # of 24 at 95 %
+    assert sum(inside) >= 10  # of 12 at 95 %
 
 
 def test_intervals_hold_at_fixed_relaxation_times_for_serially_correlated_residuals():
@@ -242,7 +242,11 @@ def test_prony_series_of_melt_requires_given_equilibrium_modulus():
 
 
 @pytest.mark.parametrize(
-    ("window", "why"), [((1e-3, 1e4), "the data are consistent with zero"), (None, "it is still falling there")]
+    ("window", "why"),
+    [
+        pytest.param((1e-3, 1e4), "the data are consistent with zero", marks=pytest.mark.slow),
+        (None, "it is still falling there"),
+    ],
 )
 def test_equilibrium_modulus_of_critical_gel_is_undetermined(window, why):
     times = np.geomspace(1e-4, 1e6, 60)  # a critical gel: a power law far beyond the data
@@ -343,6 +347,7 @@ def test_error_norm_on_published_master_curve_below_pyvisco_with_half_its_terms(
     assert 11 < best.floor < best.error < 1.2 * best.floor  # storage and loss contradict each other by that much
 
 
+@pytest.mark.slow
 def test_plateau_modulus_of_polyisoprene_melt_is_0_3_to_0_5_mpa():
     name = "rheology-polyisoprene-tts/master_curves_reference/PI_634.5k_T-35.tts"
     data = master_curve(name, 1, 1.0, temperature=-35.0, deformation="shear")

@@ -22,12 +22,12 @@ BROKEN = SimulationDiverged(step=1, time=0.0, particle=0, quantity="F", remedy="
 
 
 def test_the_best_start_is_what_the_run_ends_with(tmp_path):
-    settings = tiny(tmp_path / "run", starts=3, c_max=0.2499)
+    settings = tiny(tmp_path / "run", starts=3, c_max=0.2499, iterations=2)
     robot = walker(settings)
     found = optimize_starts(robot)
     alone = []
     for index in range(3):
-        one = walker(tiny(tmp_path / f"alone{index}", c_max=0.2499))
+        one = walker(tiny(tmp_path / f"alone{index}", c_max=0.2499, iterations=2))
         if index:
             disturb(one.field, index)
         alone.append(optimize(one))
@@ -41,20 +41,20 @@ def test_the_best_start_is_what_the_run_ends_with(tmp_path):
 
 def test_a_run_that_starts_again_leaves_no_start_of_the_former(tmp_path):
     path = tmp_path / "run"
-    optimize_starts(walker(tiny(path, starts=3)))
+    optimize_starts(walker(tiny(path, starts=3, iterations=1)))
     for other in ("start-mine", "start-4"):  # another run, beyond the former's starts
         shutil.copytree(path / "start-1", path / other)
     with pytest.raises(ValueError, match="feature"):
         optimize_starts(walker(tiny(path, feature=5e-3, overwrite=True)))
     assert len(list(path.glob("start-*"))) == 5  # refused, so that nothing is deleted
     for count, left in ((2, {"start-1", "start-2"}), (1, set())):
-        optimize_starts(walker(tiny(path, starts=count, overwrite=True)))
+        optimize_starts(walker(tiny(path, starts=count, overwrite=True, iterations=1)))
         assert {folder.name for folder in path.glob("start-*")} == left | {"start-mine", "start-4"}
 
 
 def test_a_run_is_resumed_with_several_starts_or_one_as_it_began(tmp_path):
     for name, count, other in (("one", 1, 2), ("two", 2, 1)):
-        settings = tiny(tmp_path / name, starts=count)
+        settings = tiny(tmp_path / name, starts=count, iterations=1)
         optimize_starts(walker(settings))
         before = sorted(tmp_path.rglob("*"))
         with pytest.raises(ValueError, match=f"starts = {other}: .* holds a run of {count}, wanted that"):
@@ -63,9 +63,9 @@ def test_a_run_is_resumed_with_several_starts_or_one_as_it_began(tmp_path):
 
 
 def test_starts_one_after_the_other_end_as_side_by_side(tmp_path):
-    beside = optimize_starts(walker(tiny(tmp_path / "beside", starts=2)))
+    beside = optimize_starts(walker(tiny(tmp_path / "beside", starts=2, iterations=2)))
     with threads_here(1):
-        after = optimize_starts(walker(tiny(tmp_path / "after", starts=2)))
+        after = optimize_starts(walker(tiny(tmp_path / "after", starts=2, iterations=2)))
     assert torch.equal(beside.gamma, after.gamma)
 
 
@@ -101,7 +101,7 @@ def test_the_farthest_within_the_limit_is_taken(tmp_path, monkeypatch, judged, t
         return dataclasses.replace(found, **judged[index])
 
     monkeypatch.setattr(starts, "optimize", judge)
-    found = optimize_starts(walker(tiny(tmp_path / "run", starts=2)))
+    found = optimize_starts(walker(tiny(tmp_path / "run", starts=2, iterations=1)))
     assert torch.equal(found.gamma, dict(gammas)[taken])
 
 

@@ -56,6 +56,7 @@ def test_known_walls_and_gaps_are_found(name):
         assert gap - 0.3 * STEP <= thickness.thinnest(*across, step) <= gap + 0.02 * STEP
 
 
+@pytest.mark.slow
 def test_a_strut_counts_that_is_a_thousandth_of_the_surface():
     """The area share that was once left out, 0.1 %, would have hidden it."""
     domain = Domain(size=(0.036,) * 3, particles=(36,) * 3)

@@ -82,7 +82,7 @@ def test_a_free_vibrating_block_keeps_its_energy():
     body = replace(body, velocity=(body.position - body.position.mean(0)) @ stretch)
     lattice, sim = Lattice.around(body.position, CELL), total(dt=DT / 2)
     mass, found, final = lattice.nodal_mass(body.mass.unsqueeze(0))[0], [], None
-    for _ in range(60):
+    for _ in range(30):
         before = sim(body, duration=49 * DT / 2, gravity=FREE, start=final).final
         final = sim(body, duration=DT / 2, gravity=FREE, start=before).final
         # Of symplectic Euler, velocities are those of half a step before; so is the place in the middle.
@@ -93,7 +93,7 @@ def test_a_free_vibrating_block_keeps_its_energy():
     elastic = torch.stack(found)[:, 0] / energy
     assert float(elastic.min()) < 0.2
     assert float(elastic.max()) > 0.7
-    print(f"energy over 3,000 steps: within {float((energy / energy.mean() - 1).abs().max()):.1e}")
+    print(f"energy over 1,500 steps: within {float((energy / energy.mean() - 1).abs().max()):.1e}")
     assert float((energy / energy.mean() - 1).abs().max()) < 1e-3
 
 

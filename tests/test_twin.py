@@ -324,7 +324,7 @@ def test_a_soft_part_lacks_the_fraction_that_is_told_up_to_its_boundary(trial, b
     assert effect.place(values * [1, -1, 1, 1], twin)[1] == pytest.approx(other)
 
 
-@pytest.mark.parametrize("tilt", [0.0, 0.4])
+@pytest.mark.parametrize("tilt", [0.0, pytest.param(0.4, marks=pytest.mark.slow)])
 def test_sliding_distance_on_a_slope_matches_coulomb_friction(trial, tilt):
     """On a plane, level or not, which is the same to the block if gravity is as steep to it."""
     turn = np.array([[math.cos(tilt), 0, math.sin(tilt)], [0, 1, 0], [-math.sin(tilt), 0, math.cos(tilt)]])

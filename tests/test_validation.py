@@ -36,6 +36,7 @@ def test_bar_frequency_is_within_three_percent_of_timoshenko(recipes):
     assert abs(rows[0]["error [%]"]) < 3
 
 
+@pytest.mark.slow
 def test_bar_frequency_converges_with_the_cell(recipes):
     _, structures = recipes
     rows, orders = structures.bar(cells=(2, 3), poisson=(0.0,), forms=("flip",), duration=0.4)

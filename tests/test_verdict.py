@@ -40,6 +40,13 @@ def still(made):
 
 
 @pytest.fixture(scope="module")
+def judged(still):
+    """What is said of recordings that lack nothing."""
+    problem, null_model = still
+    return weighed(problem, [effect("drag"), effect("density")], null_model, [], report=quiet)
+
+
+@pytest.fixture(scope="module")
 def dragged(made):
     """Ends of searches in recordings of a bar in a fluid."""
     twin, record = made
@@ -113,6 +120,7 @@ def test_a_stated_number_that_is_not_credible_beside_an_effect_is_weighed_as_an_
     assert _as_pairs(problem, [drag], [strained]) == []
 
 
+@pytest.mark.slow
 def test_drag_on_a_body_that_is_described_half_as_stiff_is_named_with_its_modulus(made):
     twin, record = made
     recorded, drag = record("drag", (600.0,)), effect("drag")
@@ -192,6 +200,7 @@ def test_a_mode_that_breaks_down_is_approached_halfway(dragged):
     assert found.errors == pytest.approx(drag.errors + 0.1)
 
 
+@pytest.mark.slow
 def test_trials_that_are_only_predicted_change_no_verdict(made, dragged):
     problem, effects, null_model, ends = dragged
     _, record = made
@@ -239,14 +248,12 @@ def test_a_trial_that_breaks_down_is_left_out_and_the_others_are_predicted(dragg
     assert list(predictions(problem, fit, [kept]).left_out) == ["kept"]
 
 
-def test_it_is_told_what_would_make_an_effect_that_matters_visible(still):
-    problem, null_model = still
-    found = weighed(problem, [effect("drag"), effect("density")], null_model, [], report=quiet)
-    assert found.kind in ("nothing_missing", "cannot_tell")
+def test_it_is_told_what_would_make_an_effect_that_matters_visible(judged):
+    assert judged.kind in ("nothing_missing", "cannot_tell")
     blind = dataclasses.replace(
-        found.conclusion, limit=3e-3, matters=1e-3, remedies={"noise": 4.0, "motion": 8.0}, kind="cannot_tell"
+        judged.conclusion, limit=3e-3, matters=1e-3, remedies={"noise": 4.0, "motion": 8.0}, kind="cannot_tell"
     )
-    told = explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=blind))
+    told = explanation(dataclasses.replace(judged, kind="cannot_tell", conclusion=blind))
     assert verdict_sentence(told).startswith("It cannot be told")
     (seen,) = (s for s in evidence(told) if "would have been seen" in s)
     assert "only if it changed the motion by 3 mm, while 1 mm matter" in seen
@@ -280,18 +287,16 @@ def test_a_set_of_one_name_and_what_is_unknown_says_so(monkeypatch):
     assert "that nothing is missing is not" in said(kind="unknown_physics", credible=("unknown", "nothing"))
 
 
-def test_why_an_effect_that_fits_is_not_told(still):
-    problem, null_model = still
-    found = weighed(problem, [effect("drag"), effect("density")], null_model, [], report=quiet)
+def test_why_an_effect_that_fits_is_not_told(judged):
     for credible, reason in (
         (("drag", "nothing"), "nothing is missing is not excluded"),
         (("drag",), "no better with it"),
     ):
-        seen = dataclasses.replace(found.conclusion, kind="cannot_tell", chosen=("drag",), credible=credible)
-        told = evidence(explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=seen)))
+        seen = dataclasses.replace(judged.conclusion, kind="cannot_tell", chosen=("drag",), credible=credible)
+        told = evidence(explanation(dataclasses.replace(judged, kind="cannot_tell", conclusion=seen)))
         assert any("It may be drag of the surrounding fluid" in s and reason in s for s in told)
-    blind = dataclasses.replace(found.conclusion, kind="cannot_tell", chosen=(), limit=math.inf, matters=1e-3)
-    told = evidence(explanation(dataclasses.replace(found, kind="cannot_tell", conclusion=blind)))
+    blind = dataclasses.replace(judged.conclusion, kind="cannot_tell", chosen=(), limit=math.inf, matters=1e-3)
+    told = evidence(explanation(dataclasses.replace(judged, kind="cannot_tell", conclusion=blind)))
     assert "No effect would have been seen, however large." in told
 
 
