@@ -50,7 +50,7 @@ def test_force_network_correlates_with_a_force_against_the_velocity_above_0_9(ba
 @pytest.mark.parametrize(
     ("method", "verdict", "named"),
     [
-        ("modulus-and-damping", "explained", {"modulus"}),  # all that it knows
+        pytest.param("modulus-and-damping", "explained", {"modulus"}, marks=pytest.mark.slow),  # all that it knows
         pytest.param("all-parameters", "cannot_distinguish", {"density"}, marks=pytest.mark.slow),
         pytest.param("force-network", "unknown_physics", set(), marks=pytest.mark.slow),  # a network has no names
         ("sparse-regression", None, set()),

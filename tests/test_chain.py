@@ -106,6 +106,7 @@ def test_heavy_beads_swing_with_the_body(engine):
     np.testing.assert_allclose(fallen, sunk, rtol=0, atol=5e-3 * sunk.max())
 
 
+@pytest.mark.slow
 def test_engines_agree_on_a_chain_that_swings_aside():
     lattice, body = bar()
     chains = [

@@ -84,7 +84,7 @@ def test_scenarios_are_fresh_in_each_iteration_and_the_same_ones_when_asked_agai
     assert torch.equal(fixed.sample(7).friction, two.friction)
 
 
-@pytest.mark.parametrize(("count", "carried"), [(5, 5), (9, 16)])
+@pytest.mark.parametrize(("count", "carried"), [(5, 5), pytest.param(9, 16, marks=pytest.mark.slow)])
 def test_a_gradient_is_the_sum_over_scenarios_of_the_gradients_of_single_runs(count, carried):
     made = robot_of(scenarios=count, clip=0.0, lightness=0.1, dt=1e-4)
     assert made.carried(count) == carried

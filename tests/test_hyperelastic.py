@@ -87,6 +87,7 @@ def test_interval_widens_with_serially_correlated_residuals():
     assert held(found, shear=TRUE.shear) == [True]
 
 
+@pytest.mark.slow
 def test_two_maxwell_elements_recovered_within_10_percent_and_predict_another_rate():
     known = [experiment("shear", rate, prony=PRONY, noise=0.01, seed=k) for k, rate in enumerate((0.02, 1.0))]
     known.append(experiment("uniaxial", 0.1, top=2.0, prony=PRONY, noise=0.01, seed=7))

@@ -80,6 +80,7 @@ def test_storage_modulus_mismatch_of_raw_adhesive_sweeps_below_30_percent_of_pub
 
 
 @recordings
+@pytest.mark.slow
 def test_resonance_of_rubber_discs_predicted_from_dma_within_13_percent(checks):
     rows = checks.shaker(Path(RECORDINGS) / "dma-shaker-rubber" / "material_a", across=())
     for row in rows:

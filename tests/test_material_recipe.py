@@ -71,7 +71,6 @@ def test_prony_series_recovered_within_3_percent_from_sweep_file(modules, tmp_pa
     assert again.solidified.spectrum.error == pytest.approx(found.solidified.spectrum.error, rel=1e-6)
 
 
-@pytest.mark.slow
 def test_relaxation_slower_than_horizon_adds_to_equilibrium_modulus(modules, tmp_path):
     file = sweeps(tmp_path / "slow.csv", Prony(moduli=torch.tensor([1.0, 1.0]), times=torch.tensor([3.0, 0.01])))
     options = modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0, horizon=0.3)
@@ -86,6 +85,7 @@ def test_melt_without_given_equilibrium_modulus_is_refused(modules, tmp_path):
         modules["material"].main(modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0))
 
 
+@pytest.mark.slow
 def test_prony_series_recovered_within_2_percent_from_creep_compliance(modules, tmp_path):
     # Retardation after 1e-6, 3e-6 and 5e-6 1/Pa at 20 C; at 35 C a tenth of the time for it.
     time, retarded, compliances = np.geomspace(1e-3, 1e2, 60), np.array([0.01, 1.0]), np.array([3e-6, 5e-6])

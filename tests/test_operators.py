@@ -14,7 +14,9 @@ from torchsoro import Prony, ground
 from torchsoro.simulation.ops.scene import Inputs, scene_of
 
 FORMS = {"apic": {"blend": 0.0}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}
-forms = pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+forms = pytest.mark.parametrize(
+    "form", [pytest.param(form, id=name, marks=[pytest.mark.slow] * (name == "flip")) for name, form in FORMS.items()]
+)
 NAMES = ("state", "weight", *(f.name for f in fields(Inputs)))
 
 

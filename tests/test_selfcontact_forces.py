@@ -281,6 +281,7 @@ def test_a_run_that_goes_on_is_that_in_one():
     assert torch.equal(rest.final, whole.final)
 
 
+@pytest.mark.slow
 def test_both_engines_agree():
     runs = [watched(touching(lanes=lanes), fork(), 100) for lanes in (True, False)]
     assert float((runs[0].position - runs[1].position).abs().max()) < 1e-8 * H
