@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from torchsoro.simulation.actuation import Waveform, read_pressure_csv, square_wave
@@ -43,7 +43,6 @@ def test_waveform_is_linear_between_samples_and_constant_outside():
     torch.testing.assert_close(seen, tensor(10.0, 10.0, 12.5, 20.0, 0.0, -20.0, -20.0), rtol=0, atol=0)
 
 
-@settings(max_examples=30, deadline=None)
 @given(
     steps=st.lists(st.floats(1e-4, 1.0), min_size=1, max_size=6),
     leading=st.sampled_from([(), (1,), (2, 3)]),
@@ -104,7 +103,6 @@ def test_bad_times_are_refused(t):
 # The switched valve ---------------------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     amplitude=st.floats(-50.0 * KPA, 100.0 * KPA),
     frequency=st.floats(0.5, 50.0),

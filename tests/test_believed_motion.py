@@ -114,7 +114,10 @@ def inflated(tmp_path_factory) -> tuple[Twin, Trial]:
     return made(tmp_path_factory.mktemp("inflated"), setup, pressure=4e3)
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(1, ""), (1e2, "mbar"), (1e3, "kPa"), (1e5, "bar")])
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [(1, ""), (1e3, "kPa"), *(pytest.param(*u, marks=pytest.mark.slow) for u in ((1e2, "mbar"), (1e5, "bar")))],
+)
 def test_a_pressure_in_another_unit_is_told_by_name(inflated, factor, unit):
     twin, trial = inflated
     assert trial.pressure is not None

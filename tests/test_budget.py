@@ -195,6 +195,7 @@ def test_elastic_solid_has_zero_storage_and_loss_error():
     assert (len(only.moduli), only.storage_error, only.loss_error) == (0, 0.0, 0.0)
 
 
+@pytest.mark.slow
 def test_budget_figure_labels_each_substitute_with_its_error(tmp_path):
     spent = paper(2e-5)
     materials = substitutes(spent, match=BAND[1])[1:]

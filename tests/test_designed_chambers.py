@@ -155,13 +155,12 @@ def test_an_unrounded_gait_that_breaks_down_costs_only_its_numbers(monkeypatch):
     assert "center_x_1" in found and "L_rounded" not in found and rounding_line(found) == ""
 
 
-def test_of_several_starts_the_best_gives_its_chambers(tmp_path):
-    for until in (0, 1):
-        robot = walker(
-            moving(tmp_path / str(until), starts=2, iterations=3, chamber_until=until, chamber_volume="fixed")
-        )
-        found = optimize_starts(robot)
-        assert torch.equal(robot.density().detach(), found.gamma)
+@pytest.mark.parametrize("until", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_of_several_starts_the_best_gives_its_chambers(tmp_path, until):
+    how = {"starts": 2, "iterations": 2, "chamber_until": until, "chamber_volume": "fixed"}
+    robot = walker(moving(tmp_path / "run", **how))
+    found = optimize_starts(robot)
+    assert torch.equal(robot.density().detach(), found.gamma)
 
 
 def test_a_design_that_breaks_down_takes_its_chambers_back_with_it(tmp_path):

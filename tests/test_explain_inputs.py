@@ -277,26 +277,26 @@ def test_a_pressure_that_does_not_fit_is_refused(folder, table, message):
     refuse(folder, rf"trials/b/pressure\.csv: .*{message}")
 
 
-def test_two_hundred_thousand_rows_are_thinned_to_what_the_simulation_shows(folder):
+def test_forty_thousand_rows_are_thinned_to_what_the_simulation_shows(folder):
     part = [f"0.08,0.01,0.02{k},0.04,0,0.01{k % 5}\n" for k in range(7)]
     with (folder / "trials/b/markers.csv").open("w") as file:
         file.write("time_s,tip_x_m,tip_y_m,tip_z_m,side_x_m,side_y_m,side_z_m\n")
-        file.writelines(f"{2.5e-6 * k:.7f},{part[k % 7]}" for k in range(200_001))
+        file.writelines(f"{1.25e-5 * k:.7f},{part[k % 7]}" for k in range(40_001))
     found = read_inputs(Options(experiment=folder, out=folder.parent / "out"))
     recording = found.trials[1].recording
     assert recording is not None and len(recording.time) == 401 and recording.time[0] == 0
     (note,) = found.notes
-    assert note.startswith("trial b: of 200001 rows of markers.csv one in 500 is used, or one in 1.25 ms; ")
+    assert note.startswith("trial b: of 40001 rows of markers.csv one in 100 is used, or one in 1.25 ms; ")
 
 
 def test_a_table_is_read_in_a_few_times_the_memory_of_its_numbers(tmp_path):
-    (tmp_path / "t.csv").write_text("a,b\n" + "".join(f"{k},\n" for k in range(60_000)))
+    (tmp_path / "t.csv").write_text("a,b\n" + "".join(f"{k},\n" for k in range(20_000)))
     tracemalloc.start()
     found = read_table(tmp_path / "t.csv")
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert found["a"][-1] == 59_999 and np.isnan(found["b"]).all()
-    assert peak < 8 * 60_000 * 2 * 8
+    assert found["a"][-1] == 19_999 and np.isnan(found["b"]).all()
+    assert peak < 8 * 20_000 * 2 * 8
 
 
 def test_a_long_recording_is_thinned_further_where_rows_between_follow_from_those_kept(folder):

@@ -39,7 +39,7 @@ def is_closed(part: Part) -> bool:
     return len(forward) == len(edges) and all((b, a) in forward for a, b in forward)
 
 
-@pytest.mark.parametrize("n", [12, 16, pytest.param(24, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [12, *(pytest.param(n, marks=pytest.mark.slow) for n in (16, 24))])
 def test_solid_cube_with_cavity(n: int) -> None:
     """Volume, mass, outer size and the wall (one lattice layer on no design material is tested below)."""
     layers = {12: 1, 16: 2, 24: 1}[n]
@@ -59,7 +59,7 @@ def test_solid_cube_with_cavity(n: int) -> None:
     assert is_closed(part)
 
 
-@pytest.mark.parametrize("n", [12, 16, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [12, *(pytest.param(n, marks=pytest.mark.slow) for n in (16, 40))])
 def test_wall_one_layer_thick_survives(n: int) -> None:
     """A bare chamber on one thick leg: the wall keeps its thickness of one spacing, coarse or fine."""
     h, outer = 0.036 / n, 2 * round(n / 4) * 0.036 / n
@@ -113,6 +113,7 @@ def test_offset_grows_the_outside_only() -> None:
     assert is_closed(part)
 
 
+@pytest.mark.slow
 def test_offset_of_a_ball() -> None:
     """A curved surface moves by the offset as well."""
     domain = Domain(size=(0.036,) * 3, particles=(18,) * 3)

@@ -192,6 +192,7 @@ def test_an_eroded_design_wears_off_at_the_faces_of_its_box():
     assert float(field(torch.ones_like(phi), threshold=eta)[domain.nearest(torch.full((1, 3), size / 2))]) > 0.99
 
 
+@pytest.mark.slow
 def test_a_port_that_belongs_to_the_domain_leaves_limbs_as_thick_as_they_are():
     chamber = Chamber(name="air", center=(0.01, 0.01, 0.01), size=(0.01,) * 3, wall=0.002)
     port = AirPort(diameter=0.003)

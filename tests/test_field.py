@@ -118,7 +118,7 @@ def test_gradient_is_the_left_right_average_of_the_gradient_without_symmetry():
     torch.testing.assert_close(mirrored.phi.grad, average, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("symmetry", [(), ("y",), ("x", "z")])
+@pytest.mark.parametrize("symmetry", [("y",), *(pytest.param(s, marks=pytest.mark.slow) for s in ((), ("x", "z")))])
 def test_gradcheck(symmetry):
     domain = domain_of((5, 4, 3), (3, 4, 3), center=(2.5, 2, 1.5))
     field = DesignField(domain, radius=2.2 * H, beta=3.0, symmetry=symmetry, dtype=torch.float64)

@@ -89,7 +89,7 @@ def test_kernels_deal_with_springs_only_where_there_are_any():
     assert attach(block()[1], [spring]).drag is None
 
 
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])
 def test_a_point_mass_has_inertia_and_weight(way):
     push, load = Force(particles=EVERY, value=vector(0.01, 0.0, 0.0)), PointMass(particles=EVERY, mass=3 * MASS)
     pushed = run([push, load], **way)
@@ -103,7 +103,7 @@ def test_a_point_mass_has_inertia_and_weight(way):
     assert sag == pytest.approx(-9.81 * 4 * MASS / stiffness, rel=1e-3)
 
 
-@ways("apic", "flip", "total")
+@ways("apic", "flip", "total", slow=["flip"])
 def test_a_spring_has_its_frequency(way):
     stiffness = 50.0
     shift = vector(0.0, 0.0, 1e-3)

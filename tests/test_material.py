@@ -243,7 +243,7 @@ def test_courant_number_names_gas_and_viscosity():
     assert courant(thick, None, dt=DT, cell=2 * H).term == "viscosity"
 
 
-@pytest.mark.parametrize("elements", [0, 3, 5])
+@pytest.mark.parametrize("elements", [0, pytest.param(3, marks=pytest.mark.slow), 5])
 @pytest.mark.parametrize(("factor", "stable"), [(1.0, True), (1.1, False)])
 def test_waves_stay_bounded_up_to_the_stable_step(elements, factor, stable, monkeypatch):
     domain = Domain(size=(8 * H,) * 3, particles=(8, 8, 8))
@@ -423,7 +423,7 @@ def test_no_lattice_is_unstable_below_a_total_courant_number_of_one(shape, poiss
 
 
 @pytest.mark.parametrize("viscosity", [None, 20.0])
-@pytest.mark.parametrize("elements", [0, 3, 5])
+@pytest.mark.parametrize("elements", [0, pytest.param(3, marks=pytest.mark.slow), 5])
 def test_a_total_lagrangian_lattice_steps_stably_up_to_a_courant_number_of_one(elements, viscosity, monkeypatch):
     monkeypatch.setattr("torchsoro.simulation.stability.STABLE_COURANT", 1.0)
     prony, solid, cell = Prony.paper(elements), Solid(), 1.75e-3

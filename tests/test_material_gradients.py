@@ -258,7 +258,7 @@ def formulation(way: dict[str, str]) -> str:
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])  # the updated form by all numbers at once below
 def test_gradient_equals_the_central_difference(name, way):
     if name == "second Plane.offset" and way != WAYS["total"]:
         return  # refused, see below

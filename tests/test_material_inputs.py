@@ -151,9 +151,9 @@ def test_a_workbook_without_its_reader_or_of_text_is_refused(tmp_path, monkeypat
 @pytest.mark.parametrize(
     "content",
     [
-        "\ufeff" + text(table()),
+        pytest.param("\ufeff" + text(table()), marks=pytest.mark.slow),
         text([table()[0], *([c.replace(".", ",") for c in row] for row in table()[1:])], ";"),
-        text(table()[:1] + table()[:0:-1]),
+        pytest.param(text(table()[:1] + table()[:0:-1]), marks=pytest.mark.slow),
     ],
     ids=["byte order mark", "decimal commas", "falling frequencies"],
 )

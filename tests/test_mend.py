@@ -48,6 +48,7 @@ def made(domain: Domain, solid: torch.Tensor, min_wall: float, port: AirPort | N
     return plain, mended
 
 
+@pytest.mark.slow
 def test_a_thin_plate_gets_the_wanted_thickness():
     domain = Domain(size=(14 * H,) * 3, particles=(14,) * 3)
     solid = torch.zeros(14, 14, 14)
@@ -116,6 +117,7 @@ def test_a_neck_between_two_blocks_becomes_a_rod_of_the_wanted_diameter():
     assert mended.report.thinnest_gap_mm == pytest.approx(plain.report.thinnest_gap_mm, abs=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_thick_enough_is_returned_unchanged():
     domain, _ = shell()
     plain, mended = made(domain, torch.ones(14, 14, 14), 2.9 * H)  # walls of 3 or 4 mm

@@ -31,7 +31,7 @@ def arguments(p: Problem, keep: bool) -> tuple:
 # ------------------------------------------------------------------------------------------------------- registration
 
 
-@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
 @forms
 def test_opcheck_of_the_rollout(form, keep):
     p = problem(particles=(4, 4, 4), steps=3, samples=(0, 2), **form)
@@ -39,7 +39,7 @@ def test_opcheck_of_the_rollout(form, keep):
     assert set(result.values()) == {"SUCCESS"}
 
 
-@pytest.mark.parametrize("keep", [True, False])
+@pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
 @forms
 def test_opcheck_of_the_adjoint(form, keep):
     p = problem(particles=(4, 4, 4), steps=3, samples=(0, 2), **form)
@@ -145,7 +145,7 @@ class Softened(nn.Module):
 
 
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor that is not a leaf:UserWarning")  # by Dynamo itself
-@pytest.mark.parametrize("backend", ["eager", "aot_eager"])
+@pytest.mark.parametrize("backend", [pytest.param("eager", marks=pytest.mark.slow), "aot_eager"])
 @ways("apic", "total")
 def test_compiled_module_agrees_with_eager(way, backend):
     module, x = Softened(way), torch.tensor(0.5, dtype=torch.float64)

@@ -120,7 +120,7 @@ def body_column(picture: np.ndarray) -> float:
     return float(np.argwhere(upper[..., 2] - upper[..., 0] > 20)[:, 1].mean())
 
 
-@pytest.mark.parametrize("follow", [False, True])
+@pytest.mark.parametrize("follow", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_camera_that_follows_keeps_the_body_within_a_tenth_of_the_width_and_shows_it_larger(
     tmp_path: Path, follow: bool
 ) -> None:
@@ -154,7 +154,7 @@ def test_a_failed_movie_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.M
     assert old.read_bytes() == b"old" and list(tmp_path.iterdir()) == [old]
 
 
-@pytest.mark.parametrize("climb", [False, True])
+@pytest.mark.parametrize("climb", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_summary(tmp_path: Path, climb: bool) -> None:
     history = {"objective/L": [1e-3, float("nan"), 3e-3], "constraint/C": [0.05, 0.03, 0.012]}
     given = arguments(12)

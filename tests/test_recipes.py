@@ -231,6 +231,7 @@ def test_a_bad_schedule_is_refused_before_the_folder_is_made(recipes, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_the_climber_raises_gravity_in_steps_and_writes_its_files(recipes, tmp_path):
     settings = tiny(
         tmp_path / "run", iterations=2, settle=0.0, gravity_steps=1, gravity_every=1, frames=2, robot="climber"
@@ -447,6 +448,7 @@ def test_without_a_design_within_the_limit_the_one_with_the_least_loss_is_delive
     assert result["C"] == pytest.approx(violations[least] + settings.c_max, rel=1e-2)
 
 
+@pytest.mark.slow
 def test_the_best_design_within_the_limit_is_delivered(recipes, tmp_path):
     settings = tiny(tmp_path / "run", c_max=0.249, iterations=2, frames=2)  # which every design but the first keeps
     result = recipes["walker"].main(settings)

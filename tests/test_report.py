@@ -210,8 +210,10 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
 @pytest.mark.parametrize(
     "kind",
     [
-        *(pytest.param(k, marks=pytest.mark.slow) for k in ("nothing_missing", "cannot_tell", "cannot_distinguish")),
-        "unknown_physics",
+        *(
+            pytest.param(k, marks=pytest.mark.slow)
+            for k in ("nothing_missing", "cannot_tell", "cannot_distinguish", "unknown_physics")
+        ),
         "explained",
     ],
 )

@@ -24,7 +24,7 @@ def test_pictures_get_the_planes_of_the_robot():
     assert drawn_planes(climber(TINY)) == ((0, -0.0175, 1), (0, 0.0175, -1))
 
 
-@pytest.mark.parametrize(("make", "axis"), [(walker, 0), (climber, 2)])
+@pytest.mark.parametrize(("make", "axis"), [(walker, 0), pytest.param(climber, 2, marks=pytest.mark.slow)])
 def test_the_air_port_leaves_at_the_rear(make, axis):
     robot = make(dataclasses.replace(TINY, port=0.005))
     part = print_part(robot, robot.field(torch.ones(8, 8, 8)).detach().numpy())
@@ -37,6 +37,7 @@ def test_the_air_port_leaves_at_the_rear(make, axis):
         assert (hole & (depth > 1) & (depth < 5)).any() == there
 
 
+@pytest.mark.slow
 def test_an_offset_thickens_the_part():
     robot = walker(TINY)
     density = robot.field(torch.ones(8, 8, 8)).detach().numpy()
@@ -56,7 +57,7 @@ def test_the_shape_goes_to_tensorboard_as_picture_and_mesh(tmp_path):
     assert [event.step for event in seen.Tensors("shape/mesh_VERTEX")] == [0, 4]
 
 
-@pytest.mark.parametrize("void", [True, False])
+@pytest.mark.parametrize("void", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run(void, tmp_path, monkeypatch):
     robot = walker(dataclasses.replace(TINY, frames=2))
     gamma = (robot.domain.positions[:, 0] < 0.008).float()  # void in front

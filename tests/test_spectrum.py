@@ -278,6 +278,7 @@ def test_least_bic_selects_five_terms_of_table_s1_at_2_percent_noise():
     assert error_norm(found, sweep(TABLE_S1, MASTER, 0.02)) == pytest.approx(found.error)
 
 
+@pytest.mark.slow
 def test_regularization_reduces_error_of_moduli_of_60_terms_below_30_percent():
     times = np.geomspace(1e-7, 1e2, 60)
     truth = Spectrum(equilibrium=1e5, moduli=1e4 * times**-0.25, times=times, deformation="shear")

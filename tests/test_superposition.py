@@ -312,11 +312,9 @@ def test_read_shift_converts_units_sorts_and_finds_reference(tmp_path):
 # --------------------------------------------------------------------------------------------------------- recordings
 
 
+@pytest.mark.slow
 @recordings
-@pytest.mark.parametrize(
-    ("file", "molar_mass"),
-    [("PI_226k_sweeps.csv", 225.9), pytest.param("PI_635k_sweeps.csv", 634.5, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("file", "molar_mass"), [("PI_226k_sweeps.csv", 225.9), ("PI_635k_sweeps.csv", 634.5)])
 def test_polyisoprene_shift_factors_within_0_1_decades_of_published_law(file, molar_mass):
     # Header of their master curves: log10 a_T = -C1 (T - Tr + c) / (C2 + T + c), T in deg C, c = 14.65 / molar mass;
     # b_T = rho Tr / (rho T), rho = 0.928 - 0.61e-3 T.

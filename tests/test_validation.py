@@ -30,6 +30,7 @@ def test_timoshenko_tends_to_euler_and_bernoulli_for_a_slender_bar(recipes):
     assert 0.9 < ratios[1] < 0.95
 
 
+@pytest.mark.slow
 def test_bar_frequency_is_within_three_percent_of_timoshenko(recipes):
     _, structures = recipes
     rows, _ = structures.bar(cells=(3,), poisson=(0.4,), duration=0.4)
