@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import os
 import sys
@@ -24,6 +25,7 @@ from tiny import tiny
 
 os.environ["MPLBACKEND"] = "Agg"  # also for the processes that tests start
 matplotlib.use("Agg")
+gc.set_threshold(20_000, 20, 20)  # to look for cycles takes a tenth of the time to compile
 torch.set_num_threads(1)  # the tensors are small: threads cost more than they give, and two cores are shared
 # Recipes are programs and no package: as modules they are found by name.
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -75,6 +77,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.gpu)
         if item.get_closest_marker("slow") is not None and not config.option.slow:
             item.add_marker(pytest.mark.skip(reason="slow: runs with --slow"))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Leave what is there by now, which stays, out of the search for cycles of objects."""
+    gc.freeze()
 
 
 @pytest.fixture
