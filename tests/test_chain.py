@@ -22,6 +22,7 @@ G = 9.81
 DOWN = (0.0, 0.0, -G)
 N = layout.CHAIN_BEADS
 ENGINES = [{}, {"lanes": False}]
+# The kernels of a GPU are compared with the lanes below, which takes ten seconds to compile.
 one_at_once = pytest.mark.parametrize("engine", [{}, pytest.param({"lanes": False}, marks=pytest.mark.slow)])
 
 

@@ -24,7 +24,7 @@ from torchsoro.simulation.selfcontact import overlapping
 from torchsoro.simulation.stability import stable_step
 from torchsoro.simulation.threads import threads_here
 
-# That both engines agree is tested below.
+# On a GPU this contact is refused, so that its kernels are for comparison only.
 one_at_once = pytest.mark.parametrize(
     "lanes", [pytest.param(True, id="lanes"), pytest.param(False, id="taichi", marks=pytest.mark.slow)]
 )
