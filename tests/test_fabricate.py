@@ -141,6 +141,7 @@ def test_island_is_removed_and_reported() -> None:
     assert part.report.bodies == 1
 
 
+@pytest.mark.slow
 def test_closed_hollow_is_reported() -> None:
     """A hollow without an opening would trap resin."""
     domain = walker(12)

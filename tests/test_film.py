@@ -48,6 +48,7 @@ def test_what_is_filmed_can_be_explained_once_markers_are_there(filmed, tmp_path
     assert (out / "markers.png").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_markers_are_on_material_that_the_camera_sees(filmed):
     folder, out, _ = filmed
     robot = build(read_settings(folder / "settings.json", device="cpu"))

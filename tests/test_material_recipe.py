@@ -71,6 +71,7 @@ def test_prony_series_recovered_within_3_percent_from_sweep_file(modules, tmp_pa
     assert again.solidified.spectrum.error == pytest.approx(found.solidified.spectrum.error, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_relaxation_slower_than_horizon_adds_to_equilibrium_modulus(modules, tmp_path):
     file = sweeps(tmp_path / "slow.csv", Prony(moduli=torch.tensor([1.0, 1.0]), times=torch.tensor([3.0, 0.01])))
     options = modules["material"].Options(file=file, out=tmp_path / "out", reference=20.0, horizon=0.3)

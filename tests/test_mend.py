@@ -134,6 +134,7 @@ def test_clearance_is_the_distance_to_cells_and_to_the_box():
     assert found[4, 4, :].tolist() == [0.5, 1.5, 1.5, 0.5, -0.5, 0.5, 1.5, 1.5, 0.5]
 
 
+@pytest.mark.slow
 def test_where_there_is_no_room_the_wall_stays_and_the_report_says_so():
     """A wall of one layer between the cavity and the face of the box."""
     air = Chamber(name="air", center=(4 * H, 6 * H, 6 * H), size=(8 * H, 6 * H, 6 * H), wall=H)

@@ -198,6 +198,7 @@ def thrown(seed: int, late: float) -> Recording:
     late=st.floats(-0.015, 0.015),
     pair=st.sampled_from([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]),
 )
+@pytest.mark.slow
 def test_exchanged_markers_of_a_body_that_is_thrown_are_put_right(tmp_path_factory, seed, late, pair):
     place, order = tmp_path_factory.mktemp("thrown"), np.arange(4)
     start = "[start]\nvelocity = [1.5, -0.5, 0.0]\nangular_velocity = [0.0, 0.0, 10.0]\n"

@@ -175,7 +175,9 @@ def at(numbers):
     )
 
 
-@pytest.mark.parametrize("test", ["shear", "uniaxial", pytest.param("equibiaxial", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "test", ["shear", *(pytest.param(t, marks=pytest.mark.slow) for t in ("uniaxial", "equibiaxial"))]
+)
 def test_complex_step_and_autograd_derivatives_match_for_every_constant(test):
     stretch = path(12)
     dt = even(12, 0.05)

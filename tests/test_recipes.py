@@ -196,6 +196,7 @@ def test_a_checkpoint_of_other_settings_is_refused_and_stays_whole(recipes, stra
     assert {file: file.read_bytes() for file in path.rglob("*.*")} == held
 
 
+@pytest.mark.slow
 def test_a_design_with_no_body_to_print_leaves_its_numbers(recipes, tmp_path):
     # Grey everywhere but in the wall, which no design particle touches at one half.
     settings = tiny(tmp_path / "run", iterations=1, min_wall=1e-3)

@@ -210,13 +210,14 @@ def test_places_come_out_of_the_page_as_they_went_in_to_a_20000th_of_their_exten
 @pytest.mark.parametrize(
     "kind",
     [
-        *(
-            pytest.param(k, marks=pytest.mark.slow)
-            for k in ("nothing_missing", "cannot_tell", "cannot_distinguish", "unknown_physics")
-        ),
+        "nothing_missing",
+        "cannot_tell",
+        "cannot_distinguish",
+        "unknown_physics",
         "explained",
     ],
 )
+@pytest.mark.slow
 def test_every_verdict_has_its_page_with_the_numbers_of_its_json(dragged, judged, shown, kind, tmp_path):
     problem, _ = dragged
     _, _, _, worst, body = shown

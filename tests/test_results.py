@@ -81,6 +81,7 @@ def test_a_robot_is_shown_with_or_without_its_void_and_without_a_page_of_its_run
     assert found["mass"] == pytest.approx(float(solid), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_pictures_of_a_run_tell_the_numbers_of_its_result(tmp_path, monkeypatch):
     robot = walker(dataclasses.replace(TINY, frames=2))
     told: dict[str, dict[str, Any]] = {}

@@ -181,6 +181,7 @@ def test_every_chamber_has_the_gain_and_the_lag():
     assert supplied(wave, batch(tilt_x=[1.0])) is wave
 
 
+@pytest.mark.slow
 def test_lagging_valves_of_several_chambers_have_gradients_by_the_timing_of_each_scenario():
     valves = {"pressure": 2e4, "frequency": 100.0, "rise": 5e-4, "fall": 5e-4, "start": 5e-3, "end": 2e-2}
     names = ("amplitude", "phase", "duty")

@@ -78,6 +78,7 @@ def test_horizontal_shift_factors_match_wlf_within_standard_errors(reference):
     assert shift.noise == pytest.approx((0.004, 0.008), rel=0.3)
 
 
+@pytest.mark.slow
 def test_shift_factor_errors_grow_with_distance_from_reference_and_with_noise():
     shift = superpose(sweeps(), reference=6.0)
     at = int(np.argmin(shift.log_a_error))

@@ -78,6 +78,7 @@ def walker() -> tuple[Domain, torch.Tensor]:
     return domain, gamma.flatten()
 
 
+@pytest.mark.slow
 def test_a_sleeve_gives_the_port_a_wall():
     domain, gamma = walker()
     thin = fabricate(domain, gamma, density=1000.0, port=AirPort(diameter=0.005), refine=2)

@@ -174,6 +174,7 @@ def test_drag_is_named_with_its_number_and_its_probability(dragged):
     assert answer["probabilities"]["drag"] == answer["effects"][0]["confidence"] == found.chosen[0].probability
 
 
+@pytest.mark.slow
 def test_what_breaks_down_where_it_is_most_probable_explains_nothing(dragged, monkeypatch):
     problem, effects, null_model, ends = dragged
 
