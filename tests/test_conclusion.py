@@ -43,10 +43,11 @@ def test_nothing_is_missing_where_an_effect_that_matters_would_have_been_seen():
 
 
 def test_what_is_too_weak_to_be_seen_is_told_beside_nothing_and_changes_no_verdict():
-    weak, strong = (conclude(weighed(*recorded(0.0, 5, effect=e)), limit=0.0) for e in (0.0, 0.3))
-    # A quarter of what is missing is less than one noticeable change, a third of the width of the prior.
+    weighings = [weighed(*recorded(0.0, 5, effect=e)) for e in (0.0, 0.3)]
+    weak, strong = (conclude(weighing, limit=0.0, too_weak=0.3) for weighing in weighings)
+    # Something is missing as often as nothing.
     assert weak.kind == "nothing_missing" and strong.kind == "explained"
-    assert weak.probabilities["unseen"] == pytest.approx(0.245 * weak.probabilities["nothing"], rel=1e-2)
+    assert weak.probabilities["unseen"] == pytest.approx(0.3 * weak.probabilities["nothing"], rel=1e-9)
     assert weak.probabilities["nothing"] + weak.probabilities["unseen"] > CREDIBLE
     assert strong.probabilities["unseen"] < 1e-6
 

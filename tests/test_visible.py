@@ -6,11 +6,13 @@ import dataclasses
 import math
 
 import numpy as np
+import pytest
 from swings import recorded, weighed
 
-from torchsoro.sim2real.inference.decision import MATTERS, VISIBLE
+from torchsoro.sim2real.inference.decision import MATTERS, STRENGTH, VISIBLE
 from torchsoro.sim2real.inference.evidence import infer
-from torchsoro.sim2real.inference.visible import FACTORS, limit, remedies
+from torchsoro.sim2real.inference.isolability import Isolability
+from torchsoro.sim2real.inference.visible import FACTORS, limit, remedies, too_weak
 
 
 def test_an_effect_of_the_limit_is_near_the_credible_probability():
@@ -26,6 +28,31 @@ def test_an_effect_of_the_limit_is_near_the_credible_probability():
         probabilities.append(weighed(data, *near).candidates()[0]["drag"])
     assert probabilities[0] < 0.5
     assert probabilities[1] > 0.95
+
+
+def test_what_is_too_weak_is_spread_over_two_decades_about_the_width_of_the_prior():
+    data, nothing, drag = recorded(0.0, 12)
+    still = infer(data, nothing)
+    (J,) = [np.concatenate([one.ravel() for one in drag.slopes])]
+    seen = limit(data, still, drag.slopes, 1.0, 10) / float(np.sqrt(np.mean(J**2)))  # multiple of the response
+
+    def told(*responses: tuple[str, float], effects: tuple[str, ...] = ("drag",)) -> float:
+        changes = tuple(np.concatenate([r * J for _, r in responses], -1) for J in drag.slopes)
+        owners = tuple(name for name, _ in responses)
+        empty = np.zeros((0, 0))
+        tells = Isolability(
+            effects=effects, quantities=(), detectable=empty, cosines=empty, changes=changes, owners=owners
+        )
+        return too_weak(data, still, tells, 1.0, 10)
+
+    # A response of which a multiple of STRENGTH is just seen is in the middle.
+    middle = seen / STRENGTH
+    assert told(("drag", middle)) == pytest.approx(0.5)
+    assert told(("drag", middle / 3)) == pytest.approx(0.5 + math.log10(3) / 2)
+    assert told(("drag", middle * 100)) == 0.0 and told(("drag", middle / 100)) == 1.0
+    # Of an effect that acts in several ways the median counts, and one that moves nothing is never seen.
+    assert told(("drag", middle), ("drag", middle * 100), ("drag", middle / 100)) == pytest.approx(0.5)
+    assert told(("drag", middle), effects=("drag", "leak")) == pytest.approx(0.75)
 
 
 def test_remedies_name_what_hides_an_effect():

@@ -17,7 +17,7 @@ from statistics import NormalDist
 
 from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, compared
-from torchsoro.sim2real.inference.weighing import NOTHING, SEEN, UNKNOWN, UNSEEN, Candidate, Weighing, apart
+from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN, UNSEEN, Candidate, Weighing, apart
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -58,12 +58,15 @@ class Conclusion:
     remedies: dict[str, float] = field(default_factory=dict)
 
 
-def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None = None) -> Conclusion:
+def conclude(
+    weighing: Weighing, limit: float, remedies: dict[str, float] | None = None, *, too_weak: float = 0.5
+) -> Conclusion:
     """The conclusion from evidence.
 
     Args:
         weighing: Of all that was fitted.
         limit: Change of the motion that would have been seen [m].
+        too_weak: Share of the prior of what is missing that would not have been seen.
         remedies: By what, and with which factor, the limit would come to what matters.
     """
     data, null = weighing.data, weighing.null
@@ -100,7 +103,7 @@ def conclude(weighing: Weighing, limit: float, remedies: dict[str, float] | None
         told[UNKNOWN] += sum(told.pop(name, 0.0) for name in chosen if name != UNKNOWN)
         chosen = [UNKNOWN]
     # Without an effect that is seen there is none, or it is too weak.
-    none = (1 - MISSING) / (1 - SEEN)
+    none = (1 - MISSING) / (1 - MISSING + MISSING * too_weak)
     told |= {NOTHING: none * told[NOTHING], UNSEEN: (1 - none) * told[NOTHING]}
     if chosen[0] == UNKNOWN:
         kind = "unknown_physics"

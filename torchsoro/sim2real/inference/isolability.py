@@ -38,8 +38,9 @@ class Isolability:
         quantities: First quantity of each, and its unit.
         detectable: Strength at which each is detectable, in that unit [E]; infinite if never.
         cosines: How much of the change by effect i, where it is first detectable, effect j can imitate [E, E], 0 to 1.
-        changes: Of the motion by weak effects, one for each direction in which one acts, of each trial [T, M, A, D] m;
-            without what breaks down or moves nothing.
+        changes: Of the motion by one noticeable change, one for each direction in which an effect acts, as far as weak
+            ones tell, of each trial [T, M, A, D] m; without what breaks down or moves nothing.
+        owners: Name of the effect of each of these [D].
     """
 
     effects: tuple[str, ...]
@@ -47,6 +48,7 @@ class Isolability:
     detectable: np.ndarray
     cosines: np.ndarray
     changes: Motions
+    owners: tuple[str, ...]
 
     def confused(self, threshold: float = SAME) -> list[tuple[str, str]]:
         """Pairs of effects, of which the second can imitate the first: the experiment cannot tell them apart."""
@@ -117,16 +119,37 @@ def isolability(
     responses = [known[id(effect)] for effect in effects]
     detectable, cosines = compare(responses, common, prior_residual_of(problem), score)
     first = [e.quantities[0] for e in effects]
-    beliefs = [1 + fitted[type(e)] for e in effects if type(e) in fitted]
-    weak = [tuple(m[..., beliefs] for m in moved[0])]
-    weak += [tuple(m[..., : sum(map(len, own))] for m in by) for by, (own, _) in zip(moved[1:], looks, strict=True)]
+    changes, owners = _seen(problem, _noticeable(problem, effects, [own for own, _ in looks], moved, small))
     return Isolability(
         effects=tuple(e.name for e in effects),
         quantities=tuple((q.name, q.unit) for q in first),
         detectable=detectable * np.array([q.scale for q in first]),
         cosines=cosines,
-        changes=_seen(problem, weak),
+        changes=changes,
+        owners=owners,
     )
+
+
+def _noticeable(
+    problem: FitProblem,
+    effects: Sequence[Hypothesis],
+    probe_points: Sequence[Sequence[np.ndarray]],
+    moved: Sequence[Motions],
+    small: float,
+) -> list[tuple[str, Motions]]:
+    """Changes by one noticeable change of each effect [T, M, A, D] m, with its name, from those by weak ones."""
+    fitted = {type(e): k for k, (e, _) in enumerate(problem.common)}
+    rest = iter(zip(probe_points, moved[1:], strict=True))
+    found: list[tuple[str, Motions]] = []
+    for effect in effects:
+        if (k := fitted.get(type(effect))) is not None:
+            share = effect.quantities[0].scale / problem.common[k][1] / small
+            found.append((effect.name, tuple(share * m[..., [1 + k]] for m in moved[0])))
+        else:
+            own, by = next(rest)
+            strength = np.linalg.norm(np.concatenate(own)[:, : len(effect.quantities)], axis=1)
+            found.append((effect.name, tuple(m[..., : len(strength)] / strength for m in by)))
+    return found
 
 
 def prior_residual_of(problem: FitProblem) -> PriorResidual:
@@ -170,15 +193,16 @@ def shortened(blocks: Sequence[np.ndarray], by: np.ndarray, observation: Observa
     return np.asarray(np.linalg.qr(left, mode="r"))
 
 
-def _seen(problem: FitProblem, changes: Sequence[Motions]) -> Motions:
-    """Those together that move something that was recorded, of each trial [T, M, A, D] m."""
+def _seen(problem: FitProblem, changes: Sequence[tuple[str, Motions]]) -> tuple[Motions, tuple[str, ...]]:
+    """Those together that move something that was recorded, of each trial [T, M, A, D] m, and the names of each."""
     found = []
+    owners = [name for name, of in changes for _ in range(of[0].shape[-1])]
     for i, trial in enumerate(problem.trials):
         assert trial.recording is not None
         seen = np.isfinite(trial.recording.position)[..., None]
-        found.append(np.where(seen, np.concatenate([of[i] for of in changes], -1), 0.0))
+        found.append(np.where(seen, np.concatenate([of[i] for _, of in changes], -1), 0.0))
     some = np.any([change.any(axis=(0, 1, 2)) for change in found], axis=0)
-    return tuple(change[..., some] for change in found)
+    return tuple(change[..., some] for change in found), tuple(o for o, kept in zip(owners, some, strict=True) if kept)
 
 
 def _probe_points(effect: Hypothesis, problem: FitProblem, small: float) -> tuple[list[np.ndarray], list[np.ndarray]]:

@@ -30,7 +30,7 @@ from torchsoro.sim2real.inference.fit import Fit, FitProblem
 from torchsoro.sim2real.inference.heldout import Prediction, predictions
 from torchsoro.sim2real.inference.isolability import Isolability, isolability
 from torchsoro.sim2real.inference.least_squares import told
-from torchsoro.sim2real.inference.observed import Data, Motions
+from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
 from torchsoro.sim2real.inference.starts import unconstrained
 from torchsoro.sim2real.inference.weighing import Weighing, adjustment
@@ -186,9 +186,9 @@ def weighed(
             known = [one for one in known if one[1].near.model.name not in sound]
         known += again
         weighing = weighing_of(problem, [p for _, p in known], names)
-    changes = (tells or isolability(problem, effects)).changes
+    tells = tells or isolability(problem, effects)
     while True:
-        verdict = _concluded(problem, known, weighing, changes, report)
+        verdict = _concluded(problem, known, weighing, tells, report)
         folds = _folds(verdict, data, weighing.kappa) if not heldout else ()
         ahead = predictions(problem, verdict.best, heldout, folds)
         if ahead.before or not verdict.chosen:
@@ -203,15 +203,16 @@ def _concluded(
     problem: FitProblem,
     known: Sequence[tuple[Fit, Posterior]],
     weighing: Weighing,
-    changes: Motions,
+    tells: Isolability,
     report: Callable[[str], None],
 ) -> Verdict:
     """The verdict that follows from what was weighed, without what it predicts."""
     data = weighing.data
     # Where no search has ended with an effect, the responses tell how far the twin's error may pass for one.
-    kappa = weighing.kappa if weighing.groups else adjustment(data, weighing.null, changes)
-    asked = data, weighing.null, changes, kappa, weighing.names
-    found = conclude(weighing, visible.limit(*asked), visible.remedies(*asked))
+    kappa = weighing.kappa if weighing.groups else adjustment(data, weighing.null, tells.changes)
+    asked = data, weighing.null, tells.changes, kappa, weighing.names
+    weak = visible.too_weak(data, weighing.null, tells, kappa, weighing.names)
+    found = conclude(weighing, visible.limit(*asked), visible.remedies(*asked), too_weak=weak)
     ranking = [
         Candidate(
             fit=at_mode(problem, _fit_of(known, c.best), told(data, c.best)),

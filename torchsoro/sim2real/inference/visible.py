@@ -6,6 +6,9 @@ of information I = c' C^-1 c. It comes to have more than the credible probabilit
     a^2 I / (2 kappa) = ln(credible / (1 - credible)) + ln(names + 1) + ln(unseen / seen),
 
 the last two its prior odds, see :mod:`torchsoro.sim2real.inference.weighing`.
+
+The strength of what is missing is known to its order of magnitude at most. What share of it would not have been seen is
+told with strengths spread evenly in their logarithm, from a tenth to ten times the width of the prior.
 """
 
 from __future__ import annotations
@@ -16,8 +19,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, VISIBLE
+from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, STRENGTH, VISIBLE
 from torchsoro.sim2real.inference.evidence import Posterior, products
+from torchsoro.sim2real.inference.isolability import Isolability
 from torchsoro.sim2real.inference.observed import Data, Motions
 from torchsoro.sim2real.inference.state_space import total
 from torchsoro.sim2real.inference.weighing import LN_NOT_SEEN, LN_SEEN
@@ -36,6 +40,40 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
         names: Number of effects that can be named.
         trials: Times as many trials as there are.
     """
+    size, least = _least(data, null, responses, kappa, names, trials)
+    seen = np.isfinite(least)
+    if not seen.any():
+        return math.inf
+    # What the twin may err by is not told, however well it is seen.
+    return max(float(np.median((size * least)[seen])), null.near.numerics.size)
+
+
+def too_weak(data: Data, null: Posterior, tells: Isolability, kappa: float, names: int) -> float:
+    """Share of the prior of what is missing that would not have been seen, on average over effects.
+
+    Of an effect that acts in several directions the median of these counts.
+
+    Args:
+        data: Recordings.
+        null: The model without an effect.
+        tells: Change of the motion by one noticeable change of each effect.
+        kappa: By which ln evidences are divided.
+        names: Number of effects that can be named.
+    """
+    size, least = _least(data, null, tells.changes, kappa, names)
+    own = null.near.numerics.size
+    with np.errstate(divide="ignore", invalid="ignore"):
+        needed = np.maximum(least, np.where(size > 0, own / size, np.inf))
+    share = np.clip((np.log10(needed / STRENGTH) + 1) / 2, 0, 1)
+    # One that moves nothing that was recorded is not seen.
+    owners = np.array(tells.owners)
+    return float(np.mean([np.median(share[owners == name]) if name in owners else 1.0 for name in set(tells.effects)]))
+
+
+def _least(
+    data: Data, null: Posterior, responses: Motions, kappa: float, names: int, trials: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Root mean square of each response that beliefs and measurement errors leave [m], and its least multiple seen."""
     near = null.near
     count = responses[0].shape[-1]
     columns = [
@@ -49,13 +87,10 @@ def limit(data: Data, null: Posterior, responses: Motions, kappa: float, names: 
     taken = np.linalg.solve(A + weight, B)
     information = np.diag(G - B.T @ taken)
     left = np.concatenate([(c - J @ taken).reshape(-1, count) for c, J in zip(responses, near.slopes, strict=True)])
-    size = np.sqrt((left**2).mean(0))
-    seen = information > 0
-    if not seen.any():
-        return math.inf
     needed = 2 * kappa * (math.log(CREDIBLE / (1 - CREDIBLE)) + math.log(names + 1) + LN_NOT_SEEN - LN_SEEN)
-    # What the twin may err by is not told, however well it is seen.
-    return max(float(np.median(size[seen] * np.sqrt(needed / information[seen]))), near.numerics.size)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        least = np.where(information > 0, np.sqrt(needed / information), np.inf)
+    return np.sqrt((left**2).mean(0)), least
 
 
 def remedies(data: Data, null: Posterior, responses: Motions, kappa: float, names: int) -> dict[str, float]:

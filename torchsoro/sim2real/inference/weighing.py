@@ -30,8 +30,9 @@ improbable whatever the twin errs by. An extension has a number more, by which i
 what it extends, the error is as large as it is priced. Nothing and what moves the body by less than the twin may err
 are compared in the same way.
 
-An effect that is missing may be too weak to be seen: by the prior of strengths, a quarter is less than one noticeable
-change. It predicts what nothing predicts, and is told beside that, whatever its name.
+An effect that is missing may be too weak to be seen. It predicts what nothing predicts, and is told beside that,
+whatever its name, see :func:`torchsoro.sim2real.inference.visible.too_weak`. By the prior of strengths a quarter is
+less than one noticeable change: that has no name.
 
 Nothing with a stated number that is off by more than is credible is not nothing: its probability is that of the
 number's name.
