@@ -14,9 +14,15 @@ from torchsoro import Prony, ground
 from torchsoro.simulation.ops.scene import Inputs, scene_of
 
 FORMS = {"apic": {"blend": 0.0}, "flip": {"blend": 1.0}, "total": {"formulation": "total"}}
-forms = pytest.mark.parametrize(
-    "form", [pytest.param(form, id=name, marks=[pytest.mark.slow] * (name == "flip")) for name, form in FORMS.items()]
-)
+
+
+def formed(*quick: str) -> pytest.MarkDecorator:
+    """Parametrise a test by ``form``; all but these run with ``--slow``."""
+    marks = {name: [] if name in quick else [pytest.mark.slow] for name in FORMS}
+    return pytest.mark.parametrize("form", [pytest.param(FORMS[n], id=n, marks=marks[n]) for n in FORMS])
+
+
+forms = formed("apic", "total")
 NAMES = ("state", "weight", *(f.name for f in fields(Inputs)))
 
 
@@ -32,7 +38,7 @@ def arguments(p: Problem, keep: bool) -> tuple:
 
 
 @pytest.mark.parametrize("keep", [True, pytest.param(False, marks=pytest.mark.slow)])
-@forms
+@formed("total")
 def test_opcheck_of_the_rollout(form, keep):
     p = problem(particles=(4, 4, 4), steps=3, samples=(0, 2), **form)
     result = torch.library.opcheck(torch.ops.torchsoro.rollout.default, arguments(p, keep))

@@ -28,9 +28,15 @@ _real = ti.f64
 
 
 def start(*, gpu: bool) -> None:
-    """Prepare Taichi, once in a process."""
-    options = {"device_memory_GB": 8} if gpu else {"cpu_max_num_threads": 1}
-    ti.init(arch=ti.cuda if gpu else ti.cpu, default_fp=_real, log_level=ti.WARN, **options)
+    """Prepare Taichi, once in a process.
+
+    Raises:
+        ValueError: for a GPU where there is none.
+    """
+    options = {"device_memory_GB": 4} if gpu else {"cpu_max_num_threads": 1}
+    ti.init(arch=ti.cuda if gpu else ti.cpu, default_fp=_real, log_level=ti.ERROR, **options)
+    if gpu and ti.cfg.arch != ti.cuda:
+        raise ValueError("gpu = True: there is no CUDA device, wanted one, or processes alone")
 
 
 def able(world: World) -> bool:
@@ -53,7 +59,7 @@ def _slope(i, k):
 
 @ti.data_oriented
 class Fleet:
-    """Trials of bodies with the same mesh, at rest at the start of each."""
+    """Trials of one body, which are advanced together."""
 
     def __init__(self, marches: Sequence[March], instants: Sequence[Floats], points: Sequence[tuple[Ints, Floats]]):
         """Copy what the trials are.

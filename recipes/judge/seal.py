@@ -305,7 +305,8 @@ def seal(
         SHA-256 of truth.sealed, or nothing while cases are left to be made.
 
     Raises:
-        ValueError: If the folder holds a batch with other settings, or a new batch gets no seed, or two.
+        ValueError: If the folder holds a batch with other settings, a new batch gets no seed, or two, or a GPU is asked
+            for where there is none.
     """
     if seed is not None and seed_from_os:
         raise ValueError(f"seed = {seed}: also seed_from_os, wanted one of the two")

@@ -2,8 +2,9 @@
 
     python recipes/validate/gap.py walker --hide tube --out runs/gap
     python recipes/validate/gap_error.py runs/gap
+    python recipes/validate/gap_error.py runs/gap --edges 0.0029 0.00175
 
-Both twins simulate the described model, and the same with the effect in its true form and with its true numbers. What
+The twins simulate the described model, and the same with the effect in its true form and with its true numbers. What
 is left of each trial, once measurement errors are fitted, is the error of the twin, beside noise. Where it is not far
 less with the effect than without, the effect cannot be named by that twin. Motions corrected by ``simulated.csv`` have
 what that adds to the twin's motion of the described model.
@@ -11,6 +12,7 @@ what that adds to the twin's motion of the described model.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from collections.abc import Callable, Sequence
@@ -42,6 +44,8 @@ class Options:
 
     experiment: tyro.conf.Positional[Path]
     """Folder that gap.py wrote, with its truth beside it."""
+    edges: tuple[float, ...] = ()
+    """Edges of the cells of the twins [m]; those of an explanation if none."""
     threads: int = 0
     """0 for as many as there are processors."""
 
@@ -124,7 +128,8 @@ def main(asked: Options) -> dict[str, dict[str, list[float]]]:
     truth = json.loads(path.read_text(encoding="utf-8"))
     inputs = read_inputs(Explaining(experiment=asked.experiment, out=asked.experiment, threads=asked.threads))
     tables = {}
-    for twin in (inputs.twin, inputs.fine):
+    others = [dataclasses.replace(inputs.twin, edge=edge) for edge in asked.edges]
+    for twin in others or (inputs.twin, inputs.fine):
         problem = FitProblem(inputs.experiment, twin, trials=inputs.trials, threads=inputs.threads)
         tables[f"{1e3 * twin.edge:.1f}"] = table = remainders(problem, truth)
         print(f"cells of {1e3 * twin.edge:.1f} mm: mm left of {', '.join(t.name for t in problem.trials)}")
