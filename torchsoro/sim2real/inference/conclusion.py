@@ -66,8 +66,8 @@ def conclude(
     Args:
         weighing: Of all that was fitted.
         limit: Change of the motion that would have been seen [m].
-        too_weak: Share of the prior of what is missing that would not have been seen.
         remedies: By what, and with which factor, the limit would come to what matters.
+        too_weak: Share of the prior of what is missing that would not have been seen.
     """
     data, null = weighing.data, weighing.null
     probabilities, candidates = weighing.candidates()

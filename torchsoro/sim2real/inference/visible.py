@@ -65,9 +65,10 @@ def too_weak(data: Data, null: Posterior, tells: Isolability, kappa: float, name
     with np.errstate(divide="ignore", invalid="ignore"):
         needed = np.maximum(least, np.where(size > 0, own / size, np.inf))
     share = np.clip((np.log10(needed / STRENGTH) + 1) / 2, 0, 1)
-    # One that moves nothing that was recorded is not seen.
     owners = np.array(tells.owners)
-    return float(np.mean([np.median(share[owners == name]) if name in owners else 1.0 for name in set(tells.effects)]))
+    # One that moves nothing that was recorded is not seen.
+    each = [np.median(share[owners == name]) if name in owners else 1.0 for name in sorted(set(tells.effects))]
+    return float(np.mean(each))
 
 
 def _least(
