@@ -27,7 +27,7 @@ def vector(*values):
     return torch.tensor(values, dtype=torch.float64)
 
 
-@ways("apic", "flip", "total")
+@ways("apic", "flip", "total", slow=["apic"])
 def test_the_ground_holds_a_block(way):
     _, rest = run(gravity=(0.0, 0.0, -G), planes=[ground()], **way)
     sag = rest.center_of_gravity[..., 2] - rest.center_of_gravity[0, 2]
@@ -120,7 +120,7 @@ def test_adhesion_resists_a_pull_that_just_exceeds_it(way):
     assert falls[0] > factor * falls[1] > factor**2 * falls[2] > falls[3]
 
 
-@ways("apic", "total")
+@ways("apic", "total", slow=["apic"])
 def test_tensor_planes_have_a_batch_and_gradients(way):
     mu = torch.tensor([0.2, 0.4], dtype=torch.float64, requires_grad=True)
     _, sliding = run(

@@ -15,7 +15,7 @@ DOMAIN = Domain(
 )
 
 
-@pytest.mark.parametrize("form", ["total", "updated"])
+@pytest.mark.parametrize("form", ["total", pytest.param("updated", marks=pytest.mark.slow)])
 def test_gradient_of_travel_by_the_design_field_is_the_central_difference(form):
     field = DesignField(DOMAIN, radius=0.006, symmetry=(), dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)

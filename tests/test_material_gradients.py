@@ -279,6 +279,7 @@ def test_gradient_at_exactly_zero_equals_the_one_sided_difference(name, way):
     check(numbers[name], lambda t: total({name: t}), scale=scale, one_sided=True, zero=zero, rtol=rtol)
 
 
+@pytest.mark.slow
 def test_flip_gradient_along_all_numbers_at_once_equals_the_central_difference():
     along = {
         name: noise(*value.shape, seed=k) * (LENGTHS.get(name) or float(value.abs().mean()))
