@@ -198,13 +198,13 @@ def test_intervals_cover_moduli_of_melt_with_one_relaxation_time_below_data_wind
         deformation="shear",
     )
     inside = []
-    for seed in range(4):
+    for seed in range(8):
         found = fit(sweep(truth, np.geomspace(1e-3, 1e3, 30), 0.02, seed), elements=4, equilibrium=False)
         assert found.intervals[0].unknown and not any(i.unknown for i in found.intervals[1:])
         for interval, modulus in zip(found.intervals[1:], truth.moduli[1:], strict=True):
             assert interval.high < 1.1 * interval.low
             inside.append(interval.low <= modulus <= interval.high)
-    assert sum(inside) >= 10  # of 12 at 95 %
+    assert sum(inside) >= 21  # of 24 at 95 %
 
 
 def test_intervals_hold_at_fixed_relaxation_times_for_serially_correlated_residuals():
