@@ -41,11 +41,30 @@ def believed_motion(name: str, number: int, world: World, finer: float, kept: Pa
 
 def expected(name: str, number: int, world: World, finer: float) -> Begun:
     """The march of such a motion, its instants [T] s, and what :meth:`March.run` takes of the stated markers."""
+    march, points = begun(name, number, world, finer)
+    return march, _times(name), points
+
+
+def begun(
+    name: str, number: int, world: World, finer: float, off: Floats | None = None
+) -> tuple[March, tuple[Ints, Floats]]:
+    """The march of a trial in a world, and nodes and shape functions [P, 27] of its markers.
+
+    Args:
+        name: Of the specimen.
+        number: Of its trial.
+        world: What is not as stated.
+        finer: Divides the elements' edge.
+        off: How far the markers are from where they are stated [markers, 3] m; they come first then, before the stated
+            places.
+    """
     specimen, mesh = SPECIMENS[name](), mesh_for(name, finer)
-    trial = specimen.trials[number]
-    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure)
-    points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-    return March(case, world), _times(name), mesh.interpolation(points)
+    trial, duration = specimen.trials[number], specimen.setup["duration"]
+    times = {"started": number * duration, "lasting": len(specimen.trials) * duration}
+    case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure, **times)
+    stated = np.array([m["at"] for m in specimen.setup["marker"]], float)
+    points = stated if off is None else np.concatenate([stated + off, stated])
+    return March(case, world), mesh.interpolation(points)
 
 
 def expected_path(name: str, number: int, world: World, finer: float, kept: Path) -> Path:

@@ -177,7 +177,6 @@ class March:
                 self.mass[nodes] += lump.mass * weights
         depth = (mesh.nodes[mesh.cells] - np.asarray(world.soft_at)) @ np.asarray(world.soft_normal)
         factor = world.modulus * (1 - world.soft * 0.5 * (1 + np.tanh(depth / world.soft_width)))
-        self.cooling = np.ones(1)
         self.shear, self.bulk = case.shear * factor, case.bulk * factor
         self.elements = np.asarray((*case.elements, *world.elements), float).reshape(-1, 2)
         self.law = np.array([world.gent, world.softening, world.softening_energy])

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from believed import Begun, expected, expected_path, keep
+from believed import Begun, begun, expected, expected_path, keep
 from camera import Errors, decoy, draw_errors, instants
 from effects import LIBRARY, OUTSIDE, Effect, own_world
 from lobatto import Floats
-from march import Broken, March, case_of
-from specimens import SPECIMENS, Specimen, mesh_for
+from march import Broken
+from specimens import SPECIMENS, Specimen
 from world import World
 
 MOTIONS = "sealed/motions"  # folder of motions of cases that are not made yet
@@ -109,13 +109,10 @@ class Motion:
 
     def begun(self) -> Begun:
         """The march, its instants [T] s, and the markers' places, first as they are, then as they are said to be."""
-        specimen, mesh = SPECIMENS[self.body](), mesh_for(self.body, self.finer)
-        trial, duration = specimen.trials[self.number], specimen.setup["duration"]
-        times = {"started": self.number * duration, "lasting": len(specimen.trials) * duration}
-        case = case_of({**specimen.setup, **trial.tables}, mesh, trial.pressure, **times)
-        points = np.array([m["at"] for m in specimen.setup["marker"]], float)
-        recorded = mesh.interpolation(np.concatenate([points + np.asarray(self.errors.places), points]))
-        return March(case, self.world), instants(specimen, self.errors, trial.name)[1], recorded
+        off = np.asarray(self.errors.places)
+        march, points = begun(self.body, self.number, self.world, self.finer, off)
+        specimen = SPECIMENS[self.body]()
+        return march, instants(specimen, self.errors, specimen.trials[self.number].name)[1], points
 
     def markers(self) -> Floats:
         """Markers of the trial [T, 2 markers, 3] m, first where they are, then where they are said to be.
