@@ -10,10 +10,11 @@ import torch
 from test_experiment import experiment
 
 from torchsoro.sim2real.data.experiment import read_experiment
+from torchsoro.sim2real.data.schema import ForceTable
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.twin.batch import _at_once, _countable, _Group, simulate, waves
-from torchsoro.sim2real.twin.twin import Twin
+from torchsoro.sim2real.twin.batch import _at_once, _countable, _Group, safety, simulate, waves
+from torchsoro.sim2real.twin.twin import Twin, _steps
 from torchsoro.simulation.kernels.layout import LARGEST
 
 EDGE = 0.008
@@ -115,3 +116,17 @@ def test_a_gpu_moves_markers_as_lanes_do(trial, cuda):
     found = simulate(on_gpu, [still.replace(velocity=still.velocity + far)])[0]
     assert found.sound.tolist() == [False, True]
     np.testing.assert_allclose(found.position[1], simulate(twin, [still])[0].position[0], rtol=0, atol=2e-6)
+
+
+def test_a_solid_that_softens_steeply_has_a_step_that_is_short_enough(trial):
+    """Held near its largest stretch, where what softens little is steep: with steps as near rest, it diverges."""
+    twin = Twin(trial.setup, edge=EDGE)
+    pulled = ForceTable(box=((0.036, -1, -1), (0.041, 1, 1)), force=(0, 0, 0.7), ramp=0.05)
+    still = twin.scenario(trial).replace(loads=tuple(_steps(pulled, twin.grid.within(pulled.box))))
+    still = still.replace(poisson_ratio=torch.tensor(0.3, dtype=torch.float64))
+    asked = torch.tensor([[0.3, -6.0], [0.1, -7.0], [0.6, -6.0]], dtype=torch.float64)
+    deep = EFFECTS["Softening"](still, asked, twin)
+    (bare,), (found,) = simulate(twin, [still]), simulate(twin, [deep])
+    (wanted,) = simulate(twin, [deep], safe=safety(twin) / 8)
+    assert_same([found], [wanted], 3e-5)  # of a step that is up to eight times as long
+    assert found.sound.all() and (np.abs(wanted.position - bare.position).max((1, 2, 3)) > 5e-4).all()

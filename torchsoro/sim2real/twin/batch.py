@@ -34,6 +34,8 @@ SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars
 CUT = 0.7  # the same where cells are filled in part, whose nodes may have little mass; robots on legs bear up to 0.9
 MESHED = 1.0  # the same of a mesh in whole cells; robots on legs bear up to 1.25
 SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
+SOFTENED = 0.6  # of the steepest slope below the largest stretch, that counts: it falls at once; a finger bears 0.6
+SHORTER = 4  # times that a step is shortened, to half of it at most, until a solid that softens is stable
 HALVINGS = 30  # of the error of ln dt, where the stiffness depends on the step
 THREADS = os.cpu_count() or 1
 TOGETHER = 8  # threads that simulate one group, at most: they wait for each other twice a step
@@ -88,46 +90,46 @@ def simulate(
     if not (shortest := min(float(dt.min()) for dt in steps)) > SHORTEST:
         raise ValueError(f"stiffness: a step of {shortest:g} s is needed, wanted a body with at least {SHORTEST:g} s")
     samples = math.ceil(max(s.until for s in scenarios) / SAMPLE - 1e-9) + 1
-    alike: dict[object, list[Lane]] = {}
-    for i, s in enumerate(scenarios):
-        alike.setdefault(_kind(s), []).extend((i, b) for b in range(s.batch))
-    groups: list[list[Lane]] = []
-    for members in alike.values():
-        # What is alike goes together: all of a group take the time of the most elements, and the shortest step.
-        members.sort(key=lambda lane: (*_extras(scenarios[lane[0]]), steps[lane[0]][lane[1]]))
-        if twin.device == "cpu":
-            groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
-        else:
-            elements = max(_extras(scenarios[i])[0] for i, _ in members)
-            most = min(MOST_AT_ONCE, _countable(twin, samples, elements))
-            groups += _at_once(members, [steps[i][b] for i, b in members], most)
     markers = torch.tensor([m.at for m in twin.setup.markers], dtype=torch.float64).reshape(-1, 3)
     shape = samples, len(markers)
     position, velocity = ([np.zeros((s.batch, *shape, 3)) for s in scenarios] for _ in range(2))
     deformation = [np.zeros((s.batch, *shape, 3, 3)) for s in scenarios]
     sound = [np.zeros(s.batch, bool) for s in scenarios]
 
-    def run(group: list[Lane], share_of_threads: int) -> float:
+    def run(group: list[Lane], share_of_threads: int) -> tuple[float, list[Lane]]:
+        """Simulate; returns the step, and what softens so much that this is too long, with a shorter one noted."""
         every = math.ceil(SAMPLE / min(steps[i][b] for i, b in group))
         with threads_here(share_of_threads), torch.no_grad():
-            found = _Group(twin, scenarios, group).simulate(SAMPLE / every, samples - 1, markers, share)
+            own = _Group(twin, scenarios, group)
+            found = own.simulate(SAMPLE / every, samples - 1, markers, share)
         seen = (position, found.position), (velocity, found.velocity), (deformation, found.deformation)
         for kept, values in (*seen, (sound, found.sound)):
             for (i, b), one in zip(group, values.numpy(), strict=True):
                 kept[i][b] = one
-        return found.dt
+        again = []
+        for (i, b), stretch in zip(group, own.stretched(found), strict=True):
+            if stretch and (needed := float(stable(twin.grid, scenarios[i], share, stretch)[b])) < found.dt:
+                steps[i][b] = max(needed, found.dt / 2)
+                again.append((i, b))
+        return found.dt, again
 
-    largest, first, done = 0.0, 0, 0.0
+    largest, lanes = 0.0, [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
     whole = sum(s.until * s.batch for s in scenarios)
-    plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
-    for width, count in sorted(Counter(plan).items(), reverse=True):
-        part = groups[first : first + width * count]
-        each = [min(threads // width, TOGETHER)] * len(part)
-        with ThreadPoolExecutor(width) if width > 1 else contextlib.nullcontext() as pool:
-            for group, dt in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
-                largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
-                watch(done / whole)
-        first += len(part)
+    for k in range(1 + SHORTER):
+        groups, left, first, done = _grouped(twin, scenarios, lanes, steps, samples), [], 0, 0.0
+        plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
+        for width, count in sorted(Counter(plan).items(), reverse=True):
+            part = groups[first : first + width * count]
+            each = [min(threads // width, TOGETHER)] * len(part)
+            with ThreadPoolExecutor(width) if width > 1 else contextlib.nullcontext() as pool:
+                for group, (dt, again) in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
+                    largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
+                    left += again
+                    if not k:
+                        watch(done / whole)
+            first += len(part)
+        if not (lanes := sorted(left)):
+            break
     time = np.arange(samples) * SAMPLE
     return [
         MarkerTrajectory(time=time, position=x, velocity=v, deformation=F, sound=ok, dt=largest)
@@ -156,6 +158,25 @@ def _at_once(members: list[Lane], steps: list[float], most: int = MOST_AT_ONCE) 
     return batches
 
 
+def _grouped(
+    twin: Twin, scenarios: Sequence[Scenario], lanes: Sequence[Lane], steps: Sequence[np.ndarray], samples: int
+) -> list[list[Lane]]:
+    """What is alike goes together: all of a group take the time of the most elements, and the shortest step."""
+    alike: dict[object, list[Lane]] = {}
+    for i, b in lanes:
+        alike.setdefault(_kind(scenarios[i]), []).append((i, b))
+    groups: list[list[Lane]] = []
+    for members in alike.values():
+        members.sort(key=lambda lane: (*_extras(scenarios[lane[0]]), steps[lane[0]][lane[1]]))
+        if twin.device == "cpu":
+            groups += [members[k : k + LANES] for k in range(0, len(members), LANES)]
+        else:
+            elements = max(_extras(scenarios[i])[0] for i, _ in members)
+            most = min(MOST_AT_ONCE, _countable(twin, samples, elements))
+            groups += _at_once(members, [steps[i][b] for i, b in members], most)
+    return groups
+
+
 @cache
 def waves(groups: int, threads: int) -> tuple[int, ...]:
     """How many groups to simulate side by side, wave after wave, in the least time; those of a wave share the threads.
@@ -172,15 +193,28 @@ def waves(groups: int, threads: int) -> tuple[int, ...]:
     return min(plans, key=lambda plan: sum(min(threads // width, TOGETHER) ** -MARCHING for width in plan))
 
 
-def stable(grid: Grid, s: Scenario, share: float) -> np.ndarray:
-    """Largest step of each variation [B] s with ``share`` of the bound near rest; see ``courant.total_courant``."""
+def stable(grid: Grid, s: Scenario, share: float, stretch: float = 0.0) -> np.ndarray:
+    """Largest step of each variation [B] s with ``share`` of the bound near rest; see ``courant.total_courant``.
+
+    Below its largest stretch x = I1b - 3 so far, a solid that softens by d over a span r is steeper: the slope of its
+    factor 1 - d erf(u / r), 2 d / (sqrt(pi) r) at most, adds up to 4 d x / (sqrt(pi) r) to its relative stiffness.
+    (From the law, with b' the deviatoric part of the isochoric left Cauchy-Green tensor and b':b' = 2 x near rest.)
+
+    Args:
+        grid: Of the body.
+        s: The scenario.
+        share: Of the bound.
+        stretch: Largest x.
+    """
     nu = s.poisson_ratio.unsqueeze(-1)
     bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
     bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch) for m in (bulk, shear))
     steep, dt = max(a.steep for a in grid.axes), np.ones(s.batch)
     bulk, shear = bulk.numpy(), shear.numpy()
+    depth, span = (s.softening[..., k].expand(s.batch).numpy() for k in range(2))
+    steeper = 1 + SOFTENED * 4 / math.sqrt(math.pi) * depth * stretch / span
     for _ in range(1 if s.prony is None else HALVINGS):
-        factor = 1.0 if s.prony is None else 1 + _step_moduli(s.prony, dt)
+        factor = steeper if s.prony is None else steeper + _step_moduli(s.prony, dt)
         speed = np.maximum(math.sqrt(3) * bulk, np.sqrt(2 * factor) * shear)
         bound = share * 2 / (speed * math.sqrt(steep))
         dt = bound if s.prony is None else np.sqrt(dt * bound)
@@ -248,6 +282,14 @@ class _Group:
             divergence="mark",
             record="probes",
         )
+
+    def stretched(self, found: Trajectory) -> list[float]:
+        """Largest stretch of each variation that softens, I1b - 3; that of one that diverged is out of all bounds."""
+        softens = self.rows(lambda s: s.softening, 1)[:, 0] > 0
+        if not bool(softens.any()):
+            return [0.0] * len(self.lanes)
+        largest = found.final[..., -self.twin.grid.lattice.count :].amax(-1).cpu()
+        return torch.where(softens, torch.where(found.sound, largest, FAR), 0.0).tolist()
 
     def rows(self, get: Amounts, rank: int) -> Tensor:
         """A quantity of each variation [K, ...] float32, of as many axes as it has without a batch."""
