@@ -89,7 +89,7 @@ class Softening(Hypothesis):
     """Stress is lower below the largest stretch so far (Mullins), by the law of Ogden and Roxburgh (1999)."""
 
     name, affected_quantity, model_form_deviation = "softening", "stress below the largest stretch so far", LAW
-    quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -10.0, 1.0))
+    quantities = (Quantity("depth", "1", 0.1, 0.0, 9.0), Quantity("ln_range", "ln of I1b - 3", 1.0, -8.0, 1.0))
     starts = tuple((d, r) for d in (1.0, 3.0) for r in (-7.0, -5.0, -3.0))
 
     def forward(self, scenario: Scenario, values: Tensor, twin: Twin) -> Scenario:

@@ -33,7 +33,7 @@ from torchsoro.sim2real.inference.least_squares import told
 from torchsoro.sim2real.inference.observed import Data
 from torchsoro.sim2real.inference.search import search
 from torchsoro.sim2real.inference.starts import unconstrained
-from torchsoro.sim2real.inference.weighing import Weighing, adjustment
+from torchsoro.sim2real.inference.weighing import CLOSE, Weighing, adjustment
 
 FOLDS = 4  # trials that are left out, one after the other
 NAMED = ("explained", "cannot_distinguish")  # verdicts that name effects
@@ -267,6 +267,7 @@ def _as_simpler(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequen
     found, known = [], len(problem.common)
     for fit in ends:
         if len(fit.effects) != 1:
+            found += _alone(problem, fit)
             continue
         for simple in fit.effects[0].simpler(fit.values[0]):
             plain = next((e for e in effects if e.name == simple.name), None)
@@ -281,6 +282,22 @@ def _as_simpler(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequen
                     stated[k] = 0.0
             found.append(dataclasses.replace(fit, effects=(plain,), point=np.concatenate([stated, own])))
     return found
+
+
+def _alone(problem: FitProblem, pair: Fit) -> list[Fit]:
+    """Each effect of a pair without the other, where that is hardly there."""
+    known = len(problem.common)
+    ends = np.cumsum([len(e.quantities) + 3 * e.local for e in pair.effects])
+    parts = np.split(pair.point[known:], ends[:-1])
+    hardly = [
+        all(abs(x) < CLOSE for k, (q, x) in enumerate(zip(e.quantities, own, strict=False)) if not k or q.least >= 0)
+        for e, own in zip(pair.effects, parts, strict=True)
+    ]
+    return [
+        dataclasses.replace(pair, effects=(effect,), point=np.concatenate([pair.point[:known], own]))
+        for k, (effect, own) in enumerate(zip(pair.effects, parts, strict=True))
+        if any(hardly[:k] + hardly[k + 1 :]) and not hardly[k]
+    ]
 
 
 def _far(weighing: Weighing, behind: float) -> list[Posterior]:

@@ -96,8 +96,8 @@ def simulate(
     deformation = [np.zeros((s.batch, *shape, 3, 3)) for s in scenarios]
     sound = [np.zeros(s.batch, bool) for s in scenarios]
 
-    def run(group: list[Lane], share_of_threads: int) -> tuple[float, list[Lane]]:
-        """Simulate; returns the step, and what softens so much that this is too long, with a shorter one noted."""
+    def run(group: list[Lane], share_of_threads: int) -> tuple[float, list[float]]:
+        """Simulate; returns the step, and the largest stretch of what softens."""
         every = math.ceil(SAMPLE / min(steps[i][b] for i, b in group))
         with threads_here(share_of_threads), torch.no_grad():
             own = _Group(twin, scenarios, group)
@@ -106,29 +106,37 @@ def simulate(
         for kept, values in (*seen, (sound, found.sound)):
             for (i, b), one in zip(group, values.numpy(), strict=True):
                 kept[i][b] = one
-        again = []
-        for (i, b), stretch in zip(group, own.stretched(found), strict=True):
-            if stretch and (needed := float(stable(twin.grid, scenarios[i], share, stretch)[b])) < found.dt:
-                steps[i][b] = max(needed, found.dt / 2)
-                again.append((i, b))
-        return found.dt, again
+        return found.dt, own.stretched(found)
+
+    def needed(lane: Lane, stretch: float) -> float:
+        return float(stable(twin.grid, scenarios[lane[0]], share, stretch)[lane[1]])
 
     largest, lanes = 0.0, [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
     whole = sum(s.until * s.batch for s in scenarios)
     for k in range(1 + SHORTER):
-        groups, left, first, done = _grouped(twin, scenarios, lanes, steps, samples), [], 0, 0.0
+        groups, first, done = _grouped(twin, scenarios, lanes, steps, samples), 0, 0.0
+        borne, left = 0.0, []
         plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
         for width, count in sorted(Counter(plan).items(), reverse=True):
             part = groups[first : first + width * count]
             each = [min(threads // width, TOGETHER)] * len(part)
             with ThreadPoolExecutor(width) if width > 1 else contextlib.nullcontext() as pool:
-                for group, (dt, again) in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
+                for group, (dt, stretches) in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
                     largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
-                    left += again
+                    for lane, stretch in zip(group, stretches, strict=True):
+                        if stretch and needed(lane, stretch) < dt:
+                            left.append((lane, dt))
+                        else:
+                            borne = max(borne, stretch)
                     if not k:
                         watch(done / whole)
             first += len(part)
-        if not (lanes := sorted(left)):
+        # What was not stable has stretched too far: others tell how far it should, or half of the step is next.
+        lanes = sorted(lane for lane, _ in left)
+        for (i, b), dt in left:
+            shorter = needed((i, b), borne) if borne else dt
+            steps[i][b] = shorter if shorter < dt else dt / 2
+        if not lanes:
             break
     time = np.arange(samples) * SAMPLE
     return [
