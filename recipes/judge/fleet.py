@@ -40,8 +40,8 @@ def start(*, gpu: bool) -> None:
 
 
 def able(world: World) -> bool:
-    """Whether a world has only what is computed here: no softening, drag, wind, magnet, or liquid."""
-    other = world.softening or world.drag or world.gust is not None or world.magnet is not None
+    """Whether a world has only what is computed here: no stiffening, softening, drag, wind, magnet, or liquid."""
+    other = world.gent or world.softening or world.drag or world.gust is not None or world.magnet is not None
     return not other and len(world.chains) < 2 and not any(lump.frequency for lump in world.lumps)
 
 
@@ -117,7 +117,6 @@ class Fleet:
         self.factor = self._field(flat)
         self.shear = self._field([m.case.shear for m in marches])
         self.bulk = self._field([m.case.bulk for m in marches])
-        self.gent = self._field([m.law[0] for m in marches])
         discrete = np.zeros((self.count, max(self.links, 1), 3))
         for s, m in enumerate(marches):
             discrete[s, : len(m.discrete)] = m.discrete
@@ -252,7 +251,7 @@ class Fleet:
         cb = two * (f.transpose() @ f)
         trace = cb.trace()
         pulled = (ti.Matrix.identity(_real, 3) - trace / 3 * cb.inverse()) / j
-        t = pulled / (1 - ti.min(self.gent[s] * (trace - 3), 0.9))
+        t = 1.0 * pulled
         for c in ti.static(range(6)):
             row, col = ti.static(((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))[c])
             change = pulled[row, col] - self.old[c, s, p]

@@ -26,6 +26,8 @@ STICK = 1e6
 # Stiffness of the plate over that of the thinnest layer of elements. With 1 in place of 16, bodies bounce higher:
 # a thrown block moves differently by 0.8 mm, a body that hops by millimetres.
 PLATE = 16.0
+AGREE = 1e-5  # root mean square difference [m] of motions of a step and of half of it, below which it is short enough
+HALVINGS = 5  # of the step, at most
 LANDING = 10.0  # loss of nodes that press on the plate, over the impedance of plane waves: they land without chatter
 
 
@@ -352,7 +354,28 @@ class March:
         self.t += dt
 
     def run(self, instants: Floats, nodes: Ints, shapes: Floats) -> Floats:
-        """Positions [T, P, 3] m of points x = sum shapes * x[nodes] at increasing instants [T] s."""
+        """Positions [T, P, 3] m of points x = sum shapes * x[nodes] at increasing instants [T] s.
+
+        A solid that stiffens, or that is steep below the largest stretch that softened it, needs a step that is shorter
+        than near rest by as much as it stretches: that is halved until the motion is the same.
+
+        Raises:
+            Broken: if an element turns inside out, with however short a step.
+        """
+        if not (self.world.gent or self.world.softening):
+            return self._run(instants, nodes, shapes)
+        found = None
+        for k in range(1 + HALVINGS):
+            again = March(self.case, self.world, self.dt / 2**k)
+            try:
+                before, found = found, again._run(instants, nodes, shapes)
+            except Broken:
+                before = found = None
+            if before is not None and found is not None and math.sqrt(np.mean((found - before) ** 2)) < AGREE:
+                return found
+        raise Broken(f"no step down to {self.dt / 2**HALVINGS:.2g} s is short enough")
+
+    def _run(self, instants: Floats, nodes: Ints, shapes: Floats) -> Floats:
         out = np.zeros((len(instants), len(nodes), 3))
         done, number = 0, 0
         while done < len(instants):
