@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from swings import draws, recorded
 
+from torchsoro.sim2real.inference.evidence import infer
 from torchsoro.sim2real.inference.observed import size_of
 from torchsoro.sim2real.inference.remaining_error import ORDER, by_richardson, by_spread, cleared
 
@@ -62,6 +63,19 @@ def test_errors_of_other_twins_add_up():
     left = [size_of(cleared(data, nothing, o)) for o in (one, other)]
     assert priced.numerics.size == pytest.approx(float(np.hypot(*left)), rel=1e-6)
     assert priced.numerics.modes[0].shape[-1] == 7 + 2
+
+
+def test_what_smaller_cells_would_change_may_look_like_a_belief():
+    data, _, drag = recorded(0.0, 3)
+    believed = dataclasses.replace(drag, model=dataclasses.replace(drag.model, own=()))
+    difference = tuple(0.2 * J[..., 0] for J in drag.slopes)
+    priced = by_spread(data, believed, [drag.residuals] * 7, SHIFTS, beyond=(difference,))
+    for mode, whole in zip(priced.numerics.modes, difference, strict=True):
+        assert mode[..., -1] == pytest.approx(whole, nan_ok=True)
+    assert priced.numerics.size < 0.05 * size_of(difference)  # what a belief does not take up
+    without = by_spread(data, believed, [drag.residuals] * 7, SHIFTS)
+    sure, unsure = (float(infer(data, m).mode.covariance[0, 0]) for m in (without, priced))
+    assert unsure > 4 * sure
 
 
 def test_two_twins_have_no_spread_and_shifts_are_theirs():

@@ -12,6 +12,7 @@ from ringing import bar, effect, onto_a_floor
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
+from torchsoro.sim2real.inference.resolution import finest
 from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
@@ -88,3 +89,24 @@ def test_the_chance_of_both_twins_is_measured(on_a_floor):
         (motions,) = shifted(problem, [((), np.zeros((1, 1)))], GAPS)
         moved = np.concatenate([np.ptp(m.position, axis=0).ravel() for m in motions])
         assert 0 < chance < moved.max()
+
+
+@pytest.mark.slow
+def test_a_third_twin_corrects_the_finer_one(on_a_floor):
+    third = finest(on_a_floor.fine, 1, math.inf)
+    assert third is not None
+    known = measure(on_a_floor.experiment, on_a_floor.twin, on_a_floor.fine, finest=third)
+    assert set(known.smaller) == {t.name for t in on_a_floor.trials}
+    problem = on_a_floor.only(on_a_floor.trials, discretization=known)
+    stated = [((), np.zeros((1, 1)))]
+    plain = on_a_floor.only(on_a_floor.trials, twin=on_a_floor.fine, discretization=DiscretizationError())
+    for corrected, fine, t in zip(
+        *(p.simulate(stated)[0] for p in (problem.by(on_a_floor.fine), plain)), problem.trials, strict=True
+    ):
+        change = corrected.position[0] - fine.position[0]
+        assert change == pytest.approx(known.smaller[t.name].position, abs=1e-12)
+        assert 0 < np.abs(change).max() < 0.2 * np.ptp(fine.position)
+
+
+def test_a_third_twin_that_takes_too_long_is_none(on_a_floor):
+    assert finest(on_a_floor.fine, 1, 1e-3) is None

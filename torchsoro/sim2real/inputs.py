@@ -17,7 +17,7 @@ from torchsoro.sim2real.data.recording import Recording
 from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.hypotheses.library import library
 from torchsoro.sim2real.inference.noise import estimate_noise
-from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer
+from torchsoro.sim2real.inference.resolution import choose_twin, cost, finer, finest
 from torchsoro.sim2real.inference.thinning import thinned
 from torchsoro.sim2real.options import Options
 from torchsoro.sim2real.twin.batch import THREADS
@@ -40,6 +40,7 @@ class Inputs:
         kept: With a recording, only to be predicted.
         twin: The body that is fitted.
         fine: Simulates one with smaller cells, which tells the other's error.
+        finest: The same of that one, where bodies meet planes and the budget allows it.
         effects: Considered; None for the whole library.
         notes: Recordings that were thinned, a line each.
         hints: What is likely to be a mistake in the data, a line each, and what was put right of it.
@@ -50,6 +51,7 @@ class Inputs:
     kept: tuple[Trial, ...]
     twin: Twin
     fine: Twin
+    finest: Twin | None
     threads: int
     effects: list[Hypothesis] | None
     notes: tuple[str, ...]
@@ -95,12 +97,15 @@ def read_inputs(options: Options) -> Inputs:
         raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
     with named_in(experiment.folder):
         fine = finer(twin, len(trials), 4 * options.budget)
+        touches = any(s.planes for s in scenarios.values())
+        third = finest(fine, len(trials), 15 * options.budget) if touches else None
     return Inputs(
         experiment=experiment,
         trials=trials,
         kept=tuple(t for t in experiment.heldout if t.recording is not None),
         twin=twin,
         fine=fine,
+        finest=third,
         threads=options.threads or THREADS,
         effects=effects,
         notes=tuple(notes),

@@ -94,7 +94,9 @@ def correct(inputs: Inputs, progress: Progress | None = None) -> FitProblem:
         inputs.experiment,
         inputs.twin,
         trials=inputs.trials,
-        discretization=measure(inputs.experiment, inputs.twin, inputs.fine, threads=inputs.threads, report=report),
+        discretization=measure(
+            inputs.experiment, inputs.twin, inputs.fine, finest=inputs.finest, threads=inputs.threads, report=report
+        ),
         fine=inputs.fine,
         threads=inputs.threads,
         report=report,

@@ -25,7 +25,8 @@ from torchsoro.sim2real.inference.least_squares import closest
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
+from torchsoro.sim2real.inference.remaining_error import TOUCHING, by_richardson, by_spread, chance_in
+from torchsoro.sim2real.inference.resolution import FINEST
 from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.weighing import Weighing
@@ -39,6 +40,7 @@ LEAST_RATIO = 1.1  # of the edges of two twins, that count as one finer than the
 RESOLVED = 2  # cells through the thinnest wall, from which on the error falls with their edge
 
 Moved = Mapping[Fit, Sequence[Motions]]  # residuals by the finer twin with planes moved; none where one breaks down
+_Others = tuple[Sequence[Motions], Sequence[Motions]]  # errors by what is as good, and by what would be better
 
 
 def data_of(problem: Likelihood) -> Data:
@@ -139,10 +141,12 @@ def near(
         )
     if finer is None:
         return models
-    others = [
-        [] if m is None else [*_by_other_cells(problem, [x.alone(0) for x in motions], f), *_by_sliding(problem, f, m)]
-        for f, motions, m in zip(fits, beside, models, strict=True)
-    ]
+    others: list[_Others] = []
+    for f, motions, m in zip(fits, beside, models, strict=True):
+        at, known = [x.alone(0) for x in motions], problem.discretization
+        alike = [] if m is None else [*_by_other_cells(problem, at, f, known.between), *_by_sliding(problem, f, m)]
+        left = [] if m is None else _by_other_cells(problem, at, f, known.smaller, 1 / (FINEST**TOUCHING - 1))
+        others.append((alike, left))
     return _corrected(problem, coarse, fits, models, others, finer, closely, moved or {})
 
 
@@ -151,7 +155,7 @@ def _corrected(
     coarse: FitProblem,
     fits: Sequence[Fit],
     models: Sequence[Linearised | None],
-    others: Sequence[Sequence[Motions]],
+    others: Sequence[_Others],
     fine: Twin,
     closely: bool,
     moved: Moved,
@@ -164,11 +168,11 @@ def _corrected(
     resolved = min(problem.discretization.walls, default=0) >= RESOLVED
     known = _deviation(problem, problem.discretization) if resolved else 0.0
 
-    def spread(model: Linearised | None, variants: Sequence[Motions], own: Sequence[Motions]) -> Linearised | None:
+    def spread(model: Linearised | None, variants: Sequence[Motions], own: _Others) -> Linearised | None:
         """A model by equally good twins; none where a simulation broke down."""
         if model is None or not variants:
             return None
-        return by_spread(data, model, variants, GAPS, model.residuals, edges, own, known)
+        return by_spread(data, model, variants, GAPS, model.residuals, edges, *own, known)
 
     if problem.rough and closely:
         fresh = [f for f in fits if f not in moved]
@@ -222,12 +226,17 @@ def _with_planes_moved(problem: Likelihood, fit: Fit, motions: Sequence[MarkerTr
     return [_left(problem, variant, fit.errors) for variant in moved]
 
 
-def _by_other_cells(problem: Likelihood, motions: Sequence[MarkerTrajectory], fit: Fit) -> list[Motions]:
-    """What cells between those of the twins change in residuals, by what they change in the setup as stated."""
-    known = problem.discretization.between
+def _by_other_cells(
+    problem: Likelihood,
+    motions: Sequence[MarkerTrajectory],
+    fit: Fit,
+    known: Mapping[str, MarkerTrajectory],
+    share: float = 1.0,
+) -> list[Motions]:
+    """What other cells change in residuals, by a share of what they are known to change in the setup as stated."""
     if not known:
         return []
-    moved = [m.plus(known[t.name]) for m, t in zip(motions, problem.trials, strict=True)]
+    moved = [m.plus(known[t.name], share) for m, t in zip(motions, problem.trials, strict=True)]
     with_them, without = (_left(problem, m, fit.errors) for m in (moved, motions))
     return [tuple(a - b for a, b in zip(with_them, without, strict=True))]
 

@@ -11,7 +11,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, added
+from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, Request, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.observed import Motions
 from torchsoro.sim2real.inference.remaining_error import chance_in
@@ -22,6 +22,7 @@ from torchsoro.sim2real.twin.batch import THREADS
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 
 SAFETY = 1.5  # standard deviation of the twin's error over the difference to the finer twin
+SHIFTS = 5  # of planes, over whose mean the finer twin and a third one are compared: a group of lanes with three trials
 NEARER = 2e-5 * np.array([-1.0, 1.0])  # shifts of planes by which the twin in use may be off [m]
 # Of recordings without measurement errors.
 EXACT = Priors(clock=1e-9, rate=1e-9, scale=1e-9, metres=1e-9, rotation=1e-9, place=1e-9)
@@ -34,6 +35,7 @@ def measure(
     twin: Twin,
     fine: Twin,
     *,
+    finest: Twin | None = None,
     threads: int = THREADS,
     report: Callable[[str], None] = lambda line: None,
 ) -> DiscretizationError:
@@ -46,6 +48,7 @@ def measure(
         experiment: What is to be explained, with trials that are only predicted.
         twin: In use.
         fine: Another, with smaller cells.
+        finest: A third, with still smaller cells, for bodies that meet planes.
         threads: That simulate.
         report: Called with a line after each batch of simulations.
     """
@@ -56,12 +59,21 @@ def measure(
     there = FitProblem(experiment, fine, trials=everything, **common)
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     cells: Mapping[str, MarkerTrajectory] = {}
+    smaller: Mapping[str, MarkerTrajectory] = {}
     chance = in_use = math.inf
     if there.touches and not any(t.simulated for t in trials):
         believed, touching, chance = _chance(there, len(trials))
         _, _, in_use = _chance(FitProblem(experiment, twin, trials=trials, **common), len(trials))
         middle = _believed(FitProblem(experiment, between(twin, fine), trials=trials, **common))
         cells = added(trials, believed[: len(trials)], middle)
+        if finest is not None:
+            (own,), (sharp,) = (
+                averaged(p, [_stated(there)], SHIFTS) for p in (there, there.only(everything, twin=finest))
+            )
+            smaller = added(everything, own, sharp)
+            believed = [
+                m.plus(smaller[t.name]) if t.name in smaller else m for m, t in zip(believed, everything, strict=True)
+            ]
     else:
         believed = _believed(there)
     other = [as_simulated(motion, t) for motion, t in zip(believed, everything, strict=True)]
@@ -94,6 +106,7 @@ def measure(
         correction=correction,
         touching=touching,
         between=cells,
+        smaller=smaller if all(t.name in smaller for t in trials) else {},
         chance=chance,
         chance_in_use=in_use,
         edges=(twin.edge, fine.edge),
@@ -105,7 +118,7 @@ def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
     if not here.touches:
         return []
-    (motions,) = shifted(here, [((), np.zeros((1, len(here.common))))], NEARER)
+    (motions,) = shifted(here, [_stated(here)], NEARER)
     return [[m.alone(k) for m in motions] for k in range(len(NEARER))]
 
 
@@ -113,7 +126,7 @@ def _chance(
     problem: FitProblem, count: int
 ) -> tuple[list[MarkerTrajectory], tuple[Mapping[str, MarkerTrajectory], ...], float]:
     """The motion as stated; what moved planes add to it in the first trials, by shift; how much is chance [m]."""
-    (motions,) = shifted(problem, [((), np.zeros((1, len(problem.common))))], GAPS)
+    (motions,) = shifted(problem, [_stated(problem)], GAPS)
     middle = [m.alone(len(GAPS) // 2) for m in motions]
     if not all(m.sound.all() for m in middle):
         raise ValueError(BREAKS)
@@ -190,13 +203,18 @@ def _recordings_of(here: FitProblem, motions: Sequence[MarkerTrajectory]) -> lis
     return recorded
 
 
+def _stated(problem: FitProblem) -> Request:
+    """The setup as stated."""
+    return (), np.zeros((1, len(problem.common)))
+
+
 def _believed(problem: FitProblem) -> list[MarkerTrajectory]:
     """Motion of the setup as stated, for each trial.
 
     Raises:
         ValueError: if it breaks down.
     """
-    motions = problem.simulate([((), np.zeros((1, len(problem.common))))])[0]
+    motions = problem.simulate([_stated(problem)])[0]
     if not all(m.sound.all() for m in motions):
         raise ValueError(BREAKS)
     return [m.alone() for m in motions]

@@ -216,9 +216,9 @@ class Likelihood:
         return dataclasses.replace(self, trials=tuple(trials), **changes)
 
     def by(self, twin: Twin) -> Self:
-        """The same by another twin as it is, which nothing corrects; touching hangs on chance as much."""
+        """The same by the finer twin, corrected by what still smaller cells add; touching hangs on chance as much."""
         chance = self.discretization.chance
-        error = DiscretizationError(chance=chance, chance_in_use=chance)
+        error = DiscretizationError(chance=chance, chance_in_use=chance, correction=self.discretization.smaller)
         return self.only(self.trials, twin=twin, discretization=error)
 
     def corrected(self, at: np.ndarray) -> Self:

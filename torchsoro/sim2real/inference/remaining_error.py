@@ -15,12 +15,13 @@ where planes are is stated. Beside that line, their mean at no shift predicts be
 
     S = (1 + 1/R) 1/(R - 2) sum_r d_r d_r',    d_r = y_r - mean - g_r sum_q g_q y_q / sum_q g_q^2,    sum_q g_q = 0,
 
-to which that of other cells is added, which are as good. The whole difference to larger cells, the error of the finer
-ones at order one, is a direction in which these may be off. It is no measure of how far where one of them is as wide as
-a wall: then it is one more draw. Where walls have two or more, it adds to chance, as other cells do, and the standard
-deviation by which searches are weighted counts beside them.
+to which that of other cells is added, which are as good. Where a third twin has smaller cells of edge h3, what these
+change is added to motions, and what is left of it at order one, h3 / (h2 - h3) of it, is one more direction. The whole
+difference to larger cells, the error of the finer ones at order one, is another in which these may be off. It is no
+measure of how far where one of them is as wide as a wall: then it is one more draw. Where walls have two or more, it
+adds to chance, as other cells do, and the standard deviation by which searches are weighted counts beside them.
 
-In both, only that counts which beliefs and measurement errors cannot take up.
+In all but that by smaller cells, only that counts which beliefs and measurement errors cannot take up.
 """
 
 from __future__ import annotations
@@ -77,6 +78,7 @@ def by_spread(
     coarser: Motions | None = None,
     ratio: float = math.inf,
     others: Sequence[Motions] = (),
+    beyond: Sequence[Motions] = (),
     known: np.ndarray | float = 0.0,
 ) -> Linearised:
     """The mean of equally good twins, with the error that this has, in each trial by itself.
@@ -93,6 +95,7 @@ def by_spread(
         coarser: Residuals by a twin with larger cells.
         ratio: Edge of its cells over that of the variants'.
         others: Errors of other kinds: what other cells that are as good, or another coefficient of friction, change.
+        beyond: What cells without size would change, as known from smaller ones.
         known: Standard deviation of an error that is known by its size alone [A, M] m.
 
     Raises:
@@ -114,9 +117,10 @@ def by_spread(
     if coarser is not None:
         share = 1 / (ratio**TOUCHING - 1)
         whole = [cleared(data, near, tuple(share * (b - m) for b, m in zip(coarser, mean, strict=True)))]
-    apart = [cleared(data, near, other) for other in others]
+    apart = [cleared(data, near, other) for other in (*others, *beyond)]
     process = _process(data, [*draws, *apart], [*modes, *apart])
-    together = tuple(np.stack(same, -1) for same in zip(*modes, *whole, *apart, strict=True))
+    # Cells that are too soft in all trials strain what is believed of the modulus, so that this part is in the mode.
+    together = tuple(np.stack(same, -1) for same in zip(*modes, *whole, *apart[: len(others)], *beyond, strict=True))
     beside = [*whole, *apart]
     numerics = dataclasses.replace(
         process,

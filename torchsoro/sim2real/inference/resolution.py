@@ -17,6 +17,7 @@ SLOW = 64.0  # reserve of the budget for searches that go on for long, and for s
 SLOW_WITH_PLANES = 24.0  # the same of a body that meets planes, where sliding makes a fine twin worth the time
 # Cells along an axis of the twin that corrects, over those of the twin in use: the first that its time allows.
 FINER = (2.0, 1.5)
+FINEST = 1.5  # of a third twin over the one that corrects, where bodies meet planes
 
 
 def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
@@ -66,14 +67,34 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
         trials: To simulate.
         seconds: On one thread; the least fine of those thought of takes as long as it takes.
     """
-    least = min(a.cells for a in twin.grid.axes)
     for share in FINER:
-        walls, across = math.ceil(share * twin.walls), math.ceil(share * least)
-        fine = dataclasses.replace(twin, edge=twin.edge / share, walls=walls, across=across)
-        # A group of lanes takes as long with one trial as with sixteen.
-        if cost(fine, trials, 16 / trials * CORES) <= seconds:
+        fine = _smaller(twin, share)
+        if _once(fine, trials) <= seconds:
             break
     return fine
+
+
+def finest(fine: Twin, trials: int, seconds: float) -> Twin | None:
+    """A third twin, by which the error of the second one is told where bodies meet planes.
+
+    Args:
+        fine: The second one.
+        trials: To simulate.
+        seconds: On one thread, that simulating them once may take; without a twin that takes so long, None.
+    """
+    found = _smaller(fine, FINEST)
+    return found if _once(found, trials) <= seconds else None
+
+
+def _once(twin: Twin, trials: int) -> float:
+    """Seconds that simulating trials once takes on one thread, about: as long with one trial as with sixteen."""
+    return cost(twin, trials, 16 / trials * CORES)
+
+
+def _smaller(twin: Twin, share: float) -> Twin:
+    """A twin with so many more cells along each axis."""
+    walls, across = math.ceil(share * twin.walls), math.ceil(share * min(a.cells for a in twin.grid.axes))
+    return dataclasses.replace(twin, edge=twin.edge / share, walls=walls, across=across)
 
 
 def between(twin: Twin, fine: Twin) -> Twin:
@@ -83,6 +104,4 @@ def between(twin: Twin, fine: Twin) -> Twin:
         twin: The one in use.
         fine: The finer one.
     """
-    share = (1 + twin.edge / fine.edge) / 2
-    across = math.ceil(share * min(a.cells for a in twin.grid.axes))
-    return dataclasses.replace(twin, edge=twin.edge / share, walls=math.ceil(share * twin.walls), across=across)
+    return _smaller(twin, (1 + twin.edge / fine.edge) / 2)
