@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +12,13 @@ from swings import EXACT, draws, recorded, weighed
 
 from torchsoro.sim2real.inference import conclusion
 from torchsoro.sim2real.inference.conclusion import conclude
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, UNEXPLAINED
+from torchsoro.sim2real.inference.decision import (
+    CREDIBLE,
+    MATTERS,
+    UNEXPLAINED,
+    WRONG,
+    WRONG_BY_LEFT,
+)
 from torchsoro.sim2real.inference.evidence import (
     Linearised,
     Model,
@@ -50,6 +57,21 @@ def test_what_is_too_weak_to_be_seen_is_told_beside_nothing_and_changes_no_verdi
     assert weak.probabilities["unseen"] == pytest.approx(0.3 * weak.probabilities["nothing"], rel=1e-9)
     assert weak.probabilities["nothing"] + weak.probabilities["unseen"] > CREDIBLE
     assert strong.probabilities["unseen"] < 1e-6
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02])
+def test_what_a_name_leaves_counts_against_it_by_the_record_of_former_ones(share):
+    """What former batches say of it, up to a half; without a say in the verdict."""
+    data, nothing, drag = recorded(share, 4, effect=0.3)
+    weighing = weighed(data, nothing, drag)
+    found = conclude(weighing, limit=0.0)
+    (c,) = found.candidates
+    odds = WRONG * math.exp(WRONG_BY_LEFT * c.left / math.hypot(data.noise, drag.numerics.size, c.size / 10))
+    lost = min(odds / (1 + odds), 0.5)
+    assert found.calibrated["drag"] == pytest.approx((1 - lost) * found.probabilities["drag"])
+    assert sum(found.calibrated.values()) == pytest.approx(1.0)
+    assert found.calibrated["nothing"] == found.probabilities["nothing"]
+    assert lost > 0.3 if share else lost < 0.3
 
 
 def test_a_discrepancy_that_no_effect_explains_is_unknown():

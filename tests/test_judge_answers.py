@@ -127,6 +127,18 @@ def test_probabilities_are_compared_with_how_often_they_are_right(judge):
     assert rows["noise, as told / real, where it is not stated"].startswith("0.9 ")
 
 
+def test_the_track_record_of_names_is_found_again(judge):
+    """Odds by which names are drawn that are wrong, and the calibration of names that were all told with one."""
+    rng, record = np.random.default_rng(2), (0.15, 3.0)
+    left = rng.exponential(0.3, 4000)
+    known = [(1.0, bool(rng.random() > judge.track_record.doubt(x, *record)), float(x)) for x in left]
+    found = judge.track_record.fitted(known)
+    assert found == pytest.approx(record, rel=0.2)
+    told = [(p * (1 - judge.track_record.doubt(x, *found)), r, x) for p, r, x in known]
+    before, after = (float(judge.track_record.calibration(rows).split()[3][:-1]) for rows in (known, told))
+    assert before > 0.2 and after < 0.03
+
+
 def test_the_error_that_is_told_is_compared_with_that_of_the_sealed_trial(judge, tmp_path):
     folder, sealed = tmp_path / "answers" / "case-000", tmp_path / "sealed" / "case-000"
     time, place = np.linspace(0.0, 1.0, 5), np.zeros((5, 1, 3))

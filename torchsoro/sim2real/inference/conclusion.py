@@ -5,6 +5,11 @@ told beside that of nothing. In the set, what changes the motion by less than ma
 not credible beside it and trials left out are predicted better with it; else it counts as nothing. So does what the
 second of two effects adds to the first. Where something is missing, and the first of the set predicts trials left out
 surely worse than nothing does, no name of the set is it.
+
+All this holds if one of the models does. Of names that were most probable in former sealed batches some were wrong, the
+more of them the more they left: with the odds WRONG exp(WRONG_BY_LEFT x), x = left / sqrt(noise^2 + error^2 +
+(change / 10)^2). Calibrated, so much of a name's probability, up to a half, is that of what is unknown. No verdict
+changes by that.
 """
 
 from __future__ import annotations
@@ -15,7 +20,15 @@ from dataclasses import dataclass, field
 from functools import cache
 from statistics import NormalDist
 
-from torchsoro.sim2real.inference.decision import CREDIBLE, MATTERS, MISSING, UNEXPLAINED, VISIBLE
+from torchsoro.sim2real.inference.decision import (
+    CREDIBLE,
+    MATTERS,
+    MISSING,
+    UNEXPLAINED,
+    VISIBLE,
+    WRONG,
+    WRONG_BY_LEFT,
+)
 from torchsoro.sim2real.inference.evidence import Posterior, compared
 from torchsoro.sim2real.inference.weighing import NOTHING, UNKNOWN, UNSEEN, Candidate, Weighing, apart
 
@@ -30,6 +43,7 @@ class Conclusion:
         credible: That set, most probable first, with what is no effect.
         probabilities: Posterior, of nothing, of what is too weak to be seen, of what is unknown, and of each name,
             whether it matters or not.
+        calibrated: The same, with the doubt in names that former batches leave.
         candidates: Effects and pairs, most probable first.
         nothing: The model without an effect.
         left: What that one leaves of the recordings, its beliefs within tolerances, see :func:`remainder` [m].
@@ -46,6 +60,7 @@ class Conclusion:
     chosen: tuple[str, ...]
     credible: tuple[str, ...]
     probabilities: dict[str, float]
+    calibrated: dict[str, float]
     candidates: tuple[Candidate, ...]
     nothing: Posterior
     left: float
@@ -118,6 +133,7 @@ def conclude(
         chosen=tuple(n for n in chosen if n not in (NOTHING, UNKNOWN)),
         credible=tuple(chosen),
         probabilities=told,
+        calibrated=_calibrated(told, names, data.noise),
         candidates=tuple(candidates),
         nothing=null,
         left=left,
@@ -129,6 +145,23 @@ def conclude(
         predictive=predictive,
         remedies=(remedies or {}) if kind == "cannot_tell" else {},
     )
+
+
+def doubt(c: Candidate, noise: float) -> float:
+    """Probability that a name is wrong that is the most probable, by how often former ones were that left as much."""
+    left = c.left / math.hypot(noise, c.best.near.numerics.size, c.size / 10)
+    odds = WRONG * math.exp(min(WRONG_BY_LEFT * left, 100.0))
+    return min(odds / (1 + odds), 0.5)
+
+
+def _calibrated(told: dict[str, float], names: dict[str, Candidate], noise: float) -> dict[str, float]:
+    """Probabilities in which what a name leaves counts against it."""
+    found = dict(told)
+    for name in names.keys() & told.keys():
+        lost = found[name] * doubt(names[name], noise)
+        found[name] -= lost
+        found[UNKNOWN] += lost
+    return found
 
 
 def _credible(probabilities: dict[str, float]) -> list[str]:

@@ -52,7 +52,7 @@ class Candidate:
     Attributes:
         fit: Where it is most probable.
         posterior: Near there.
-        probability: Posterior, of its name.
+        probability: Posterior, of its name, calibrated.
         size: Root mean square of the change of the motion by it [m].
         left: Root mean square of the least that it leaves of the recordings beyond noise and the twin's own error [m].
     """
@@ -217,7 +217,7 @@ def _concluded(
         Candidate(
             fit=at_mode(problem, _fit_of(known, c.best), told(data, c.best)),
             posterior=c.best,
-            probability=found.probabilities.get(c.name, 0.0),
+            probability=found.calibrated.get(c.name, 0.0),
             size=c.size,
             left=c.left,
         )
@@ -225,7 +225,7 @@ def _concluded(
     ]
     ranking.sort(key=lambda c: -c.probability)  # in the order of evidence where they are alike
     by_name = {c.name: c for c in ranking}
-    for name, probability in sorted(found.probabilities.items(), key=lambda item: -item[1]):
+    for name, probability in sorted(found.calibrated.items(), key=lambda item: -item[1]):
         report(f"{name}: probability {probability:.3g}" + (f", {tell(by_name[name].fit)}" if name in by_name else ""))
     return Verdict(
         kind=found.kind,
@@ -266,8 +266,9 @@ def _as_simpler(problem: FitProblem, effects: Sequence[Hypothesis], ends: Sequen
     """Where an effect that others extend comes nearest to these, as its own search may have ended elsewhere."""
     found, known = [], len(problem.common)
     for fit in ends:
-        if len(fit.effects) != 1:
+        if len(fit.effects) == 2:
             found += _alone(problem, fit)
+        if len(fit.effects) != 1:
             continue
         for simple in fit.effects[0].simpler(fit.values[0]):
             plain = next((e for e in effects if e.name == simple.name), None)

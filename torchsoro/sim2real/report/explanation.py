@@ -188,7 +188,7 @@ def as_json(e: Explanation, settings: Mapping[str, Any]) -> dict[str, Any]:
         "effects": effect_rows(v.chosen[0].fit, v.chosen[0].probability, problem) if v.chosen else [],
         "set": list(c.chosen),
         "partly": c.partly,
-        "probabilities": c.probabilities,
+        "probabilities": c.calibrated,
         "ranking": [
             {
                 "name": x.name,

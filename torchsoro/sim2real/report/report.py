@@ -106,7 +106,7 @@ def _at_first(page: Document, e: Explanation, trials: Sequence[Trial]) -> None:
                 (millimetres(found.floor), "expected of noise and the simulation's own error, as corrected"),
             ]
         )
-    leading = sorted(e.verdict.conclusion.probabilities.items(), key=lambda item: -item[1])
+    leading = sorted(e.verdict.conclusion.calibrated.items(), key=lambda item: -item[1])
     shown = [(told(name), p) for k, (name, p) in enumerate(leading) if k < LEAST_BARS or p > FAINT][:BARS]
     page.bars(
         [(name, p, probability(p), 1) for name, p in shown],

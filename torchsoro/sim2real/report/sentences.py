@@ -98,14 +98,14 @@ def told(name: str) -> str:
 def _probable(e: Explanation) -> str:
     """Posterior probabilities of the set."""
     c = e.verdict.conclusion
-    leading = sorted(c.probabilities.items(), key=lambda item: -item[1])[: max(2, len(c.credible))]
+    leading = sorted(c.calibrated.items(), key=lambda item: -item[1])[: max(2, len(c.credible))]
     shares = ", ".join(f"{told(name)} {words.probability(p)}" for name, p in leading)
     return f"Probabilities of what is missing: {shares}."
 
 
 def _little(e: Explanation) -> Candidate | None:
     """What does not matter, but is more probable than that nothing is missing; None where nothing is."""
-    first, p = next(iter(e.verdict.ranking), None), e.verdict.conclusion.probabilities  # the most probable one
+    first, p = next(iter(e.verdict.ranking), None), e.verdict.conclusion.calibrated  # the most probable one
     return first if first and first.probability > p[NOTHING] + p[UNSEEN] else None
 
 
