@@ -263,7 +263,8 @@ def _considered(page: Document, e: Explanation) -> None:
             "effect that leaves more than a fifth of it, and more than the noise, is given to none of the known ones, "
             "and that of an effect that holds a simpler one, and moves the body no otherwise by more than matters, to "
             "the simpler one. Of effects that change the motion by less than the simulation may err, nothing is told "
-            "apart by more than an error of that size allows.",
+            "apart by more than an error of that size allows. Of the probability of each effect, as much goes to "
+            "something else as former blind answers were wrong in that left as much.",
         )
 
 

@@ -91,7 +91,7 @@ def lead(e: Explanation) -> str:
 
 def told(name: str) -> str:
     """A candidate's name in words."""
-    others = {NOTHING: "nothing", UNSEEN: "an effect too weak to be seen", UNKNOWN: "none of the known effects"}
+    others = {NOTHING: "nothing", UNSEEN: "an effect too weak to be seen", UNKNOWN: "something else"}
     return others.get(name) or words.effect_words(name)
 
 
