@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -213,3 +214,23 @@ def _read(
         noise_ratio=noise / camera["noise"] if noise and camera.get("told") is False else None,
         seconds=float(answer.get("judge_seconds", cost.get("seconds", 0.0)) or 0.0),
     )
+
+
+def truths(c: Scored) -> tuple[str, ...]:
+    """Names of the truth in the words of probabilities."""
+    if c.kind == "outside":
+        return ("unknown",)
+    return (" + ".join(sorted(c.truth)),) if c.truth else ("nothing",)
+
+
+def check(batch: Path) -> dict[str, Any]:
+    """The truth; ValueError if it or a recording is not as it was sealed."""
+    text = (batch / "truth.sealed").read_text()
+    stated = (batch / "truth.sha256").read_text().split()[0]
+    if hashlib.sha256(text.encode()).hexdigest() != stated:
+        raise ValueError(f"batch = {batch}: truth.sealed is not what was sealed (SHA-256), wanted it unchanged")
+    truth = json.loads(text)
+    for name, digest in truth["files"].items():
+        if hashlib.sha256((batch / name).read_bytes()).hexdigest() != digest:
+            raise ValueError(f"batch = {batch}: {name} is not what was sealed (SHA-256), wanted it unchanged")
+    return truth

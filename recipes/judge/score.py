@@ -10,7 +10,6 @@ least twice ``--threshold``, the strength at which an effect can just be seen.
 from __future__ import annotations
 
 import csv
-import hashlib
 import itertools
 import json
 import math
@@ -21,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from answers import SETS, SILENT, Scored, match
+from answers import SETS, SILENT, Scored, check, match, truths
 from scipy.stats import beta
 
 NAMED = ("explained",)
@@ -139,13 +138,6 @@ def _calibration(cases: Sequence[Scored]) -> str:
     return f"{sum(off) / len(cases):.2f} ({len(cases)})" if cases else "no case"
 
 
-def truths(c: Scored) -> tuple[str, ...]:
-    """Names of the truth in the words of probabilities."""
-    if c.kind == "outside":
-        return ("unknown",)
-    return (" + ".join(sorted(c.truth)),) if c.truth else ("nothing",)
-
-
 def over_strength(cases: Sequence[Scored]) -> list[str]:
     """Detected, named, in the set, for classes of strength."""
     single = [c for c in cases if c.kind == "effect"]
@@ -189,19 +181,6 @@ def confusion(cases: Sequence[Scored]) -> list[str]:
         f"{truth:<32} " + ", ".join(f"{said} {n}" for said, n in sorted(found.items(), key=lambda i: -i[1]))
         for truth, found in sorted(rows.items())
     ]
-
-
-def check(batch: Path) -> dict[str, Any]:
-    """The truth; ValueError if it or a recording is not as it was sealed."""
-    text = (batch / "truth.sealed").read_text()
-    stated = (batch / "truth.sha256").read_text().split()[0]
-    if hashlib.sha256(text.encode()).hexdigest() != stated:
-        raise ValueError(f"batch = {batch}: truth.sealed is not what was sealed (SHA-256), wanted it unchanged")
-    truth = json.loads(text)
-    for name, digest in truth["files"].items():
-        if hashlib.sha256((batch / name).read_bytes()).hexdigest() != digest:
-            raise ValueError(f"batch = {batch}: {name} is not what was sealed (SHA-256), wanted it unchanged")
-    return truth
 
 
 def write_cases(path: Path, truth: Sequence[dict[str, Any]], cases: Sequence[Scored]) -> None:

@@ -15,9 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from answers import match
+from answers import check, match, truths
 from scipy.optimize import minimize
-from score import check, truths
 
 Row = tuple[float, bool, float | None]
 """Probability of the most probable, whether it is the truth, and what it leaves, if it is a name."""
