@@ -32,6 +32,7 @@ from torchsoro.sim2real.inference.gauss_newton import Asked
 from torchsoro.sim2real.inference.isolability import isolability
 from torchsoro.sim2real.inference.likelihood import CALM
 from torchsoro.sim2real.inference.resolution import between
+from torchsoro.sim2real.inference.touching import shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.visible import limit
 from torchsoro.sim2real.twin.twin import Twin
@@ -324,7 +325,11 @@ def test_a_fit_whose_derivatives_are_those_of_larger_cells_ends_where_one_by_the
     fits = [p.fit([((), None)], rounds=8)[0] for p in (sliding.finely(), sliding.by(sliding.fine))]
     mixed, fine = (f for f in fits if f is not None)
     np.testing.assert_allclose(mixed.point, fine.point, atol=0.1)
-    assert mixed.chi2 < 1.02 * fine.chi2  # which is rough
+    # Planes elsewhere by less than a cell, which are as good, change chi-squared by more than the two differ.
+    there = sliding.by(sliding.fine)
+    (motions,) = shifted(there, [((), fine.point[None])], GAPS)
+    alike = [there.measure([m.alone(k) for m in motions], fine.errors)[0] for k in range(len(GAPS))]
+    assert mixed.chi2 < np.median(alike)
 
 
 @pytest.mark.slow
