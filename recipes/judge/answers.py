@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -234,3 +234,15 @@ def check(batch: Path) -> dict[str, Any]:
         if hashlib.sha256((batch / name).read_bytes()).hexdigest() != digest:
             raise ValueError(f"batch = {batch}: {name} is not what was sealed (SHA-256), wanted it unchanged")
     return truth
+
+
+def calibration_error(told: Sequence[tuple[float, bool]]) -> float:
+    """Mean distance of probabilities that are told from the share that is right, over fifths, by their cases.
+
+    Args:
+        told: Probability, and whether what it is told of is right, of each case; one or more.
+    """
+    fifths: dict[int, list[float]] = {}
+    for p, right in told:
+        fifths.setdefault(min(int(5 * p), 4), []).append(p - right)
+    return sum(abs(sum(off)) for off in fifths.values()) / len(told)

@@ -251,7 +251,7 @@ class Fleet:
         cb = two * (f.transpose() @ f)
         trace = cb.trace()
         pulled = (ti.Matrix.identity(_real, 3) - trace / 3 * cb.inverse()) / j
-        t = 1.0 * pulled
+        t = 1.0 * pulled  # a copy
         for c in ti.static(range(6)):
             row, col = ti.static(((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))[c])
             change = pulled[row, col] - self.old[c, s, p]

@@ -360,7 +360,7 @@ class March:
         than near rest by as much as it stretches: that is halved until the motion is the same.
 
         Raises:
-            Broken: if an element turns inside out, with however short a step.
+            Broken: if an element turns inside out, or if no step is short enough.
         """
         if not (self.world.gent or self.world.softening):
             return self._run(instants, nodes, shapes)

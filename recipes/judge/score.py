@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import tyro
-from answers import SETS, SILENT, Scored, check, match, truths
+from answers import SETS, SILENT, Scored, calibration_error, check, match, truths
 from scipy.stats import beta
 
 NAMED = ("explained",)
@@ -130,12 +130,9 @@ def table(cases: Sequence[Scored], threshold: float) -> dict[str, str]:
 
 
 def _calibration(cases: Sequence[Scored]) -> str:
-    """Mean distance of the probability that is told from the share that is right, over fifths, by their cases."""
-    fifths: dict[int, list[Scored]] = {}
-    for c in cases:
-        fifths.setdefault(min(int(5 * c.probability), 4), []).append(c)
-    off = [abs(sum(c.probability - (c.likely in truths(c)) for c in same)) for same in fifths.values()]
-    return f"{sum(off) / len(cases):.2f} ({len(cases)})" if cases else "no case"
+    if not cases:
+        return "no case"
+    return f"{calibration_error([(c.probability, c.likely in truths(c)) for c in cases]):.2f} ({len(cases)})"
 
 
 def over_strength(cases: Sequence[Scored]) -> list[str]:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
-from answers import check, match, truths
+from answers import calibration_error, check, match, truths
 from scipy.optimize import minimize
 
 Row = tuple[float, bool, float | None]
@@ -59,10 +59,7 @@ def fitted(known: Sequence[Row]) -> tuple[float, float]:
 
 def calibration(known: Sequence[Row]) -> str:
     """Expected calibration error by fifths, squared error, and names told with 0.8 or more."""
-    fifths: dict[int, list[float]] = {}
-    for p, right, _ in known:
-        fifths.setdefault(min(int(5 * p), 4), []).append(p - right)
-    error = sum(abs(sum(off)) for off in fifths.values()) / len(known)
+    error = calibration_error([(p, right) for p, right, _ in known])
     squared = sum((p - right) ** 2 for p, right, _ in known) / len(known)
     sure = [(p, right) for p, right, left in known if left is not None and p >= 0.8]
     names = (

@@ -100,7 +100,7 @@ def remainders(problem: FitProblem, truth: dict[str, Any]) -> dict[str, list[flo
         ValueError: as :func:`true_point`, or for a simulation that breaks down.
     """
     effect, at = true_point(problem, truth)
-    asked = [((), np.zeros((1, len(problem.common)))), ((effect,), at[None])]
+    asked = [problem.as_stated, ((effect,), at[None])]
     found = [[m.alone() for m in motions] for motions in problem.simulate(asked)]
     if not all(m.sound.all() for motions in found for m in motions):
         raise ValueError(f"{problem.experiment.folder}: a simulation breaks down, wanted a twin that bears what acts")

@@ -147,7 +147,7 @@ def conclude(
     )
 
 
-def doubt(c: Candidate, noise: float) -> float:
+def _doubt(c: Candidate, noise: float) -> float:
     """Probability that a name is wrong that is the most probable, by how often former ones were that left as much."""
     left = c.left / math.hypot(noise, c.best.near.numerics.size, c.size / 10)
     odds = WRONG * math.exp(min(WRONG_BY_LEFT * left, 100.0))
@@ -158,7 +158,7 @@ def _calibrated(told: dict[str, float], names: dict[str, Candidate], noise: floa
     """Probabilities in which what a name leaves counts against it."""
     found = dict(told)
     for name in names.keys() & told.keys():
-        lost = found[name] * doubt(names[name], noise)
+        lost = found[name] * _doubt(names[name], noise)
         found[name] -= lost
         found[UNKNOWN] += lost
     return found

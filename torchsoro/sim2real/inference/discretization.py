@@ -11,7 +11,7 @@ from scipy.interpolate import Akima1DInterpolator
 
 from torchsoro.sim2real.data.experiment import Experiment, Trial
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, Request, added
+from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.observed import Motions
 from torchsoro.sim2real.inference.remaining_error import chance_in
@@ -68,7 +68,7 @@ def measure(
         cells = added(trials, believed[: len(trials)], middle)
         if finest is not None:
             (own,), (sharp,) = (
-                averaged(p, [_stated(there)], SHIFTS) for p in (there, there.only(everything, twin=finest))
+                averaged(p, [there.as_stated], SHIFTS) for p in (there, there.only(everything, twin=finest))
             )
             smaller = added(everything, own, sharp)
             believed = [
@@ -118,7 +118,7 @@ def _touching(here: FitProblem) -> list[list[MarkerTrajectory]]:
     """Motions with planes a little nearer and farther, as the twin's place of contact is known no better."""
     if not here.touches:
         return []
-    (motions,) = shifted(here, [_stated(here)], NEARER)
+    (motions,) = shifted(here, [here.as_stated], NEARER)
     return [[m.alone(k) for m in motions] for k in range(len(NEARER))]
 
 
@@ -126,7 +126,7 @@ def _chance(
     problem: FitProblem, count: int
 ) -> tuple[list[MarkerTrajectory], tuple[Mapping[str, MarkerTrajectory], ...], float]:
     """The motion as stated; what moved planes add to it in the first trials, by shift; how much is chance [m]."""
-    (motions,) = shifted(problem, [_stated(problem)], GAPS)
+    (motions,) = shifted(problem, [problem.as_stated], GAPS)
     middle = [m.alone(len(GAPS) // 2) for m in motions]
     if not all(m.sound.all() for m in middle):
         raise ValueError(BREAKS)
@@ -203,18 +203,13 @@ def _recordings_of(here: FitProblem, motions: Sequence[MarkerTrajectory]) -> lis
     return recorded
 
 
-def _stated(problem: FitProblem) -> Request:
-    """The setup as stated."""
-    return (), np.zeros((1, len(problem.common)))
-
-
 def _believed(problem: FitProblem) -> list[MarkerTrajectory]:
     """Motion of the setup as stated, for each trial.
 
     Raises:
         ValueError: if it breaks down.
     """
-    motions = problem.simulate([_stated(problem)])[0]
+    motions = problem.simulate([problem.as_stated])[0]
     if not all(m.sound.all() for m in motions):
         raise ValueError(BREAKS)
     return [m.alone() for m in motions]

@@ -10,7 +10,6 @@ import numpy as np
 
 from torchsoro.sim2real.data.experiment import Trial
 from torchsoro.sim2real.inference.fit import Fit, FitProblem
-from torchsoro.sim2real.inference.likelihood import Request
 from torchsoro.sim2real.inference.observation import CLOCK_LIMIT
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
@@ -70,7 +69,7 @@ def predict(problem: FitProblem, fit: Fit, trials: Sequence[Trial], *, believed:
         A prediction of each trial; empty where the simulation of one breaks down.
     """
     there = _there(problem, trials)
-    (motions,) = there.simulate([_as_believed(there) if believed else (fit.effects, fit.point[None])])
+    (motions,) = there.simulate([there.as_stated if believed else (fit.effects, fit.point[None])])
     found = [_predicted(problem, there.only([t]), fit, m) for t, m in zip(there.trials, motions, strict=True)]
     return [p for p in found if p] if all(found) else []
 
@@ -86,7 +85,7 @@ def predictions(problem: FitProblem, fit: Fit, heldout: Sequence[Trial], folds: 
     """
     there = _there(problem, [*problem.trials, *heldout])
     every = range(len(there.trials))
-    requests = [_as_believed(there), *((f.effects, f.point[None]) for f in (fit, *folds))]
+    requests = [there.as_stated, *((f.effects, f.point[None]) for f in (fit, *folds))]
     believed, found, *each = there.simulate(requests, of=[every, every, *([i] for i in range(len(folds)))])
     alone = [there.only([trial]) for trial in there.trials]
     shown = [_pair(problem, one, fit, *motions) for one, *motions in zip(alone, believed, found, strict=True)]
@@ -108,11 +107,6 @@ def _there(problem: FitProblem, trials: Sequence[Trial]) -> FitProblem:
     if there.fine is not None and not there.stated:
         there = there.by(there.fine)
     return there
-
-
-def _as_believed(there: FitProblem) -> Request:
-    """The setup as stated."""
-    return (), np.zeros((1, len(there.common)))
 
 
 def at_clocks_of(

@@ -201,6 +201,11 @@ class Likelihood:
             known.append((Friction(), self.tolerances.friction))
         return tuple(known)
 
+    @property
+    def as_stated(self) -> Request:
+        """The setup as stated, without an effect."""
+        return (), np.zeros((1, len(self.common)))
+
     def ln_factors(self, point: np.ndarray) -> dict[str, float]:
         """By what the stated numbers are off at a point [K] in scales, as logarithms by name."""
         scales = self.scales(())

@@ -108,8 +108,7 @@ def body_motion(problem: FitProblem, fit: Fit, trial: Trial, clock: float, worst
         raise ValueError(
             f"trial {trial.name} is {samples * SAMPLE:g} s long, wanted at most {MOST * SAMPLE / len(places):.3g} s"
         )
-    still = np.zeros((1, len(problem.common)))
-    motions = [m.alone() for (m,) in there.simulate([((), still), (fit.effects, fit.point[None])])]
+    motions = [m.alone() for (m,) in there.simulate([problem.as_stated, (fit.effects, fit.point[None])])]
     if not all(m.sound.all() for m in motions):
         raise ValueError(BREAKS)
     kept = np.unique(np.append(np.linspace(0, len(recording.time) - 1, FRAMES).round().astype(int), worst.sample))

@@ -6,7 +6,7 @@ import contextlib
 import math
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
@@ -108,36 +108,38 @@ def simulate(
                 kept[i][b] = one
         return found.dt, own.stretched(found)
 
-    def needed(lane: Lane, stretch: float) -> float:
-        return float(stable(twin.grid, scenarios[lane[0]], share, stretch)[lane[1]])
-
-    largest, lanes = 0.0, [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
-    whole = sum(s.until * s.batch for s in scenarios)
-    for k in range(1 + SHORTER):
-        groups, first, done = _grouped(twin, scenarios, lanes, steps, samples), 0, 0.0
-        borne, left = 0.0, []
-        plan = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups)
+    def simulated(groups: list[list[Lane]]) -> Iterator[tuple[list[Lane], tuple[float, list[float]]]]:
+        """Each group with what :func:`run` returns of it."""
+        plan, first = waves(len(groups), threads) if twin.device == "cpu" else (1,) * len(groups), 0
         for width, count in sorted(Counter(plan).items(), reverse=True):
             part = groups[first : first + width * count]
             each = [min(threads // width, TOGETHER)] * len(part)
             with ThreadPoolExecutor(width) if width > 1 else contextlib.nullcontext() as pool:
-                for group, (dt, stretches) in zip(part, (pool.map if pool else map)(run, part, each), strict=True):
-                    largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
-                    for lane, stretch in zip(group, stretches, strict=True):
-                        if stretch and needed(lane, stretch) < dt:
-                            left.append((lane, dt))
-                        else:
-                            borne = max(borne, stretch)
-                    if not k:
-                        watch(done / whole)
+                yield from zip(part, (pool.map if pool else map)(run, part, each), strict=True)
             first += len(part)
-        # What was not stable has stretched too far: others tell how far it should, or half of the step is next.
-        lanes = sorted(lane for lane, _ in left)
-        for (i, b), dt in left:
-            shorter = needed((i, b), borne) if borne else dt
-            steps[i][b] = shorter if shorter < dt else dt / 2
-        if not lanes:
+
+    largest, lanes = 0.0, [(i, b) for i, s in enumerate(scenarios) for b in range(s.batch)]
+    whole = sum(s.until * s.batch for s in scenarios)
+    reached, used = ([np.zeros(s.batch) for s in scenarios] for _ in range(2))
+    for k in range(1 + SHORTER):
+        done = 0.0
+        for group, (dt, stretches) in simulated(_grouped(twin, scenarios, lanes, steps, samples)):
+            largest, done = max(largest, dt), done + sum(scenarios[i].until for i, _ in group)
+            for (i, b), stretch in zip(group, stretches, strict=True):
+                reached[i][b], used[i][b] = stretch, dt
+            if not k:
+                watch(done / whole)
+        softer = {i for i, b in lanes if reached[i][b]}
+        bounds = {i: stable(twin.grid, scenarios[i], share, reached[i]) for i in softer}
+        late = [(i, b) for i, b in lanes if reached[i][b] and bounds[i][b] < used[i][b]]
+        if not late:
             break
+        # What was not stable has stretched too far: others tell how far it should, or half of the step is next.
+        borne = max((reached[i][b] for i, b in set(lanes) - set(late)), default=0.0)
+        shorter = {i: stable(twin.grid, scenarios[i], share, borne) for i, _ in late}
+        for i, b in late:
+            steps[i][b] = shorter[i][b] if borne and shorter[i][b] < used[i][b] else used[i][b] / 2
+        lanes = late
     time = np.arange(samples) * SAMPLE
     return [
         MarkerTrajectory(time=time, position=x, velocity=v, deformation=F, sound=ok, dt=largest)
@@ -201,7 +203,7 @@ def waves(groups: int, threads: int) -> tuple[int, ...]:
     return min(plans, key=lambda plan: sum(min(threads // width, TOGETHER) ** -MARCHING for width in plan))
 
 
-def stable(grid: Grid, s: Scenario, share: float, stretch: float = 0.0) -> np.ndarray:
+def stable(grid: Grid, s: Scenario, share: float, stretch: np.ndarray | float = 0.0) -> np.ndarray:
     """Largest step of each variation [B] s with ``share`` of the bound near rest; see ``courant.total_courant``.
 
     Below its largest stretch x = I1b - 3 so far, a solid that softens by d over a span r is steeper: the slope of its
@@ -212,7 +214,7 @@ def stable(grid: Grid, s: Scenario, share: float, stretch: float = 0.0) -> np.nd
         grid: Of the body.
         s: The scenario.
         share: Of the bound.
-        stretch: Largest x.
+        stretch: Largest x, of each variation [B] or of all.
     """
     nu = s.poisson_ratio.unsqueeze(-1)
     bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
