@@ -164,11 +164,16 @@ class FitProblem(Likelihood):
         linear = [e.probe_points(self.twin) if e.joint else e.weak_probe_points(self.twin, weak) for e in effects]
         linear = [[e.with_masses_aside(d, self.twin) for d in own] for e, own in zip(effects, linear, strict=True)]
         points = [own if e.joint else own + e.probe_points(self.twin) for e, own in zip(effects, linear, strict=True)]
+        # Where the weak are as strong as the others, most of them are the same.
+        apart = [np.unique(np.concatenate(own), axis=0, return_inverse=True) for own in points]
         requests = [
-            ((e,), np.concatenate([np.concatenate([np.tile(base.at, (len(d), 1)), d], 1) for d in own]))
-            for e, own in zip(effects, points, strict=True)
+            ((e,), np.concatenate([np.tile(base.at, (len(mine), 1)), mine], 1))
+            for e, (mine, _) in zip(effects, apart, strict=True)
         ]
-        simulated = self.responses(requests, base)
+        simulated = [
+            [m.alone(places.reshape(-1)) for m in motions]
+            for motions, (_, places) in zip(self.responses(requests, base), apart, strict=True)
+        ]
         return [
             ranked_starts(self, e, own, len(through_zero), weak, motions, base)
             for e, own, through_zero, motions in zip(effects, points, linear, simulated, strict=True)

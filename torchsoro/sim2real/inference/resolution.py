@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from torchsoro.sim2real.data.experiment import Setup
 from torchsoro.sim2real.twin.batch import safety
 from torchsoro.sim2real.twin.twin import Twin
@@ -23,10 +25,10 @@ FINEST = 1.5  # of a third twin over the one that corrects, where bodies meet pl
 def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
     """Seconds that an explanation takes on two cores, about."""
     s = twin.setup
-    speed = math.sqrt(s.youngs_modulus / (1 - 2 * s.poisson_ratio) / s.density)
-    factor = math.sqrt(1 + sum(g for g, _ in s.prony) / 2)
-    steep = math.sqrt(max(a.steep for a in twin.grid.axes))
-    steps = s.duration * steep * speed * factor / (2 * safety(twin))
+    bulk, shear = s.youngs_modulus / (3 * (1 - 2 * s.poisson_ratio)), s.youngs_modulus / (2 * (1 + s.poisson_ratio))
+    stiffened = 1 + sum(g for g, _ in s.prony) / 2
+    square = bulk / s.density * float(twin.frequency.square(np.array(stiffened * shear / bulk)))
+    steps = s.duration * math.sqrt(square) / (2 * safety(twin))
     return twin.count * steps * trials * simulations / SPEED / CORES
 
 

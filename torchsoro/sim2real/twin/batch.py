@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoro.sim2real.twin.grid import Grid
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.actuation import Waveform
@@ -30,9 +29,9 @@ from torchsoro.simulation.threads import threads_here
 from torchsoro.simulation.trajectory import Start, Trajectory
 
 SAMPLE = 2.5e-3  # s between two samples of a motion, which is interpolated by cubics
-SAFETY = 1.4  # times the bound of a stable step near rest; free blocks and bars were stable up to 1.6
-CUT = 0.7  # the same where cells are filled in part, whose nodes may have little mass; robots on legs bear up to 0.9
-MESHED = 1.0  # the same of a mesh in whole cells; robots on legs bear up to 1.25
+STEP = 0.85  # of the largest stable step near rest; free blocks and bars are stable up to 0.98
+CHAMBERED = 0.75  # the same of a body with chambers, whose corners stretch much; up to 0.77, and not at 0.85
+MESHED = 0.55  # the same of a mesh; robots on legs as well as with shorter steps up to 0.54, and hardly less so at 0.59
 SHORTEST = 1e-9  # s, a step; shorter ones are lost to rounding
 SOFTENED = 0.6  # of the steepest slope below the largest stretch, that counts: it falls at once; a finger bears 0.6
 SHORTER = 4  # times that a step is shortened, to half of it at most, until a solid that softens is stable
@@ -49,10 +48,10 @@ Amounts = Callable[[Scenario], Tensor]
 
 
 def safety(twin: Twin) -> float:
-    """Step in use over the bound of a stable step near rest."""
-    if twin.setup.surface is None:
-        return SAFETY
-    return CUT if twin.grid.cut else MESHED
+    """Step in use over the largest stable step near rest."""
+    if twin.setup.surface is not None:
+        return MESHED
+    return CHAMBERED if twin.setup.chambers else STEP
 
 
 def simulate(
@@ -71,7 +70,7 @@ def simulate(
         scenarios: Each with a batch of variations [B], or none.
         threads: Number of threads.
         even: Whether all variations take the same time step, so that its error cancels in their differences.
-        safe: Step over the bound of a stable one near rest; chosen by the body's cells if None.
+        safe: Step over the largest stable one near rest; :func:`safety` if None.
         watch: Called with the share of the simulated time that is done, group by group.
 
     Returns:
@@ -83,7 +82,7 @@ def simulate(
     if not scenarios:
         return []
     share = safe or safety(twin)
-    steps = [stable(twin.grid, s, share) for s in scenarios]
+    steps = [stable(twin, s, share) for s in scenarios]
     if even:
         least = min(float(dt.min()) for dt in steps)
         steps = [np.full_like(dt, least) for dt in steps]
@@ -101,7 +100,7 @@ def simulate(
         every = math.ceil(SAMPLE / min(steps[i][b] for i, b in group))
         with threads_here(share_of_threads), torch.no_grad():
             own = _Group(twin, scenarios, group)
-            found = own.simulate(SAMPLE / every, samples - 1, markers, share)
+            found = own.simulate(SAMPLE / every, samples - 1, markers)
         seen = (position, found.position), (velocity, found.velocity), (deformation, found.deformation)
         for kept, values in (*seen, (sound, found.sound)):
             for (i, b), one in zip(group, values.numpy(), strict=True):
@@ -130,13 +129,13 @@ def simulate(
             if not k:
                 watch(done / whole)
         softer = {i for i, b in lanes if reached[i][b]}
-        bounds = {i: stable(twin.grid, scenarios[i], share, reached[i]) for i in softer}
+        bounds = {i: stable(twin, scenarios[i], share, reached[i]) for i in softer}
         late = [(i, b) for i, b in lanes if reached[i][b] and bounds[i][b] < used[i][b]]
         if not late:
             break
         # What was not stable has stretched too far: others tell how far it should, or half of the step is next.
         borne = max((reached[i][b] for i, b in set(lanes) - set(late)), default=0.0)
-        shorter = {i: stable(twin.grid, scenarios[i], share, borne) for i, _ in late}
+        shorter = {i: stable(twin, scenarios[i], share, borne) for i, _ in late}
         for i, b in late:
             steps[i][b] = shorter[i][b] if borne and shorter[i][b] < used[i][b] else used[i][b] / 2
         lanes = late
@@ -203,30 +202,28 @@ def waves(groups: int, threads: int) -> tuple[int, ...]:
     return min(plans, key=lambda plan: sum(min(threads // width, TOGETHER) ** -MARCHING for width in plan))
 
 
-def stable(grid: Grid, s: Scenario, share: float, stretch: np.ndarray | float = 0.0) -> np.ndarray:
-    """Largest step of each variation [B] s with ``share`` of the bound near rest; see ``courant.total_courant``.
+def stable(twin: Twin, s: Scenario, share: float, stretch: np.ndarray | float = 0.0) -> np.ndarray:
+    """Step of each variation [B] s, ``share`` of the largest that is stable near rest: 2 over the highest frequency.
 
     Below its largest stretch x = I1b - 3 so far, a solid that softens by d over a span r is steeper: the slope of its
     factor 1 - d erf(u / r), 2 d / (sqrt(pi) r) at most, adds up to 4 d x / (sqrt(pi) r) to its relative stiffness.
     (From the law, with b' the deviatoric part of the isochoric left Cauchy-Green tensor and b':b' = 2 x near rest.)
 
     Args:
-        grid: Of the body.
+        twin: The body.
         s: The scenario.
-        share: Of the bound.
+        share: Of the largest stable step.
         stretch: Largest x, of each variation [B] or of all.
     """
     nu = s.poisson_ratio.unsqueeze(-1)
-    bulk, shear = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
-    bulk, shear = (torch.sqrt((m / s.density).amax(-1)).expand(s.batch) for m in (bulk, shear))
-    steep, dt = max(a.steep for a in grid.axes), np.ones(s.batch)
-    bulk, shear = bulk.numpy(), shear.numpy()
+    moduli = s.youngs_modulus / (3 * (1 - 2 * nu)), s.youngs_modulus / (2 * (1 + nu))
+    bulk, shear = ((m / s.density).amax(-1).expand(s.batch).numpy() for m in moduli)
+    dt = np.ones(s.batch)
     depth, span = (s.softening[..., k].expand(s.batch).numpy() for k in range(2))
     steeper = 1 + SOFTENED * 4 / math.sqrt(math.pi) * depth * stretch / span
     for _ in range(1 if s.prony is None else HALVINGS):
         factor = steeper if s.prony is None else steeper + _step_moduli(s.prony, dt)
-        speed = np.maximum(math.sqrt(3) * bulk, np.sqrt(2 * factor) * shear)
-        bound = share * 2 / (speed * math.sqrt(steep))
+        bound = share * 2 / np.sqrt(bulk * twin.frequency.square(factor * shear / bulk))
         dt = bound if s.prony is None else np.sqrt(dt * bound)
     return np.minimum(dt, SAMPLE)
 
@@ -262,7 +259,7 @@ class _Group:
     scenarios: Sequence[Scenario]
     lanes: Sequence[Lane]
 
-    def simulate(self, dt: float, samples: int, markers: Tensor, share: float) -> Trajectory:
+    def simulate(self, dt: float, samples: int, markers: Tensor) -> Trajectory:
         """Motions [K, ...] of the markers, sampled so many times after the start."""
         lattice, first = self.twin.grid.lattice, self.scenarios[self.lanes[0][0]]
         simulator = Simulator(
@@ -272,7 +269,7 @@ class _Group:
             high=(FAR,) * 3,
             formulation=Total(
                 lattice=lattice,
-                limit=1.001 * share,
+                limit=math.inf,  # the step is chosen by a sharper bound
                 device=None if self.twin.device == "cpu" else self.twin.device,
             ),
         )

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchsoro.sim2real.data.experiment import Setup, Trial
 from torchsoro.sim2real.data.schema import Box, ForceTable, PlaneTable
+from torchsoro.sim2real.twin.frequency import Frequency
 from torchsoro.sim2real.twin.grid import Axis, Grid, divide
 from torchsoro.sim2real.twin.scenario import Scenario
 from torchsoro.simulation.contact import Plane
@@ -45,8 +46,8 @@ class MarkerTrajectory:
     sound: np.ndarray
     dt: float
 
-    def alone(self, number: int = 0) -> MarkerTrajectory:
-        """One of a batch."""
+    def alone(self, number: int | np.ndarray = 0) -> MarkerTrajectory:
+        """One of a batch, or several."""
         if self.position.ndim == 3:
             return self
         names = "position", "velocity", "deformation", "sound"
@@ -118,24 +119,30 @@ class Twin:
         setup, walls, surface, axes = self.setup, self.walls, self.setup.surface, []
         for axis in range(3):
             begin, end = setup.origin[axis], setup.origin[axis] + setup.size[axis]
-            inner = sorted({c.box[side][axis] for c in setup.chambers for side in (0, 1)})
-            if inner and not begin < inner[0] < inner[-1] < end:
+            creases = sorted({c.box[side][axis] for c in setup.chambers for side in (0, 1)})
+            if creases and not begin < creases[0] < creases[-1] < end:
                 raise ValueError(
-                    f"chamber: from {inner[0]:g} to {inner[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} and "
-                    f"{end:g} m, within the body"
+                    f"chamber: from {creases[0]:g} to {creases[-1]:g} m along {'xyz'[axis]}, wanted between {begin:g} "
+                    f"and {end:g} m, within the body"
                 )
             faces = [] if surface is None else surface.faces[axis]
             near = NEAR * setup.size[axis]
-            inner = sorted([*inner, *(f for f in faces if not any(abs(f - i) < near for i in inner))])
+            inner = sorted([*creases, *(f for f in faces if not any(abs(f - c) < near for c in creases))])
             breaks = [begin, *inner, end]
             least = [walls if setup.chambers else 1] * (len(breaks) - 1)
             # With one cell in every interval, motions quadratic along two axes have no strain at points (hourglassing).
             widest = int(np.diff(breaks).argmax())
             least[widest] = max(least[widest], 2, 0 if setup.chambers else self.across - len(inner))
-            # Double knots at the faces of chambers: two walls that share a node would be coupled across the chamber.
-            axes.append(Axis(divide(breaks, least, self.edge), inner))
+            # Double knots at the faces of chambers: two walls that share a node would be coupled across the chamber. At
+            # those of a mesh, legs would be too soft: with larger cells, robots respond better by 4 times without them.
+            axes.append(Axis(divide(breaks, least, self.edge), creases))
         x, y, z = axes
         return Grid((x, y, z), [c.box for c in setup.chambers], None if surface is None else surface.filled)
+
+    @cached_property
+    def frequency(self) -> Frequency:
+        """The highest that the grid bears."""
+        return Frequency(self.grid)
 
     @cached_property
     def held(self) -> np.ndarray:
