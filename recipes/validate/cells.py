@@ -12,16 +12,17 @@ steps that are given as such shares.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
 import tyro
+from slopes import names_of
 
 from torchsoro.command_line import options, program
 from torchsoro.sim2real.inference.fit import FitProblem
+from torchsoro.sim2real.inference.resolution import finest
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inputs import Inputs, read_inputs
 from torchsoro.sim2real.options import Options as Explaining
@@ -29,7 +30,6 @@ from torchsoro.sim2real.twin.batch import THREADS, safety, simulate
 from torchsoro.sim2real.twin.twin import Twin
 
 OFF = 0.05  # of modulus and pressure, for a response
-SMALLER = 1.5  # cells of the second twin over those of the reference
 
 
 @options
@@ -76,20 +76,14 @@ def main(options: Options) -> None:
         ValueError: for a folder without the cases.
     """
     threads = options.threads or THREADS
-    names = options.cases or tuple(sorted(p.name for p in options.folder.iterdir() if (p / "setup.toml").exists()))
-    for name in names:
-        if not (options.folder / name / "setup.toml").exists():
-            raise ValueError(f"cases: {name} is not in {options.folder}, wanted a folder with setup.toml")
+    names = names_of(options.folder, options.cases)
     print("case      cells [mm]  moves [um]  error [um]  of responses  step in use  sound with steps of")
     for name in names:
         inputs = read_inputs(Explaining(experiment=options.folder / name, out=Path("runs/cells"), threads=threads))
         fine = inputs.fine
-        reference = moved(
-            inputs,
-            dataclasses.replace(fine, edge=fine.edge / SMALLER, walls=math.ceil(SMALLER * fine.walls)),
-            options.until,
-            threads,
-        )
+        smaller = finest(fine, len(inputs.trials), math.inf)
+        assert smaller is not None  # whatever it takes
+        reference = moved(inputs, smaller, options.until, threads)
         wanted = reference[1:] - reference[0]
         for twin in (inputs.twin, fine):
             ways = moved(inputs, twin, options.until, threads)

@@ -38,6 +38,19 @@ class Options:
     """0 for as many as there are processors."""
 
 
+def names_of(folder: Path, cases: tuple[str, ...]) -> tuple[str, ...]:
+    """The given cases, or all of a folder.
+
+    Raises:
+        ValueError: for a folder without one that is given.
+    """
+    names = cases or tuple(sorted(p.name for p in folder.iterdir() if (p / "setup.toml").exists()))
+    for name in names:
+        if not (folder / name / "setup.toml").exists():
+            raise ValueError(f"cases: {name} is not in {folder}, wanted a folder with setup.toml")
+    return names
+
+
 def quotients(problem: FitProblem, step: float) -> np.ndarray:
     """Difference quotients of what is recorded of the first trial, by stated number and shift [K, R, ...] m."""
     count, none = len(problem.common), np.zeros(len(problem.observation.deviations))
@@ -58,10 +71,7 @@ def main(options: Options) -> None:
     Raises:
         ValueError: for a folder without the cases.
     """
-    names = options.cases or tuple(sorted(p.name for p in options.folder.iterdir() if (p / "setup.toml").exists()))
-    for name in names:
-        if not (options.folder / name / "setup.toml").exists():
-            raise ValueError(f"cases: {name} is not in {options.folder}, wanted a folder with setup.toml")
+    names = names_of(options.folder, options.cases)
     print("case      number          noise  response  error: step 0.05   step (shifts)  as chosen  [um]")
     for name in names:
         inputs = read_inputs(

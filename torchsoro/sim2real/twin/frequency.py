@@ -56,8 +56,7 @@ class Frequency:
     @cached_property
     def _roots(self) -> Tensor:
         """One over the square root of the mass of the nodes [nodes] kg^-1/2, zero where there is none."""
-        mass = self._volumes.unsqueeze(0)
-        mass = self.grid.lattice.nodal(mass, torch.zeros_like(mass), 1.0)[0, 0]
+        mass = self.grid.lattice.nodal_mass(self._volumes.unsqueeze(0))[0]
         return torch.where(mass > 0, mass, torch.inf) ** -0.5
 
     def _largest(self, shear: float) -> float:
