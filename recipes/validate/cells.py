@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import tyro
-from slopes import names_of
+from chosen_cases import names_of
 
 from torchsoro.command_line import options, program
 from torchsoro.sim2real.inference.fit import FitProblem

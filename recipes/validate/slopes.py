@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import tyro
+from chosen_cases import names_of
 
 from torchsoro.command_line import options, program
 from torchsoro.sim2real.inference.discretization import measure
@@ -36,19 +37,6 @@ class Options:
     """Their names; all if none is given."""
     threads: int = 0
     """0 for as many as there are processors."""
-
-
-def names_of(folder: Path, cases: tuple[str, ...]) -> tuple[str, ...]:
-    """The given cases, or all of a folder.
-
-    Raises:
-        ValueError: for a folder without one that is given.
-    """
-    names = cases or tuple(sorted(p.name for p in folder.iterdir() if (p / "setup.toml").exists()))
-    for name in names:
-        if not (folder / name / "setup.toml").exists():
-            raise ValueError(f"cases: {name} is not in {folder}, wanted a folder with setup.toml")
-    return names
 
 
 def quotients(problem: FitProblem, step: float) -> np.ndarray:
