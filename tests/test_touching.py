@@ -13,7 +13,7 @@ from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
 from torchsoro.sim2real.inference.resolution import finest
-from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
+from torchsoro.sim2real.inference.touching import GAPS, ROUGHLY, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -79,6 +79,18 @@ def test_changes_by_larger_cells_are_differentiated_as_these_touch(on_a_floor):
     assert loud.finely().step == loud.step == SECANT
     assert loud.finely().looks == loud.looks > 1
     assert loud.by(loud.fine).step == STEP  # by itself it touches calmly
+
+
+def test_responses_that_tell_where_to_begin_are_means_over_few_shifts(on_a_floor):
+    finely = known(on_a_floor, on_a_floor.noise).finely()
+    base, request = finely.base(), [((effect("density"),), np.array([[0.0, 1.0]]))]
+    found = []
+    for roughly, shifts in (True, ROUGHLY), (False, LOOKS):
+        before = finely.tally.simulations
+        found.append(finely.responses(request, base, roughly=roughly)[0][0].position - base.motions[0].position)
+        assert finely.tally.simulations - before == 2 * shifts * len(finely.trials)  # with the density, and without
+    few, many = found
+    assert 0 < np.abs(few - many).max() < 0.5 * np.abs(many).max()
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Answer, Asked, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.probing import ranked_starts
-from torchsoro.sim2real.inference.touching import averaged
+from torchsoro.sim2real.inference.touching import ROUGHLY, averaged
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.kernels.lanes import LANES
@@ -119,12 +119,21 @@ class FitProblem(Likelihood):
             found[k] = [_changed(m.alone(), m, at.alone()) for m, at in zip(motions, found[k], strict=True)]
         return found
 
-    def responses(self, requests: Sequence[Request], base: Point) -> list[list[MarkerTrajectory]]:
-        """As :meth:`simulate`, of points beside a base without an effect; what they change of it by larger cells."""
+    def responses(
+        self, requests: Sequence[Request], base: Point, *, roughly: bool = False
+    ) -> list[list[MarkerTrajectory]]:
+        """As :meth:`simulate`, of points beside a base without an effect; what they change of it by larger cells.
+
+        Args:
+            requests: Effects and points.
+            base: Beside which.
+            roughly: Whether the responses only tell where to begin, so that a few shifts of the planes are enough.
+        """
         coarsely = self._coarsely
         if coarsely is None:
             return self.simulate(requests)
-        middle, *found = averaged(coarsely, [((), base.at[None]), *requests], self.looks)
+        looks = min(self.looks, ROUGHLY) if roughly else self.looks
+        middle, *found = averaged(coarsely, [((), base.at[None]), *requests], looks)
         return [
             [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]
             for motions in found

@@ -135,7 +135,7 @@ def _simulated(
 ) -> list[dict[int, float]]:
     """Chi-squared at the points of each request by their number, without those that break down."""
     found = []
-    for motions in problem.simulate(asked) if base is None else problem.responses(asked, base):
+    for motions in problem.simulate(asked) if base is None else problem.responses(asked, base, roughly=True):
         sound = map(int, np.flatnonzero(np.all([m.sound for m in motions], axis=0)))
         found.append({k: problem.measure([m.alone(k) for m in motions], errors)[0] for k in sound})
     return found
