@@ -125,6 +125,14 @@ def test_a_good_experiment_is_accepted_with_byte_order_marks(folder):
     assert found.twin.highest == found.fine.highest == highest > 0
 
 
+def test_a_third_twin_is_of_a_body_that_sticks(folder):
+    asked = Options(experiment=folder, out=folder.parent / "out", budget=1e3)
+    assert read_inputs(asked).finest is None
+    write(folder, "setup.toml", SETUP.replace("friction = 0.3", 'friction = "stick"'))
+    found = read_inputs(asked)
+    assert found.finest is not None and found.finest.edge < found.fine.edge
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

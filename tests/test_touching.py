@@ -12,7 +12,8 @@ from ringing import bar, effect, onto_a_floor
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
-from torchsoro.sim2real.inference.resolution import finest
+from torchsoro.sim2real.inference.remaining_error import ORDER
+from torchsoro.sim2real.inference.resolution import FINEST, finest
 from torchsoro.sim2real.inference.touching import GAPS, ROUGHLY, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
@@ -118,6 +119,25 @@ def test_a_third_twin_corrects_the_finer_one(on_a_floor):
         change = corrected.position[0] - fine.position[0]
         assert change == pytest.approx(known.smaller[t.name].position, abs=1e-12)
         assert 0 < np.abs(change).max() < 0.2 * np.ptp(fine.position)
+
+
+@pytest.mark.slow
+def test_a_calm_motion_is_extrapolated_to_cells_without_size(on_a_floor):
+    third = finest(on_a_floor.fine, 1, math.inf)
+
+    def known(noise):
+        setup = dataclasses.replace(on_a_floor.experiment.setup, noise=noise)
+        experiment = dataclasses.replace(on_a_floor.experiment, setup=setup)
+        return measure(experiment, on_a_floor.twin, on_a_floor.fine, finest=third)
+
+    rough, calm = known(1e-9), known(1e-2)
+    assert calm.chance == rough.chance > CALM * 1e-9
+    more = 1 + 1 / (FINEST**ORDER - 1)
+    for name, change in rough.smaller.items():
+        np.testing.assert_allclose(calm.smaller[name].position, more * change.position, atol=1e-12)
+    # At first order, three times what a third twin with cells smaller by a third changes.
+    assert rough.unsure == pytest.approx(2)
+    assert calm.unsure == pytest.approx((more - 1) / more)
 
 
 def test_a_third_twin_that_takes_too_long_is_none(on_a_floor):

@@ -251,7 +251,7 @@ def pad() -> Specimen:
     names = ("friction", "friction", "adhesion", "adhesion", "wall_offset", "density", "viscoelastic",
              "attached_mass", "modulus", "soft_side")  # fmt: skip
     return Specimen(
-        name="pad", setup=setup, trials=trials, rate=150, edge=0.0047, effects=names,
+        name="pad", setup=setup, trials=trials, rate=150, edge=0.0031, effects=names,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 
@@ -322,7 +322,7 @@ def crawler() -> Specimen:
         ],
     )  # fmt: skip
     return Specimen(
-        name="crawler", setup=setup, trials=_walks(), rate=150, edge=0.0053, effects=WALKING,
+        name="crawler", setup=setup, trials=_walks(), rate=150, edge=0.0041, effects=WALKING,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 
@@ -388,7 +388,7 @@ def robot() -> Specimen:
         [[0.056, 0.026, 0.0002], [0.064, 0.036, 0.0122]],
     ]
     return Specimen(
-        name="robot", setup=setup, trials=_walks(), rate=150, edge=0.0053, effects=WALKING,
+        name="robot", setup=setup, trials=_walks(), rate=150, edge=0.0041, effects=WALKING,
         outside=("foam", "magnet", "gust", "sloshing"),
     )  # fmt: skip
 

@@ -97,8 +97,10 @@ def read_inputs(options: Options) -> Inputs:
         raise ValueError(f"effects = {', '.join(options.effects)}: wanted one that can act in these trials")
     with named_in(experiment.folder):
         fine = finer(twin, len(trials), 4 * options.budget)
-        touches = any(s.planes for s in scenarios.values())
-        third = finest(fine, len(trials), 15 * options.budget) if touches else None
+        planes = [plane for s in scenarios.values() for plane in s.planes]
+        # Of a body that slides, which node sticks when decides how far it goes, in smaller cells as much as in larger.
+        sticks = bool(planes) and all(isinstance(plane.friction, str) for plane in planes)
+        third = finest(fine, len(trials), 15 * options.budget) if sticks else None
     return Inputs(
         experiment=experiment,
         trials=trials,

@@ -25,8 +25,7 @@ from torchsoro.sim2real.inference.least_squares import closest
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.observed import Data, Motions, TrialData, size_of
 from torchsoro.sim2real.inference.priors import Prior
-from torchsoro.sim2real.inference.remaining_error import TOUCHING, by_richardson, by_spread, chance_in
-from torchsoro.sim2real.inference.resolution import FINEST
+from torchsoro.sim2real.inference.remaining_error import by_richardson, by_spread, chance_in
 from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.inference.weighing import Weighing
@@ -145,7 +144,7 @@ def near(
     for f, motions, m in zip(fits, beside, models, strict=True):
         at, known = [x.alone(0) for x in motions], problem.discretization
         alike = [] if m is None else [*_by_other_cells(problem, at, f, known.between), *_by_sliding(problem, f, m)]
-        left = [] if m is None else _by_other_cells(problem, at, f, known.smaller, 1 / (FINEST**TOUCHING - 1))
+        left = [] if m is None else _by_other_cells(problem, at, f, known.smaller, known.unsure)
         others.append((alike, left))
     return _corrected(problem, coarse, fits, models, others, finer, closely, moved or {})
 

@@ -14,8 +14,8 @@ from torchsoro.sim2real.inference.fit import FitProblem
 from torchsoro.sim2real.inference.likelihood import BREAKS, WITHIN, added
 from torchsoro.sim2real.inference.observation import Priors
 from torchsoro.sim2real.inference.observed import Motions
-from torchsoro.sim2real.inference.remaining_error import chance_in
-from torchsoro.sim2real.inference.resolution import between
+from torchsoro.sim2real.inference.remaining_error import ORDER, TOUCHING, chance_in
+from torchsoro.sim2real.inference.resolution import FINEST, between
 from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.batch import THREADS
@@ -48,7 +48,7 @@ def measure(
         experiment: What is to be explained, with trials that are only predicted.
         twin: In use.
         fine: Another, with smaller cells.
-        finest: A third, with still smaller cells, for bodies that meet planes.
+        finest: A third, with still smaller cells, for bodies that stick to planes.
         threads: That simulate.
         report: Called with a line after each batch of simulations.
     """
@@ -60,6 +60,7 @@ def measure(
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     cells: Mapping[str, MarkerTrajectory] = {}
     smaller: Mapping[str, MarkerTrajectory] = {}
+    unsure = 1 / (FINEST**TOUCHING - 1)
     chance = in_use = math.inf
     if there.touches and not any(t.simulated for t in trials):
         believed, touching, chance = _chance(there, len(trials))
@@ -70,6 +71,13 @@ def measure(
             (own,), (sharp,) = (
                 averaged(p, [there.as_stated], SHIFTS) for p in (there, there.only(everything, twin=finest))
             )
+            touching_known = DiscretizationError(chance=chance)
+            if not FitProblem(experiment, fine, trials=trials, discretization=touching_known).rough:
+                # Of a calm motion also what cells without size would add; of another, that would multiply chance.
+                beyond = 1 / (FINEST**ORDER - 1)
+                change = added(everything, own, sharp)
+                sharp = [m.plus(change[t.name], beyond) for m, t in zip(sharp, everything, strict=True)]
+                unsure = beyond / (1 + beyond)
             smaller = added(everything, own, sharp)
             believed = [
                 m.plus(smaller[t.name]) if t.name in smaller else m for m, t in zip(believed, everything, strict=True)
@@ -107,6 +115,7 @@ def measure(
         touching=touching,
         between=cells,
         smaller=smaller if all(t.name in smaller for t in trials) else {},
+        unsure=unsure,
         chance=chance,
         chance_in_use=in_use,
         edges=(twin.edge, fine.edge),

@@ -19,7 +19,7 @@ SLOW = 64.0  # reserve of the budget for searches that go on for long, and for s
 SLOW_WITH_PLANES = 24.0  # the same of a body that meets planes, where sliding makes a fine twin worth the time
 # Cells along an axis of the twin that corrects, over those of the twin in use: the first that its time allows.
 FINER = (2.0, 1.5)
-FINEST = 1.5  # of a third twin over the one that corrects, where bodies meet planes
+FINEST = 1.5  # of a third twin over the one that corrects, where bodies stick to planes
 
 
 def cost(twin: Twin, trials: int, simulations: float = SIMULATIONS) -> float:
@@ -77,7 +77,7 @@ def finer(twin: Twin, trials: int, seconds: float) -> Twin:
 
 
 def finest(fine: Twin, trials: int, seconds: float) -> Twin | None:
-    """A third twin, by which the error of the second one is told where bodies meet planes.
+    """A third twin, by which the error of the second one is told where bodies stick to planes.
 
     Args:
         fine: The second one.

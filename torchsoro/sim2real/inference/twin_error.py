@@ -28,7 +28,10 @@ class DiscretizationError:
         touching: What the finer twin adds where planes are a little elsewhere, by trial, for each of some shifts; none
             without planes, or if they were not moved.
         between: What a twin with cells between those of the two adds to the finer one, by trial; none without planes.
-        smaller: What a third twin with still smaller cells adds to the finer one, by trial; none without one.
+        smaller: What a third twin with still smaller cells adds to the finer one, by trial; none without one. Where
+            touching is calm, also what cells without size would add to that.
+        unsure: Share of this by which it may be off: what cells without size would add to it at first order, or what
+            was added for them.
         chance: Root mean square of what of that is not in proportion to the shift, so that which node touches when
             decides it [m]; not finite if it was not measured.
         chance_in_use: The same of the twin in use, by which derivatives are taken.
@@ -43,6 +46,7 @@ class DiscretizationError:
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     between: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
     smaller: Mapping[str, MarkerTrajectory] = field(default_factory=dict)
+    unsure: float = 0.0
     chance: float = math.inf
     chance_in_use: float = math.inf
     edges: tuple[float, ...] = ()
