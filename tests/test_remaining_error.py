@@ -60,6 +60,7 @@ def test_errors_of_other_twins_add_up():
     data, nothing, _ = recorded(0.0, 2)
     one, other = draws(data, 2, 0.05, 3)
     priced = by_spread(data, nothing, [nothing.residuals] * 7, SHIFTS, others=(one, other))
+    assert priced.numerics.kinds == (0,) * 7 + (1, 2)  # each of its own kind, beside seven of chance
     left = [size_of(cleared(data, nothing, o)) for o in (one, other)]
     assert priced.numerics.size == pytest.approx(float(np.hypot(*left)), rel=1e-6)
     assert priced.numerics.modes[0].shape[-1] == 7 + 2
