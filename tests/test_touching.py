@@ -11,10 +11,10 @@ from ringing import bar, effect, onto_a_floor
 
 from torchsoro.sim2real.inference.discretization import measure
 from torchsoro.sim2real.inference.fit import FitProblem
-from torchsoro.sim2real.inference.likelihood import CALM, LOOKS, SECANT, STEP
+from torchsoro.sim2real.inference.likelihood import CALM, FEW_LOOKS, LOOKS, SECANT, STEP
 from torchsoro.sim2real.inference.remaining_error import ORDER
 from torchsoro.sim2real.inference.resolution import FINEST, finest
-from torchsoro.sim2real.inference.touching import GAPS, ROUGHLY, averaged, shifted
+from torchsoro.sim2real.inference.touching import GAPS, averaged, shifted
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import Twin
 
@@ -86,7 +86,7 @@ def test_responses_that_tell_where_to_begin_are_means_over_few_shifts(on_a_floor
     finely = known(on_a_floor, on_a_floor.noise).finely()
     base, request = finely.base(), [((effect("density"),), np.array([[0.0, 1.0]]))]
     found = []
-    for roughly, shifts in (True, ROUGHLY), (False, LOOKS):
+    for roughly, shifts in (True, FEW_LOOKS), (False, LOOKS):
         before = finely.tally.simulations
         found.append(finely.responses(request, base, roughly=roughly)[0][0].position - base.motions[0].position)
         assert finely.tally.simulations - before == 2 * shifts * len(finely.trials)  # with the density, and without

@@ -153,23 +153,20 @@ def specimens(bodies: tuple[str, ...] = (), /, *, finer: tuple[float, ...] = (1.
 
         start(gpu=True)
     for name in bodies or SPECIMENS:
-        beside = (World(modulus=1 + NEAR), World(line=Line(gain=1 + NEAR)))[: 2 if "chamber" in _setup_of(name) else 1]
+        chamber = "chamber" in SPECIMENS[name]().setup
+        beside = (World(modulus=1 + NEAR), World(line=Line(gain=1 + NEAR)))[: 1 + chamber]
         stated, *others = _as_stated(name, (World(), *beside), 1.0, gpu)
         columns = np.stack([(other - stated).ravel() for other in others], -1)
-        meshes = {1.0: stated, **{factor: _as_stated(name, (World(),), factor, gpu)[0] for factor in sorted(finer)}}
-        finest = meshes.pop(max(meshes))
+        found = {1.0: stated, **{factor: _as_stated(name, (World(),), factor, gpu)[0] for factor in sorted(finer)}}
+        finest = found.pop(max(found))
         moved = 1e3 * float(np.sqrt(np.mean((finest - finest[:, :1]) ** 2)))
         print(f"{name}, against elements {max(finer):g} times finer, of a motion of {moved:.3g} mm:")
-        for factor, x in meshes.items():
+        for factor, x in found.items():
             off = (finest - x).ravel()
             left = off - columns @ np.linalg.lstsq(columns, off, rcond=None)[0]
             whole, rest = (1e3 * float(np.sqrt(np.mean(d**2))) for d in (off, left))
             print(f"  {len(mesh_for(name, factor).cells)} elements: {whole:.3f} mm, {rest:.3f} beside modulus and "
                   "pressure", flush=True)  # fmt: skip
-
-
-def _setup_of(name: str) -> dict[str, Any]:
-    return SPECIMENS[name]().setup
 
 
 if __name__ == "__main__":

@@ -60,7 +60,7 @@ def measure(
     touching: tuple[Mapping[str, MarkerTrajectory], ...] = ()
     cells: Mapping[str, MarkerTrajectory] = {}
     smaller: Mapping[str, MarkerTrajectory] = {}
-    unsure = 1 / (FINEST**TOUCHING - 1)
+    unsure = 0.0
     chance = in_use = math.inf
     if there.touches and not any(t.simulated for t in trials):
         believed, touching, chance = _chance(there, len(trials))
@@ -71,14 +71,12 @@ def measure(
             (own,), (sharp,) = (
                 averaged(p, [there.as_stated], SHIFTS) for p in (there, there.only(everything, twin=finest))
             )
-            touching_known = DiscretizationError(chance=chance)
-            if not FitProblem(experiment, fine, trials=trials, discretization=touching_known).rough:
+            smaller, unsure = added(everything, own, sharp), 1 / (FINEST**TOUCHING - 1)
+            if not FitProblem(experiment, fine, trials=trials, discretization=DiscretizationError(chance=chance)).rough:
                 # Of a calm motion also what cells without size would add; of another, that would multiply chance.
                 beyond = 1 / (FINEST**ORDER - 1)
-                change = added(everything, own, sharp)
-                sharp = [m.plus(change[t.name], beyond) for m, t in zip(sharp, everything, strict=True)]
+                smaller = {name: change.plus(change, beyond) for name, change in smaller.items()}
                 unsure = beyond / (1 + beyond)
-            smaller = added(everything, own, sharp)
             believed = [
                 m.plus(smaller[t.name]) if t.name in smaller else m for m, t in zip(believed, everything, strict=True)
             ]

@@ -14,7 +14,7 @@ from torchsoro.sim2real.hypotheses.hypothesis import Hypothesis
 from torchsoro.sim2real.inference.gauss_newton import Answer, Asked, GaussNewton, Point
 from torchsoro.sim2real.inference.likelihood import BREAKS, Effects, Likelihood, Request
 from torchsoro.sim2real.inference.probing import ranked_starts
-from torchsoro.sim2real.inference.touching import ROUGHLY, averaged
+from torchsoro.sim2real.inference.touching import averaged
 from torchsoro.sim2real.inference.twin_error import DiscretizationError
 from torchsoro.sim2real.twin.twin import MarkerTrajectory, Twin
 from torchsoro.simulation.kernels.lanes import LANES
@@ -132,7 +132,7 @@ class FitProblem(Likelihood):
         coarsely = self._coarsely
         if coarsely is None:
             return self.simulate(requests)
-        looks = min(self.looks, ROUGHLY) if roughly else self.looks
+        looks = self.few_looks if roughly else self.looks
         middle, *found = averaged(coarsely, [((), base.at[None]), *requests], looks)
         return [
             [_changed(a.alone(), m, at) for a, m, at in zip(middle, motions, base.motions, strict=True)]

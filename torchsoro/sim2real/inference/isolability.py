@@ -21,7 +21,7 @@ from torchsoro.sim2real.inference.likelihood import BREAKS
 from torchsoro.sim2real.inference.noise import NoiseModel
 from torchsoro.sim2real.inference.observation import ObservationModel
 from torchsoro.sim2real.inference.observed import Motions
-from torchsoro.sim2real.inference.touching import ROUGHLY, averaged
+from torchsoro.sim2real.inference.touching import averaged
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 SAME = 0.97  # cosine above which one effect passes for another
@@ -95,7 +95,7 @@ def isolability(
         ((e,), np.pad(np.concatenate(mine), ((0, 0), (n, 0)))) for e, mine in zip(others, probe_points, strict=True)
     ]
     problem = problem.only(problem.trials, even=True)
-    base, *found = averaged(problem, [((), still), *asked], min(problem.looks, ROUGHLY))
+    base, *found = averaged(problem, [((), still), *asked], problem.few_looks)
     if not all(m.sound.all() for m in base):
         raise ValueError(BREAKS)
     believed = [m.alone(0) for m in base]

@@ -18,9 +18,6 @@ from torchsoro.sim2real.inference.likelihood import Likelihood, Request
 from torchsoro.sim2real.twin.twin import MarkerTrajectory
 
 GAPS = 1e-5 * np.array([-10.0, -5.0, -2.0, 0.0, 2.0, 5.0, 10.0])  # of planes, far below a cell [m]
-# Shifts where a mean decides only where to begin, or from which strength on an effect is seen, at most: the error is
-# 1.5 times that of the mean over all, which takes more than twice as long.
-ROUGHLY = 3
 
 
 def shifted(problem: Likelihood, points: Sequence[Request], gaps: np.ndarray) -> list[list[MarkerTrajectory]]:
